@@ -27,11 +27,11 @@ from ...envs.vehicle.dynamics import (
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, TyreInputs, compute_tyre_load
 from .emulate import compute_ground_speed, compute_heading
-from .quality import estimate_noise_levels
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 _BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
 _MIN_SPEED = 4.0  # m/s, in a window
+_ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
 _STRETCHES = 40  # at most, of the log, which the intervals take for independent
 
 
@@ -85,13 +85,17 @@ class Windows:
         first, count = round(_BURN / self.dt), round(_WINDOW / self.dt)
         return self.starts[:, None] + np.arange(first + 1, first + count + 1)
 
-    def select(self, wanted: npt.NDArray[np.bool_]) -> "Windows":
-        """Select the windows of a mask."""
-        return replace(self, starts=self.starts[wanted], stretch=self.stretch[wanted])
-
 
 def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
-    """Make windows of drives of one dt; left_out: mask of each drive's rows that are not used."""
+    """Make windows of drives of one dt.
+
+    Args:
+        logs: Recorded drives, at least one.
+        left_out: Mask of each drive's rows that are not used, shape (rows,).
+
+    Returns:
+        The windows.
+    """
     dt, first = logs[0].record.dt, 0
     every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
     before, after = (round(s / (every * dt)) for s in (_MARGIN, _BURN + _WINDOW + 2.0 * _MARGIN))
@@ -179,10 +183,16 @@ def _simulate_windows(
 
 
 def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """Compute measured less predicted channels, shape (windows, channels, rows).
+    """Compute measured less predicted channels.
 
-    Yaw rate (rad/s) and, if logged, acceleration (m/s2) and course (rad), which begins anew in each
-    window and is 0 in rows without a fix.
+    Args:
+        car: Stated car.
+        theta: Parameters.
+        w: Windows.
+
+    Returns:
+        Yaw rate (rad/s) and, if logged, acceleration (m/s2) and course (rad), which begins anew in
+        each window and is 0 in rows without a fix, shape (windows, channels, rows).
     """
     first, count = round(_BURN / w.dt), round(_WINDOW / w.dt)
     out = np.empty((3, len(w.starts), first + count + round(_MARGIN / w.dt)))
@@ -218,12 +228,6 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
     return np.stack(channels, axis=1)
 
 
-def compute_errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """Compute the RMS of the residual of yaw rate (rad/s) and, if logged, acceleration (m/s2)."""
-    squares = np.mean(compute_residual(car, theta, w) ** 2, axis=(0, 2))
-    return np.asarray(np.sqrt(squares))[: 1 + w.accel]
-
-
 @dataclass(frozen=True)
 class BicycleFit:
     """A fitted `Theta`, its n free parameters, and every stretch's normal equations there."""
@@ -237,12 +241,26 @@ class BicycleFit:
     pull: Array  # slope of the priors, shape (n,)
 
     def estimate_shift(self, left_out: npt.NDArray[np.bool_]) -> Array:
-        """Estimate how the free ones move when stretches are left out, to first order, (n,)."""
+        """Estimate to first order how the free parameters move when stretches are left out.
+
+        Args:
+            left_out: Mask, shape (stretches,).
+
+        Returns:
+            Changes of the parameters, shape (n,).
+        """
         rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
         return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))
 
     def half(self, name: str) -> float:
-        """Half of the 95 % interval: a jackknife, and the priors' part; infinite if not free."""
+        """Compute half of the 95 % interval: a jackknife, and the priors' part.
+
+        Args:
+            name: Name of a parameter.
+
+        Returns:
+            Half of the interval, infinite if the parameter is not free.
+        """
         count = len(self.g)
         if name not in self.free or count < 2:
             return float("inf")
@@ -253,10 +271,36 @@ class BicycleFit:
         return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
 
 
+def _estimate_noise_levels(left: Array, dt: float) -> Array:
+    """Estimate deviations of independent rows that tell as much as a residual's, (channels,).
+
+    Rows of a residual are alike for a while: means over up to 1 s, by the root of their rows.
+    """
+    levels = [np.full(left.shape[1], 1e-9)]
+    shown = np.maximum(np.mean(left != 0.0, axis=(0, 2)), 1e-9)
+    for seconds in _ALIKE:
+        rows = max(round(seconds / dt), 1)
+        trimmed = left[:, :, : left.shape[2] // rows * rows]
+        means = trimmed.reshape(*left.shape[:2], -1, rows).mean(axis=3)
+        levels.append(np.sqrt(rows * np.mean(means**2, axis=(0, 2)) / shown))
+    return np.asarray(np.max(levels, axis=0))
+
+
 def fit(
     car: Vehicle, w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None
 ) -> BicycleFit:
-    """Fit the `free` parameters by least squares; scale: of the channels, None: estimated."""
+    """Fit parameters by least squares.
+
+    Args:
+        car: Stated car.
+        w: Windows.
+        start: Parameters where the search starts.
+        free: Names of those that are fitted.
+        scale: Standard deviations of the channels' residuals; None: estimated.
+
+    Returns:
+        The fit.
+    """
     at = [Theta._fields.index(name) for name in free]
     low, high, centre, sd = _LOW[at], _HIGH[at], np.array(w.centre)[at], np.array(w.spread)[at]
     steps = (_STEPS * (1, 1, 1, abs(start.gain), *7 * (1,)))[at]
@@ -274,15 +318,12 @@ def fit(
 
     x = np.clip(np.array(start)[at], low, high)
     for max_evaluations in (60,) if scale is not None else (10, 10, 60):
-        now = (
-            estimate_noise_levels(compute_residual(car, make_theta(x), w), w.dt)
-            if scale is None
-            else scale
-        )
+        now = scale
+        if now is None:
+            now = _estimate_noise_levels(compute_residual(car, make_theta(x), w), w.dt)
         solution = least_squares(
             compute_weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,),
-            max_nfev=max_evaluations,
-            xtol=1e-6, ftol=1e-7,
+            max_nfev=max_evaluations, xtol=1e-6, ftol=1e-7,
         )  # fmt: skip
         x = solution.x
     flat = (part[: -len(at)] for part in (solution.jac, solution.fun))  # without the priors' rows
@@ -290,4 +331,5 @@ def fit(
     membership = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
     H = np.einsum("ws,wki,wkj->sij", membership, J, J, optimize=True)
     g = np.einsum("ws,wki,wk->si", membership, J, r, optimize=True)
+    assert now is not None
     return BicycleFit(make_theta(x), tuple(free), now, H, g, sd**-2.0, (x - centre) / sd**2)

@@ -2,18 +2,17 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, Array, Log
 from ...envs.recordings.log_file import make_packet_rows
 from ...envs.sensors.gps import COURSE_SPEED
 from ...envs.sensors.link import SlowSensor
 
-_MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
+MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
 
@@ -49,8 +48,8 @@ class Emulation:
         if self.course_rate <= 0.0:
             raise ValueError(f"course_rate must be positive, got {self.course_rate} Hz")
 
-    def rows(self, dt: float) -> int:
-        """Rows of the log from one sample to the next; ValueError where the log is too slow."""
+    def _compute_rows(self, dt: float) -> int:
+        """Compute the rows of a log from one sample to the next; ValueError for a slow log."""
         if self.course_rate * dt > 1.0 + 1e-6:
             raise ValueError(
                 f"a course at {self.course_rate:g} Hz needs a log at least as fast; "
@@ -59,7 +58,14 @@ class Emulation:
         return round(1.0 / (self.course_rate * dt))
 
     def add_gyro_bias(self, log: Log) -> Log:
-        """Return the log with the gyro's bias added."""
+        """Return the log with the gyro's bias added.
+
+        Args:
+            log: Recorded drive.
+
+        Returns:
+            The biased log.
+        """
         fast = log.record.fast.copy()
         fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
         return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
@@ -69,12 +75,21 @@ class Emulation:
 
         course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
         ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
-        Raises ValueError without truth.
+
+        Args:
+            log: Recorded drive.
+            seed: Seed of the course's noise.
+
+        Returns:
+            The log with a GPS.
+
+        Raises:
+            ValueError: If the log has no truth.
         """
         if "beta" not in log.truth:
             raise ValueError(f"{log.name}: a course cannot be emulated without sideslip truth")
         record, beta = log.record, log.truth["beta"]
-        rows, late = self.rows(record.dt), round(self.delay / record.dt)
+        rows, late = self._compute_rows(record.dt), round(self.delay / record.dt)
         captured = np.arange(-record.first % rows, len(beta), rows)
         noise = np.random.default_rng(seed).standard_normal(len(captured))
         exact = (beta + compute_heading(log))[captured] + math.radians(self.bias_deg)
@@ -92,61 +107,52 @@ class Emulation:
 
 
 def compute_heading(log: Log) -> Array:
-    """Integrate the logged yaw rate to a heading (rad), 0 at the first row, shape (rows,)."""
+    """Integrate the logged yaw rate to a heading, 0 at the first row.
+
+    Args:
+        log: Recorded drive.
+
+    Returns:
+        Heading (rad), shape (rows,).
+    """
     gamma = log.record.fast[:, FAST.gyro]
     steps = 0.5 * (gamma[1:] + gamma[:-1]) * log.record.dt
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def compute_ground_speed(log: Log) -> Array:
-    """Compute the mean speed of the front wheels (m/s), shape (rows,)."""
+    """Compute the mean speed of the front wheels.
+
+    Args:
+        log: Recorded drive.
+
+    Returns:
+        Speed (m/s), shape (rows,).
+    """
     fast = log.record.fast
     return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
 
 
 def find_moving(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows that are fast enough to judge."""
-    return np.asarray(compute_ground_speed(log) > _MIN_SPEED)
+    """Mark the rows that are fast enough to judge.
+
+    Args:
+        log: Recorded drive.
+
+    Returns:
+        Mask, shape (rows,).
+    """
+    return np.asarray(compute_ground_speed(log) > MIN_SPEED)
 
 
 def find_backward(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows driven backward: at a negative speed, or with a truth about half a turn."""
+    """Mark the rows driven backward: at a negative speed, or with a truth about half a turn.
+
+    Args:
+        log: Recorded drive.
+
+    Returns:
+        Mask, shape (rows,).
+    """
     turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
     return np.asarray((compute_ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
-
-
-def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
-    """Compute x and y (m) by dead reckoning with a sideslip angle (rad), shape (rows,) each."""
-    psi = compute_heading(log)
-    v_x = compute_ground_speed(log)
-    v_y = v_x * np.tan(np.nan_to_num(beta))
-    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
-    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
-    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
-
-
-def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
-    """Compute steps between fixes at least `lag` (s) apart, in rad, shape (5, steps).
-
-    The course before and after; the changes of course, of the integral of the gyro, and of
-    sideslip, by the truth or else by accel_y.
-    """
-    parts = [np.zeros((5, 0))]
-    for log in (log for log in logs if "gps" in log.slow):
-        fixes = log.record.select_packets("gps")
-        speed, dt = compute_ground_speed(log), log.record.dt
-        place = fixes[:, PACKET.captured].astype(int) - log.record.first
-        good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
-        good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
-        place, course = place[good], fixes[good, PACKET.value]
-        if len(place) < 2:
-            continue
-        usual = max(float(np.median(np.diff(place))), 1.0)
-        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
-        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, _MIN_SPEED)) * dt
-        slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
-        slip = log.truth.get("beta", slip)
-        columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
-        steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
-        parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
-    return np.concatenate(parts, axis=1)

@@ -1,39 +1,23 @@
 """A car, its steering and its sensors from recorded drives, and what the drives cannot show."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.record import Array, Log
+from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.results import ResultTable, Suite
+from ..harness.stats import margin_of_error
 from ..harness.verdict import format_verdict
-from .bicycle_fit import (
-    PRIOR,
-    BicycleFit,
-    Theta,
-    Windows,
-    compute_errors,
-    compute_residual,
-    fit,
-    make_windows,
-)
-from .emulate import find_moving
-from .quality import (
-    LATE_WITHIN,
-    MIN_CORRELATION,
-    WIDE,
-    Finding,
-    estimate_steering_gain,
-    find_saturated,
-    find_swapped,
-    make_sensor_findings,
-)
+from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fit, make_windows
+from .emulate import compute_ground_speed, compute_heading, find_moving
+from .quality import MIN_CORRELATION, estimate_steering_gain, find_saturated, find_swapped
 from .suite import GYRO_ONLY
-from .wires import SignalCalibration, apply_wires
+from .wires import NOISES, SignalCalibration, apply_wires
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6
@@ -49,12 +33,30 @@ _UNKNOWN_GAIN = 0.3  # standard deviation of its share, where no stated ratio is
 _DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
 _OF_ACCEL = ("accel_bias", "accel_gain")
 _OF_CAR = {"front": "front_stiffness", "rear": "rear_stiffness", "inertia": "yaw_inertia"}
+_WIDE = "its interval is too wide"
+_BLOCKS = 20  # of a log, which the intervals take for independent
+_LATE = (-0.2, 1.2)  # s, of the GPS
+_COURSE, _SPEED = range(2)  # places in its values
+_LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
+_FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
 _NOTE = (
     "Intervals by a jackknife over 40 stretches of the log (20 for sensors), and by priors around "
     "what is stated, to which numbers that this log does not tell are drawn. Latencies of steering "
     "and acceleration are applied only where they lower the error on stretches that the fit has "
     "not seen: the lag of tyres looks like one."
 )
+
+
+class Finding(NamedTuple):
+    """A number with half of its 95 % interval, and whether the log determines it."""
+
+    name: str
+    stated: float
+    value: float = math.nan
+    half: float = math.inf
+    unit: str = ""
+    is_determined: bool = False
+    remark: str = ""
 
 
 @dataclass
@@ -116,7 +118,7 @@ def identify(
     slips = _estimate_slips(logs, result.car, result.wires)
     both = (_estimate_slips(logs, car, stated), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
-    findings, noise, latency = make_sensor_findings(logs, slips)
+    findings, noise, latency = _make_sensor_findings(logs, slips)
     result.findings += findings
     result.wires = result.wires._replace(noise=noise, latency={**result.wires.latency, **latency})
     return result
@@ -182,7 +184,8 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
     result.wires = SignalCalibration(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
     first = Theta(gain=stated.gain, offset=stated.offset)
-    rates = [float(compute_errors(car, parameters, w)[0]) for parameters in (first, theta)]
+    residuals = [compute_residual(car, parameters, w) for parameters in (first, theta)]
+    rates = [float(np.sqrt(np.mean(left**2, axis=(0, 2)))[0]) for left in residuals]
     result.rates = (*rates, float(_evaluate_folds(car, w, best)[0]))
     result.remarks.append(
         f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than "
@@ -203,14 +206,14 @@ def _fit_latencies(
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.half(name), float(getattr(free.theta, name))
-        is_determined, remark = half < LATE_WITHIN, "within its interval of 0"
+        is_determined, remark = half < _LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
             single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
             share = np.linalg.norm(_evaluate_folds(car, w, single_fit) / base.scale) / usual
             pays += [name] if share < _MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
-        text = remark if is_determined else WIDE
+        text = remark if is_determined else _WIDE
         rows.append(Finding(label, 0.0, value, half, "s", is_determined, text))
     best = fit(car, w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
@@ -222,7 +225,8 @@ def _evaluate_folds(car: Vehicle, w: Windows, best: BicycleFit) -> Array:
     for fold in range(_FOLDS):
         moves = best.estimate_shift(labels % _FOLDS == fold)
         moved = {n: getattr(best.theta, n) + m for n, m in zip(best.free, moves, strict=True)}
-        fold_windows = w.select(w.stretch % _FOLDS == fold)
+        inside = w.stretch % _FOLDS == fold
+        fold_windows = replace(w, starts=w.starts[inside], stretch=w.stretch[inside])
         theta = best.theta._replace(**moved)
         squares.append(np.mean(compute_residual(car, theta, fold_windows) ** 2, axis=2))
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0)))
@@ -242,7 +246,7 @@ def _make_car_findings(
         at = float(getattr(best.theta, name))
         half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
-        remark = "" if is_determined else WIDE
+        remark = "" if is_determined else _WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
         elif label == "steering sign":
@@ -276,8 +280,124 @@ def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
 
 
+def _jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
+    """Compute a statistic of the sum of blocks, (count, ...), and half of its 95 % interval."""
+    total, count = blocks.sum(axis=0), len(blocks)
+    without = np.array([statistic(total - block) for block in blocks])
+    return statistic(total), margin_of_error((count - 1.0) * without)
+
+
+def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
+    """Estimate standard deviation and half interval of a channel's white noise.
+
+    From third differences of new samples: a slower sensor repeats its last one.
+    """
+    blocks = []
+    for values in parts:
+        new = np.concatenate([[True], np.diff(values) != 0.0])
+        third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
+        blocks += [
+            np.array([block @ block, len(block)]) for block in np.array_split(third, _BLOCKS)
+        ]
+    # each block: sum of squares and count
+    return _jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
+
+
+def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each."""
+    # d: differences of two fixes' values less the signal's so much earlier; p: those of `part`
+    packets = log.record.select_packets("gps")
+    packets = packets[packets[:, PACKET.quality] > 0.0]
+    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
+    earlier = rows[:, None] - times / log.record.dt
+    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
+    if value == _COURSE:
+        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
+    p = np.diff(np.interp(earlier, place, part), axis=0)
+    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
+    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
+    used = usual & inside & np.isfinite(d).all(axis=1)
+    if np.count_nonzero(used) < _BLOCKS:
+        return []
+    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
+    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
+    return [block.sum(axis=1) for block in np.array_split(sums, _BLOCKS, axis=1)]
+
+
+def _compute_remainder(sums: Array, share: float | None = None) -> Array:
+    """Mean squares that a fraction of the part leaves, None: the best one; shape (times,)."""
+    square, product, part_square, count = sums
+    shares = product / np.maximum(part_square, 1e-12) if share is None else share
+    return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
+
+
+def _find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
+    """Time of the smallest remainder (s), between the samples by a parabola."""
+    lefts = _compute_remainder(sums, share)
+    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
+    left, middle, right = lefts[i - 1 : i + 2]
+    bend = left - 2.0 * middle + right
+    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+    return float(times[i] + beside * (times[1] - times[0]))
+
+
+def _make_sensor_findings(
+    logs: Sequence[Log], slips: Sequence[Array]
+) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
+    """Make findings of the sensors, noise by the estimators' options, latency by sensor (s).
+
+    slips: Sideslip angle (rad) of each log, shape (rows,), by which the course is predicted.
+    """
+    findings: list[Finding] = []
+    noise: dict[str, float] = {}
+    for channel, unit in _FAST.items():
+        if all(channel in log.record.present for log in logs):
+            column = getattr(FAST, channel)
+            sd, half = _estimate_white_noise([log.record.fast[:, column] for log in logs])
+            is_determined = half < 0.3 * sd
+            remark = "" if is_determined else _WIDE if sd > 0.0 else "none is seen"
+            row = Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
+            findings.append(row)
+            noise |= {NOISES[channel]: sd} if is_determined else {}
+    times = np.arange(*_LATE, max(logs[0].record.dt, 0.01))
+    pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
+    courses, speeds = list[Array](), list[Array]()
+    for log, slip in pairs:
+        courses += _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
+        speed, none = compute_ground_speed(log), 0.0 * log.time
+        speeds += _collect_fixes(log, _SPEED, speed, none, times)
+    if not courses:
+        return findings, noise, {}
+    late, half = _jackknife(np.array(courses), lambda sums: _find_minimum(times, sums))
+    with_slip = _find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
+    half = math.hypot(half, late - with_slip)
+    is_determined = half < _LATE_WITHIN
+    pays = is_determined and late > half
+    remark = ("applied" if pays else "within its interval of 0") if is_determined else _WIDE
+    findings.append(Finding("latency of gps", 0.0, late, half, "s", is_determined, remark))
+    at = int(np.argmin(np.abs(times - late)))
+    for name, unit, scale, blocks in (
+        ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
+    ):  # fmt: skip
+        if blocks:  # a difference has twice the variance
+            sd, half = _jackknife(
+                np.array(blocks), lambda sums: math.sqrt(0.5 * _compute_remainder(sums)[at])
+            )
+            row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
+            findings, noise = [*findings, row], noise | {NOISES[name]: sd}
+    return findings, noise, {"gps": late} if pays else {}
+
+
 def make_suite(result: IdentificationResult, name: str) -> Suite:
-    """Make a suite of the findings: a table with a verdict."""
+    """Make a suite of the findings: a table with a verdict.
+
+    Args:
+        result: What the log shows.
+        name: Name of the log.
+
+    Returns:
+        The suite.
+    """
     suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
     missing = [finding.name for finding in result.findings if not finding.is_determined]
     if result.reason:

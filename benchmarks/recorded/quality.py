@@ -4,8 +4,8 @@ Intervals are jackknives over blocks of the log.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,7 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ..harness.stats import margin_of_error
-from .emulate import compute_course_steps, compute_ground_speed, compute_heading, find_backward
-from .emulate import find_moving as find_moving
+from .emulate import MIN_SPEED, compute_ground_speed, compute_heading, find_backward, find_moving
 
 MIN_CORRELATION = 0.5  # correlation, below which steering and yaw rate have nothing in common
 TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
@@ -130,12 +128,20 @@ def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float 
 
 
 def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
-    """Estimate gain and correlation of the logged steering, from the linear car's yaw rate."""
+    """Estimate gain and correlation of the logged steering, from the linear car's yaw rate.
+
+    Args:
+        logs: Parts of the log.
+        car: Stated car.
+
+    Returns:
+        Gain (rad at the wheels per unit) and correlation; (1, 0) where steering is constant.
+    """
     line = _fit_steering(logs, car, steady=False)
     return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
-def estimate_resolution(log: Log) -> float:
+def _estimate_resolution(log: Log) -> float:
     """Estimate the step between the values of the gyro (rad/s), 0 for one too fine to be seen."""
     steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
     step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
@@ -144,17 +150,31 @@ def estimate_resolution(log: Log) -> float:
 
 
 def find_saturated(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark rows in which the gyro stays at its limit: long, and many steps of its resolution."""
+    """Mark rows in which the gyro stays at its limit: long, and many steps of its resolution.
+
+    Args:
+        log: Recorded drive.
+
+    Returns:
+        Mask, shape (rows,).
+    """
     gyro = log.record.fast[:, FAST.gyro]
     runs = np.cumsum(np.diff(gyro, prepend=gyro[0]) != 0.0)
     length = np.bincount(runs)
     long = (length >= _LONG * np.percentile(length, 95))[runs]
-    is_large = np.abs(gyro) > max(0.05, _STEPS * estimate_resolution(log))
+    is_large = np.abs(gyro) > max(0.05, _STEPS * _estimate_resolution(log))
     return np.asarray(long & is_large & ((gyro == gyro.max()) | (gyro == gyro.min())))
 
 
 def find_swapped(logs: Sequence[Log]) -> str:
-    """Find what columns seem to be swapped, "" for none that can be seen."""
+    """Find what columns seem to be swapped.
+
+    Args:
+        logs: Parts of the log.
+
+    Returns:
+        Their names and why, "" for none that can be seen.
+    """
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
     speed, turning, accel_y, accel_x, steer = _smooth_columns(logs, *names)
@@ -185,9 +205,36 @@ def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
     return [f"{name} is 0 in {zeros} of {counts.sum()} rows in which the car turns"]
 
 
+def _compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
+    """Compute steps between fixes at least `lag` (s) apart, in rad, shape (5, steps).
+
+    The course before and after; the changes of course, of the integral of the gyro, and of
+    sideslip, by the truth or else by accel_y.
+    """
+    parts = [np.zeros((5, 0))]
+    for log in (log for log in logs if "gps" in log.slow):
+        fixes = log.record.select_packets("gps")
+        speed, dt = compute_ground_speed(log), log.record.dt
+        place = fixes[:, PACKET.captured].astype(int) - log.record.first
+        good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
+        good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
+        place, course = place[good], fixes[good, PACKET.value]
+        if len(place) < 2:
+            continue
+        usual = max(float(np.median(np.diff(place))), 1.0)
+        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
+        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, MIN_SPEED)) * dt
+        slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
+        slip = log.truth.get("beta", slip)
+        columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
+        steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
+        parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
+    return np.concatenate(parts, axis=1)
+
+
 def _describe_fixes(logs: Sequence[Log]) -> list[str]:
     """Sentences on a course that is held while the gyro turns, or jumps for a fix or two."""
-    before, after, change, turned, _ = compute_course_steps(logs, 0.0)
+    before, after, change, turned, _ = _compute_course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
     if held.any():
@@ -234,13 +281,28 @@ def _describe_course(line: Any, turned: Array) -> list[str]:
 
 
 def make_remarks(logs: Sequence[Log]) -> list[str]:
-    """Make remarks on what is no fault of a drive, but good to know: a gyro of coarse steps."""
-    step = math.degrees(max(map(estimate_resolution, logs)))
+    """Make remarks on what is no fault of a drive, but good to know: a gyro of coarse steps.
+
+    Args:
+        logs: Parts of the log.
+
+    Returns:
+        Sentences.
+    """
+    step = math.degrees(max(map(_estimate_resolution, logs)))
     return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
 
 
 def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
-    """Make warnings of what does not fit together in a drive, a sentence each."""
+    """Make warnings of what does not fit together in a drive.
+
+    Args:
+        logs: Parts of the log.
+        car: The car that is assumed.
+
+    Returns:
+        A sentence each.
+    """
     sentences = [f"columns seem to be swapped, {what}"] if (what := find_swapped(logs)) else []
     if count := sum(find_saturated(log).sum() for log in logs):
         sentences.append(f"the gyro is at its limit in {count} rows")
@@ -257,7 +319,7 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     accel = _fit_line(accel_y[used], turning[used], slipping[used])
     if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
         return sentences
-    _, _, change, turned, slipped = compute_course_steps(logs, 1.0)
+    _, _, change, turned, slipped = _compute_course_steps(logs, 1.0)
     course, wrong, unit = _fit_line(change, turned, slipped), [], accel.slope if accel else 1.0
     if accel and course and 0.67 < accel.slope / course.slope < 1.5:
         implied = "what accel_y and course imply"
@@ -280,147 +342,3 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     if course and in_course and in_course.slope < 1.0 / FACTOR - _SURE * in_course.stderr:
         sentences += [] if sentences else ["the course shows no sideslip: is it the heading?"]
     return sentences
-
-
-WIDE = "its interval is too wide"
-BLOCKS = 20  # of a log, which the intervals take for independent
-_ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
-LATE = (-0.2, 1.2)  # s, of the GPS
-_COURSE, _SPEED = range(2)  # places in its values
-LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
-_FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
-NOISES = {name: f"{name.removesuffix('_left')}_noise" for name in (*_FAST, "course", "gps_speed")}
-"""The estimators' options for a standard deviation, by what it is of."""
-
-
-class Finding(NamedTuple):
-    """A number with half of its 95 % interval, and whether the log determines it."""
-
-    name: str
-    stated: float
-    value: float = math.nan
-    half: float = math.inf
-    unit: str = ""
-    is_determined: bool = False
-    remark: str = ""
-
-
-def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
-    """Compute a statistic of the sum of blocks, (count, ...), and half of its 95 % interval."""
-    total, count = blocks.sum(axis=0), len(blocks)
-    without = np.array([statistic(total - block) for block in blocks])
-    return statistic(total), margin_of_error((count - 1.0) * without)
-
-
-def estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
-    """Estimate standard deviation and half interval of a channel's white noise.
-
-    From third differences of new samples: a slower sensor repeats its last one.
-    """
-    blocks = []
-    for values in parts:
-        new = np.concatenate([[True], np.diff(values) != 0.0])
-        third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
-        blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
-    # each block: sum of squares and count
-    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
-
-
-def estimate_noise_levels(left: Array, dt: float) -> Array:
-    """Estimate deviations of independent rows that tell as much as a residual's, (channels,).
-
-    Rows of a residual are alike for a while: means over up to 1 s, by the root of their rows.
-    """
-    levels = [np.full(left.shape[1], 1e-9)]
-    shown = np.maximum(np.mean(left != 0.0, axis=(0, 2)), 1e-9)
-    for seconds in _ALIKE:
-        rows = max(round(seconds / dt), 1)
-        trimmed = left[:, :, : left.shape[2] // rows * rows]
-        means = trimmed.reshape(*left.shape[:2], -1, rows).mean(axis=3)
-        levels.append(np.sqrt(rows * np.mean(means**2, axis=(0, 2)) / shown))
-    return np.asarray(np.max(levels, axis=0))
-
-
-def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
-    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each."""
-    # d: differences of two fixes' values less the signal's so much earlier; p: those of `part`
-    packets = log.record.select_packets("gps")
-    packets = packets[packets[:, PACKET.quality] > 0.0]
-    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
-    earlier = rows[:, None] - times / log.record.dt
-    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
-    if value == _COURSE:
-        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
-    p = np.diff(np.interp(earlier, place, part), axis=0)
-    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
-    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
-    used = usual & inside & np.isfinite(d).all(axis=1)
-    if np.count_nonzero(used) < BLOCKS:
-        return []
-    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
-    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
-    return [block.sum(axis=1) for block in np.array_split(sums, BLOCKS, axis=1)]
-
-
-def _compute_remainder(sums: Array, share: float | None = None) -> Array:
-    """Mean squares that a fraction of the part leaves, None: the best one; shape (times,)."""
-    square, product, part_square, count = sums
-    shares = product / np.maximum(part_square, 1e-12) if share is None else share
-    return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
-
-
-def _find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
-    """Time of the smallest remainder (s), between the samples by a parabola."""
-    lefts = _compute_remainder(sums, share)
-    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
-    left, middle, right = lefts[i - 1 : i + 2]
-    bend = left - 2.0 * middle + right
-    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(times[i] + beside * (times[1] - times[0]))
-
-
-def make_sensor_findings(
-    logs: Sequence[Log], slips: Sequence[Array]
-) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
-    """Make findings of the sensors, noise by the estimators' options, and latency by sensor (s).
-
-    slips: Sideslip angle (rad) of each log, shape (rows,), by which the course is predicted.
-    """
-    findings: list[Finding] = []
-    noise: dict[str, float] = {}
-    for channel, unit in _FAST.items():
-        if all(channel in log.record.present for log in logs):
-            column = getattr(FAST, channel)
-            sd, half = estimate_white_noise([log.record.fast[:, column] for log in logs])
-            is_determined = half < 0.3 * sd
-            remark = "" if is_determined else WIDE if sd > 0.0 else "none is seen"
-            row = Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
-            findings.append(row)
-            noise |= {NOISES[channel]: sd} if is_determined else {}
-    times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
-    pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses, speeds = list[Array](), list[Array]()
-    for log, slip in pairs:
-        courses += _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
-        speed, none = compute_ground_speed(log), 0.0 * log.time
-        speeds += _collect_fixes(log, _SPEED, speed, none, times)
-    if not courses:
-        return findings, noise, {}
-    late, half = jackknife(np.array(courses), lambda sums: _find_minimum(times, sums))
-    with_slip = _find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
-    half = math.hypot(half, late - with_slip)
-    is_determined = half < LATE_WITHIN
-    pays = is_determined and late > half
-    remark = ("applied" if pays else "within its interval of 0") if is_determined else WIDE
-    findings.append(Finding("latency of gps", 0.0, late, half, "s", is_determined, remark))
-    at = int(np.argmin(np.abs(times - late)))
-    for name, unit, scale, blocks in (
-        ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
-    ):  # fmt: skip
-        if blocks:  # a difference has twice the variance
-            sd, half = jackknife(
-                np.array(blocks), lambda sums: math.sqrt(0.5 * _compute_remainder(sums)[at])
-            )
-            row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
-            findings, noise = [*findings, row], noise | {NOISES[name]: sd}
-    return findings, noise, {"gps": late} if pays else {}

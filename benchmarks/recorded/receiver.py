@@ -41,7 +41,7 @@ _LIMITS = math.log(_MIN_NOISE), math.log(1e4)  # of q and r
 _GRID, _STEP = np.linspace(*_LIMITS, 8), 1.0
 
 
-class Track(NamedTuple):
+class _Track(NamedTuple):
     """A receiver's fixes with an HDOP, shape (n,) each, in rising time; SI units, angles in rad."""
 
     origin: tuple[float, float]  # degrees north and east
@@ -53,12 +53,12 @@ class Track(NamedTuple):
     hdop: Array
     satellites: Array
 
-    def select(self, shown: Mask) -> "Track":
+    def select(self, shown: Mask) -> "_Track":
         """Select some of the fixes."""
-        return Track(self.origin, *(column[shown] for column in self[1:]))
+        return _Track(self.origin, *(column[shown] for column in self[1:]))
 
 
-def make_track(epochs: Sequence[Epoch]) -> Track:
+def _make_track(epochs: Sequence[Epoch]) -> _Track:
     """Make the track of fixes around the first one, without those that lack HDOP or are late.
 
     A step back beyond `_GAP` is a clock that was set, and stays.
@@ -74,10 +74,10 @@ def make_track(epochs: Sequence[Epoch]) -> Track:
     origin = (float(now["latitude"][0]), float(now["longitude"][0])) if shown else (0.0, 0.0)
     east, north = to_metres(now["latitude"], now["longitude"], origin)
     course, *others = (now[name] for name in ("course", "speed", "hdop", "satellites"))
-    return Track(origin, now["t"], east, north, course, *others)
+    return _Track(origin, now["t"], east, north, course, *others)
 
 
-class Signal(NamedTuple):
+class _Signal(NamedTuple):
     """A filtered quantity of a receiver's fixes."""
 
     name: str  # name of the signal
@@ -86,7 +86,7 @@ class Signal(NamedTuple):
     z: npt.NDArray[np.complex128]  # values, shape (n,)
     base_size: Array  # size of the noise beside HDOP, shape (n,)
     spread: float  # standard deviation of the rate at the start
-    track: Track  # fixes
+    track: _Track  # fixes
     scored: Mask  # mask of the fixes that are scored
     half: int = 0  # row at which half of these lie behind
 
@@ -102,21 +102,18 @@ class _NoiseLawResult(NamedTuple):
     hdop: Array
 
 
-def make_signals(track: Track) -> list[Signal]:
-    """Make position and course, scored where the car moves, if they have enough fixes.
-
-    Raises ValueError where position has fewer than `_MIN_FIXES`.
-    """
+def _make_signals(track: _Track) -> list[_Signal]:
+    """Make position and course, scored where the car moves; ValueError for too few fixes."""
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     positions = np.asarray(track.east + 1j * track.north, np.complex128)
-    position = Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
+    position = _Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
     part = track.select((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
     all_fixes: Mask = np.ones(len(part.t), bool)
     angle = np.asarray(part.course, np.complex128)
-    course = Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
+    course = _Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
     scored = []
     for signal in (position, course):
-        known = signal.scored & np.isfinite(predict_fixes(signal, signal.base_size**2, 1.0)[0])
+        known = signal.scored & np.isfinite(_predict_fixes(signal, signal.base_size**2, 1.0)[0])
         rows = np.flatnonzero(known)
         if len(rows) >= _MIN_FIXES:
             scored.append(signal._replace(scored=known, half=int(rows[len(rows) // 2])))
@@ -126,11 +123,10 @@ def make_signals(track: Track) -> list[Signal]:
     return scored
 
 
-def compare(signal: Signal) -> dict[str, _NoiseLawResult]:
+def _compare(signal: _Signal) -> dict[str, _NoiseLawResult]:
     """Fit each law of the noise on the first half, and one noise as informative as `table`'s."""
-    half = signal.half
-    hdop = signal.track.hdop
-    sizes = {name: compute_law_size(hdop, weight) for name, weight in HDOP_LAWS.items()}
+    half, hdop = signal.half, signal.track.hdop
+    sizes = {name: _compute_law_size(hdop, weight) for name, weight in HDOP_LAWS.items()}
     results = {name: _fit_law(signal, size) for name, size in sizes.items()}
     table = (sizes["table"] * signal.base_size)[:half]
     base = signal.base_size[:half]
@@ -139,26 +135,26 @@ def compare(signal: Signal) -> dict[str, _NoiseLawResult]:
     return results
 
 
-def compute_law_size(hdop: Array, weight: float) -> Array:
+def _compute_law_size(hdop: Array, weight: float) -> Array:
     """Compute the noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
     knots, factors = zip(*FILTERS["double-layer"].hdop, strict=True)
     return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
 
 
-def compute_gain(result: _NoiseLawResult, other: _NoiseLawResult) -> Estimate:
+def _compute_gain(result: _NoiseLawResult, other: _NoiseLawResult) -> Estimate:
     """Compute the mean log-likelihood less that of another law, by blocks of the same fixes."""
     difference = result.likelihood - other.likelihood
     blocks = np.array_split(difference, max(len(difference) // _BLOCK, 1))
     return interval(np.array([block.mean() for block in blocks]))
 
 
-def _fit_law(signal: Signal, size: Array, r: float | None = None) -> _NoiseLawResult:
+def _fit_law(signal: _Signal, size: Array, r: float | None = None) -> _NoiseLawResult:
     """Filter at its maximum likelihood on the first half: the best of a grid, then refined."""
     half = signal.half
 
     def compute_scores(p: Array, count: int) -> tuple[Array, Array, Array]:
         q, noise = np.exp(p)
-        error, S = predict_fixes(signal, (noise * size * signal.base_size)[:count] ** 2, q)
+        error, S = _predict_fixes(signal, (noise * size * signal.base_size)[:count] ** 2, q)
         square = error**2 / S / signal.axes
         return error, -0.5 * signal.axes * (square + np.log(2.0 * math.pi * S)), square
 
@@ -174,15 +170,12 @@ def _fit_law(signal: Signal, size: Array, r: float | None = None) -> _NoiseLawRe
     error, likelihood, square = compute_scores(p, len(signal.z))
     late = signal.scored & (np.arange(len(signal.z)) >= half)
     q, noise = np.exp(p)
-    hdop = signal.track.hdop
-    return _NoiseLawResult(noise, q, error[late], likelihood[late], square[late], hdop[late])
+    columns = (error, likelihood, square, signal.track.hdop)
+    return _NoiseLawResult(noise, q, *(column[late] for column in columns))
 
 
-def predict_fixes(signal: Signal, R: Array, q: float) -> tuple[Array, Array]:
-    """Predict each fix from those before: size of the error, its variance on an axis, (n,) each.
-
-    R: Variances, shape (n,). NaN while the filter settles.
-    """
+def _predict_fixes(signal: _Signal, R: Array, q: float) -> tuple[Array, Array]:
+    """Predict each fix from those before, of variances R, (n,): size and variance of the error."""
     error, variance = np.full((2, len(R)), np.nan)
     t, z, noise = signal.track.t.tolist(), signal.z.tolist(), R.tolist()
     since = SETTLED
@@ -214,40 +207,53 @@ _CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0
 _NEGLIGIBLE = 0.01  # of log-likelihood a fix: nobody would notice
 _WEAK_CORRELATION = 0.3  # a rank correlation that explains little
 _ROWS = {"position": "prediction_error", "course": "course_prediction_error"}
-_ALL = {"likelihood": "log_likelihood", "square": "nis"}
 
 
 class ReceiverReplay(NamedTuple):
     """A receiver's log: its fixes, and each signal with the results of the laws."""
 
     name: str
-    track: Track
-    outcomes: list[tuple[Signal, dict[str, _NoiseLawResult]]]
+    track: _Track
+    outcomes: list[tuple[_Signal, dict[str, _NoiseLawResult]]]
     counts: Counts
 
 
 def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
     """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
 
-    no_drive: What only a drive with a gyro has, a vehicle and a mapping: None or empty. Raises what
-    `read_nmea` does, and ValueError, with the path, for a log too short to compare.
+    Args:
+        log: Path of the log.
+        no_drive: What only a drive with a gyro has, a vehicle and a mapping: None or empty.
+
+    Returns:
+        The fixes, and the results of each law.
+
+    Raises:
+        ValueError: For a log too short to compare, and for all that `read_nmea` refuses.
     """
     path = Path(log)
     if any(no_drive):
         raise ValueError(f"{path}: a receiver's log takes no vehicle and no mapping")
     epochs, counts = read_nmea(path)
-    track = make_track(epochs)
+    track = _make_track(epochs)
     try:
         if not len(track.t):
             raise ValueError("no fix has an HDOP: expected GGA, GNS or GSA sentences with one")
-        outcomes = [(signal, compare(signal)) for signal in make_signals(track)]
+        outcomes = [(signal, _compare(signal)) for signal in _make_signals(track)]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return ReceiverReplay(f"{path.resolve().parent.name}/{path.stem}", track, outcomes, counts)
 
 
 def make_receiver_suite(replay: ReceiverReplay) -> Suite:
-    """Make a suite of the verdict, the counts, the numbers of each law, and the track."""
+    """Make a suite of the verdict, the counts, the numbers of each law, and the track.
+
+    Args:
+        replay: Results of a log.
+
+    Returns:
+        The suite.
+    """
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
     step = np.diff(track.t)
@@ -261,7 +267,7 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
         "half of the log; all numbers are of the second."
     )
     suite = Suite("replay", f"A receiver's log: {replay.name}", text)
-    suite.verdict = compose_verdict(replay)
+    suite.verdict = _compose_verdict(replay)
     suite.rows = [
         row for signal, results in replay.outcomes for row in _make_rows(replay, signal, results)
     ]
@@ -273,7 +279,7 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     return suite
 
 
-def compose_verdict(replay: ReceiverReplay) -> str:
+def _compose_verdict(replay: ReceiverReplay) -> str:
     """Compose the verdict."""
     tuned, fixed = (replay.outcomes[0][1][law] for law in (_TUNED, _FIXED))
     rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
@@ -290,7 +296,7 @@ def compose_verdict(replay: ReceiverReplay) -> str:
 
 def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
     """Sentence on whether noise that follows HDOP predicts a signal better."""
-    number = compute_gain(results[_TUNED], results[_FIXED])
+    number = _compute_gain(results[_TUNED], results[_FIXED])
     what, (value, low, high) = f"Tuning the noise of {name} by HDOP", number
     if max(abs(low), abs(high)) < _NEGLIGIBLE:
         return f"{what} changes nothing: log-likelihood {value:+.3f}."
@@ -299,7 +305,7 @@ def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
 
 
 def _make_rows(
-    replay: ReceiverReplay, signal: Signal, results: Mapping[str, _NoiseLawResult]
+    replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
 ) -> list[ResultRow]:
     rows = []
     for law, result in results.items():
@@ -307,27 +313,27 @@ def _make_rows(
             "suite": "replay", "scenario": f"{replay.name}: {signal.name}", "estimator": law,
             "n": len(result.error), "env_version": f"replay {__version__}",
         }  # fmt: skip
-        rms = Estimate(float(np.sqrt(np.mean(result.error**2))))
-        numbers = {_ROWS[signal.name]: rms}
-        for column, metric in _ALL.items():
-            numbers[metric] = Estimate(float(getattr(result, column).mean()))
+        numbers = {
+            _ROWS[signal.name]: Estimate(float(np.sqrt(np.mean(result.error**2)))),
+            "log_likelihood": Estimate(float(result.likelihood.mean())),
+            "nis": Estimate(float(result.square.mean())),
+        }
         if law != _FIXED:
-            numbers["difference"] = compute_gain(result, results[_FIXED])
+            numbers["difference"] = _compute_gain(result, results[_FIXED])
         rows += [ResultRow.from_estimate(metric, x, **where) for metric, x in numbers.items()]
     return rows
 
 
-def _make_table(signal: Signal, results: Mapping[str, _NoiseLawResult]) -> ResultTable:
+def _make_table(signal: _Signal, results: Mapping[str, _NoiseLawResult]) -> ResultTable:
     scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
     cells = []
     for law, result in results.items():
         error = scale * result.error
-        more = "-"
-        if law != _FIXED:
-            more = compute_gain(result, results[_FIXED]).inline(digits="+.3f")
+        gain = _compute_gain(result, results[_FIXED]).inline(digits="+.3f")
         numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
         numbers += [result.likelihood.mean(), result.square.mean()]
         noise = f"{scale * result.r:.3g}" if result.r > 1.5 * _MIN_NOISE else "none seen"
+        more = "-" if law == _FIXED else gain
         cells.append([law, noise, *(f"{number:.2f}" for number in numbers), more])
     header = ("noise", f"at HDOP 1 / {unit}", "median", "rms", "95 %", "log-likelihood", "NIS",
               "against constant")  # fmt: skip
@@ -342,7 +348,12 @@ def _make_table(signal: Signal, results: Mapping[str, _NoiseLawResult]) -> Resul
 
 
 def write_kml(path: Path, replay: ReceiverReplay) -> None:
-    """Write the fixes as a track for a map."""
+    """Write the fixes as a track for a map.
+
+    Args:
+        path: Path of the KML file.
+        replay: Results of a log.
+    """
     track = replay.track
     fixes = {"fixes": (track.east, track.north)}
     write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
@@ -364,7 +375,12 @@ def _draw_figures(replay: ReceiverReplay) -> list[tuple[str, Any, str]]:
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:
-    """Draw the track and the errors of the next fix by HDOP as a picture (extra `report`)."""
+    """Draw the track and the errors of the next fix by HDOP as a picture (extra `report`).
+
+    Args:
+        path: Path of the picture, whose ending chooses the format.
+        replay: Results of a log.
+    """
     with require_extra("report", "pictures need matplotlib"):
         from matplotlib.colors import LogNorm
         from matplotlib.figure import Figure

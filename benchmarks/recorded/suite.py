@@ -19,7 +19,7 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
-from .emulate import Emulation, compute_path, find_backward
+from .emulate import Emulation, compute_ground_speed, compute_heading, find_backward
 
 GYRO_ONLY = "bicycle-kf"
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -89,34 +89,39 @@ class Settings(Emulation):
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything that moves a number, as JSON types."""
-        plain = dataclasses.asdict(self)
-        del plain["figures"], plain["emulated"]
-        plain["estimators"] = list(self.estimators or ESTIMATORS)
-        return plain
-
 
 @dataclass
 class ReplayResult:
-    """Errors of one vehicle's estimators on one drive, by estimator.
-
-    outcomes: States that are no motion at the end: name, value, standard deviation. remarks: Why an
-    estimator was left out, or what it cannot see.
-    """
+    """Errors of one vehicle's estimators on one drive, by estimator."""
 
     squares: dict[str, Array] = field(default_factory=dict)  # by seed (rad2); empty without truth
     cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
     traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
+    # states that are no motion at the end: name, value, standard deviation
     outcomes: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
-    remarks: dict[str, str] = field(default_factory=dict)
+    remarks: dict[str, str] = field(default_factory=dict)  # why it is left out, or what it misses
 
     def rmse(self, name: str) -> tuple[float, float, float]:
-        """Return the RMS error (rad): median, smallest and largest over the seeds."""
+        """Return the RMS error over the seeds.
+
+        Args:
+            name: Name of the estimator.
+
+        Returns:
+            Median, smallest and largest (rad).
+        """
         return _summarise_range(np.sqrt(self.squares[name]))
 
     def ratio(self, name: str, other: str = GYRO_ONLY) -> tuple[float, float, float]:
-        """Return the RMS error over another's, seed by seed: median, smallest and largest."""
+        """Return the RMS error over another's, seed by seed.
+
+        Args:
+            name: Name of the estimator.
+            other: Name of the other one.
+
+        Returns:
+            Median, smallest and largest ratio.
+        """
         return _summarise_range(np.sqrt(self.squares[name] / self.squares[other]))
 
 
@@ -136,7 +141,7 @@ def _make_drives(log: Log, settings: Settings) -> list[Log]:
     return [settings.add_course(log, settings.seed + i) for i in range(settings.seeds)]
 
 
-def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
+def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
     """Run every wanted estimator that the drives' slow sensors serve over every drive."""
     log, result = drives[0], ReplayResult()
     counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log)
@@ -188,11 +193,10 @@ def _make_estimator(
     name: str, slow: str | None, log: Log, vehicle: Vehicle, settings: Settings
 ) -> Any:
     sensors: dict[str, SlowSensor] = {} if slow is None else {slow: log.slow[slow]}
-    options: dict[str, Any] = {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
-    if slow is not None:
-        options |= {"slow": slow, "q_psi": settings.q_psi}
-    if name == _OWN_NOISE:
-        options = {"slow": slow} if slow is not None else {}
+    options: dict[str, Any] = {} if slow is None else {"slow": slow}
+    if name != _OWN_NOISE:
+        options |= {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
+        options |= {} if slow is None else {"q_psi": settings.q_psi}
     if slow == "gps":
         options["course_noise"] = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
         options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
@@ -228,12 +232,19 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     how = Settings(**settings)
     car = vehicle.scale_stiffness(how.stiffness_factor)
     drives = _make_drives(log, how)
-    result = run_estimators(drives, car, how)
+    result = _run_estimators(drives, car, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", _make_text(log, drives, car, how))
     suite.rows = _make_rows(result, log.name, car, how)
     suite.tables = [_make_table(result, log.name, car, len(drives))]
-    if any(result.outcomes.values()):
-        suite.tables.append(_make_parameter_table(result, log.name))
+    cells = [
+        [label, state, f"{value:.4g}", f"{sd:.2g}"]
+        for label, states in result.outcomes.items()
+        for state, value, sd in states
+    ]
+    if cells:
+        note = "At the end of the drive, SI units; tyres are factors on the assumed stiffness."
+        header, title = ("estimator", "state", "value", "deviation"), "what the estimators found"
+        suite.tables.append(ResultTable(f"{log.name}: {title}", header, cells, note))
     suite.verdict = compose_verdict(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
         suite.figures = _draw_figures(result, log)
@@ -245,7 +256,15 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 
 def compose_verdict(result: ReplayResult, emulated: bool) -> str:
-    """Compose the verdict; emulated: whether the GPS course is made from the truth."""
+    """Compose the verdict.
+
+    Args:
+        result: Errors of the estimators.
+        emulated: Whether the GPS course is made from the truth.
+
+    Returns:
+        The verdict.
+    """
     if not result.squares:
         return format_verdict(
             f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
@@ -269,8 +288,16 @@ def compose_verdict(result: ReplayResult, emulated: bool) -> str:
 def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     """Replay with the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
 
-    settings: Those of `replay`. One table, the rows of every corner, no figures. Raises what
-    `replay` does, and ValueError for a log without truth.
+    Args:
+        log: Recorded drive.
+        vehicle: Vehicle in the middle of the corners.
+        settings: Fields of `Settings`.
+
+    Returns:
+        Suite of one table and the rows of every corner, without figures.
+
+    Raises:
+        ValueError: For a log without truth, and for all that `replay` refuses.
     """
     how = Settings(**settings)
     if "beta" not in log.truth:
@@ -280,12 +307,16 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     results = {}
     for front, rear in _CORNERS:
         car = vehicle.scale_stiffness(how.stiffness_factor).scale_stiffness(front, rear)
-        result = results[f"{front} / {rear}"] = run_estimators(drives, car, how)
+        result = results[f"{front} / {rear}"] = _run_estimators(drives, car, how)
         scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
         suite.rows += _make_rows(result, scenario, car, how)
-    names = [name for name in ESTIMATORS if any(name in r.squares for r in results.values())]
+    medians = [{n: r.rmse(n)[0] for n in r.squares} for r in results.values()]
+    names = [name for name in ESTIMATORS if any(name in corner for corner in medians)]
     title = f"{log.name}, {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
-    cells = [[name, *(_format_error(x, name) for x in results.values())] for name in names]
+    cells = [
+        [name, *(f"{DEGREES * corner[name]:.2f}" if name in corner else "-" for corner in medians)]
+        for name in names
+    ]
     note = "The same process noise in all corners; medians over the noises."
     suite.tables = [ResultTable(title, ("estimator", *results), cells, note)]
     return suite
@@ -327,54 +358,49 @@ def _make_rows(
     result: ReplayResult, scenario: str, car: Vehicle, settings: Settings
 ) -> list[ResultRow]:
     """Rows of every number of a result."""
-    spec = json.dumps({"vehicle": car.to_dict(), "settings": settings.as_dict()})
-    common = {"salt": f"seed {settings.seed}", "env_version": f"replay {__version__}", "spec": spec}
+    plain = dataclasses.asdict(settings) | {"estimators": list(settings.estimators or ESTIMATORS)}
+    del plain["figures"], plain["emulated"]  # these move no number
+    where = {
+        "suite": "replay", "scenario": scenario, "salt": f"seed {settings.seed}",
+        "env_version": f"replay {__version__}",
+        "spec": json.dumps({"vehicle": car.to_dict(), "settings": plain}),
+    }  # fmt: skip
     rows = []
     for name, cost in result.cost.items():
-        measured = {"us_per_tick": Estimate(cost, math.nan, math.nan)}
-        n = len(result.squares.get(name, [cost]))
+        measured = {"us_per_tick": (cost, math.nan, math.nan)}
         if name in result.squares:
-            errors = {"rmse": Estimate(*result.rmse(name)), "ratio": Estimate(*result.ratio(name))}
-            measured = errors | measured
-        where = {"suite": "replay", "scenario": scenario, "estimator": name, "n": n}
-        for metric, number in measured.items():
-            rows.append(ResultRow.from_estimate(metric, number, **where, **common))
+            measured = {"rmse": result.rmse(name), "ratio": result.ratio(name)} | measured
+        n = len(result.squares.get(name, [cost]))
+        for metric, x in measured.items():
+            row = ResultRow.from_estimate(metric, Estimate(*x), estimator=name, n=n, **where)
+            rows.append(row)
     return rows
-
-
-def _format_error(result: ReplayResult, name: str) -> str:
-    """Median RMS error (deg), "-" for an estimator that was left out."""
-    return f"{DEGREES * result.rmse(name)[0]:.2f}" if name in result.squares else "-"
 
 
 def _make_table(result: ReplayResult, name: str, car: Vehicle, noises: int) -> ResultTable:
     """Table of the estimators, best first; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     if not result.squares:
-        cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
         title = f"{name}, designed from {car.name}: no truth, no score"
+        cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
         return ResultTable(title, ("estimator", "us per tick"), cells, note)
     header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
     cells = []
     for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
-        value, low, high = (DEGREES * number for number in result.rmse(label))
-        ratio, cost = result.ratio(label)[0], result.cost[label]
-        among = f"{low:.3f} .. {high:.3f}"
-        cells.append([label, f"{value:.3f}", among, f"{ratio:.2f}", f"{cost:.3f}"])
+        value, low, high = (f"{DEGREES * number:.3f}" for number in result.rmse(label))
+        numbers = f"{result.ratio(label)[0]:.2f}", f"{result.cost[label]:.3f}"
+        cells.append([label, value, f"{low} .. {high}", *numbers])
     title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
     return ResultTable(title, header, cells, note)
 
 
-def _make_parameter_table(result: ReplayResult, name: str) -> ResultTable:
-    """Table of the car's and sensors' states that estimators have at the end of the drive."""
-    cells = [
-        [label, state, f"{value:.4g}", f"{sd:.2g}"]
-        for label, states in result.outcomes.items()
-        for state, value, sd in states
-    ]
-    note = "At the end of the drive, SI units; tyres are factors on the assumed stiffness."
-    header = ("estimator", "state", "value", "deviation")
-    return ResultTable(f"{name}: what the estimators found", header, cells, note)
+def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
+    """Compute x and y (m) by dead reckoning with a sideslip angle (rad), shape (rows,) each."""
+    psi, v_x = compute_heading(log), compute_ground_speed(log)
+    v_y = v_x * np.tan(np.nan_to_num(beta))
+    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
+    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
+    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
 
 
 def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
@@ -390,7 +416,7 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
     near = np.abs(log.time - peak_time) <= _WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
-    paths = {name: compute_path(log, beta) for name, beta in traces.items()}
+    paths = {name: _compute_path(log, beta) for name, beta in traces.items()}
     overview = _select_traces(draw_time_series(log.time, slips, label), result)
     shown = [
         ("the sideslip angle and its estimates", overview, _HIDDEN),

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import check_choice, is_finite, short_repr
 from ...envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
 from ...estimators.design.options import FAST_CHANNELS, find_columns
-from .quality import NOISES
 
 _CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)  # that may be late
 _MAX_LATENCY = 5.0  # s
+NOISES = {
+    name: f"{name.removesuffix('_left')}_noise"
+    for name in ("gyro", "accel_y", "roll_rate", "wheel_left", "course", "gps_speed")
+}
+"""The estimators' options for a standard deviation, by what it is of."""
 
 
 class SignalCalibration(NamedTuple):
@@ -57,20 +61,36 @@ class SignalCalibration(NamedTuple):
 
 
 def read_wires(source: VehicleSource | None) -> SignalCalibration:
-    """Read the calibration in a vehicle's file, with its errors; that of others is unknown."""
+    """Read the calibration in a vehicle's file, with its errors; that of others is unknown.
+
+    Args:
+        source: Vehicle as for `make_vehicle`, or "identify".
+
+    Returns:
+        The calibration.
+
+    Raises:
+        type: The error of a value out of place, with the file's name.
+    """
     if source is None or source == "identify" or not is_document(source):
         return SignalCalibration()
     path = Path(str(source))
-    tables: dict[str, Any] = {name: {} for name in WIRE_TABLES} | read_document(path, "vehicle")
+    tables = read_document(path, "vehicle")
     try:
-        steering, latency, noise = (dict(tables[name]) for name in WIRE_TABLES)
+        steering, latency, noise = (dict(tables.get(name, {})) for name in WIRE_TABLES)
         return SignalCalibration(**steering, latency=latency, noise=noise).check()
     except (TypeError, ValueError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
 def write_vehicle(path: Path, car: Vehicle, wires: SignalCalibration) -> None:
-    """Write a file that `make_vehicle` reads, with the calibration in separate tables."""
+    """Write a file that `make_vehicle` reads, with the calibration in separate tables.
+
+    Args:
+        path: Path of the TOML or JSON file.
+        car: The vehicle.
+        wires: The calibration.
+    """
     values = car.to_dict()
     for axle in ("front", "rear"):
         values[f"{axle}_stiffness_axle"] = 2.0 * values.pop(f"{axle}_stiffness")
@@ -80,7 +100,15 @@ def write_vehicle(path: Path, car: Vehicle, wires: SignalCalibration) -> None:
 
 
 def apply_wires(log: Log, wires: SignalCalibration) -> Log:
-    """Return the log with calibrated steering, fast channels and captures at the true time."""
+    """Return the log with calibrated steering, fast channels and captures at the true time.
+
+    Args:
+        log: Recorded drive.
+        wires: Its calibration.
+
+    Returns:
+        The calibrated log.
+    """
     record, slow = log.record, dict(log.slow)
     fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)
     fast[:, FAST.steer] = wires.gain * fast[:, FAST.steer] + wires.offset

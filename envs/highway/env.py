@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ from ..engine.layout import P, Z
 from ..engine.window import WINDOW
 from ..numerics.packed import read
 from ..rendering.trace import RenderState
+from ..scenarios.draws import Range
 from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
@@ -19,6 +20,9 @@ from ..validation import check_choice, check_int
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import VehicleSource
 from .traffic import PERIOD, ROADS, Traffic, TrafficStart, parse_hazard
+
+if TYPE_CHECKING:
+    from highway_env.road.graphics import WorldSurface
 
 MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
 _OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")
@@ -60,7 +64,7 @@ class HighwayEnv(StabilityEnv):
     def __init__(
         self,
         road: str = "straight",
-        hazard: Mapping[str, Any] | None = {},  # never written
+        hazard: Mapping[str, Range] | None = {},  # never written
         traffic: int = 3,
         sensors: str = "fusion",
         scenario: ScenarioSource = "wet-evasion",
@@ -145,21 +149,24 @@ class HighwayEnv(StabilityEnv):
             if tick % PERIOD == 0:
                 traffic.step_road(read(self._window, WINDOW.track, tick - first - 1))
         if is_running and (traffic.crashed or traffic.departed):
-            self._write_failure(COLLISION if traffic.crashed else DEPARTURE)
+            failure, report = COLLISION if traffic.crashed else DEPARTURE, self._report
+            z[Z.clock.failure] = report[REPORT.failure] = failure
+            report[REPORT.cost] += compute_failure_cost(p[P.task.duration], z[Z.clock.tick])
+            report[REPORT.reward] = -report[REPORT.cost]
         return done
 
-    def _write_failure(self, failure: int) -> None:
-        """End the episode with a failure code; the rest of it is charged."""
-        z, report = self._state, self._report
-        z[Z.clock.failure] = report[REPORT.failure] = failure
-        report[REPORT.cost] += compute_failure_cost(self._params[P.task.duration], z[Z.clock.tick])
-        report[REPORT.reward] = -report[REPORT.cost]
-
     def make_render_state(self, row: int = 0) -> RenderState:
-        """Make the state that a picture of car `row` shows, its road by highway-env's graphics."""
+        """Make the state that a picture shows, its road by highway-env's graphics.
+
+        Args:
+            row: 0, the only car.
+
+        Returns:
+            The state.
+        """
         return super().make_render_state(row)._replace(world=self._draw_world)
 
-    def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> Any:
+    def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> "WorldSurface":
         """Draw the road around our car by highway-env, with others of ours as shadows on it."""
         import pygame
         from highway_env.road.graphics import RoadGraphics, WorldSurface

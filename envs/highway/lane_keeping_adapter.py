@@ -18,6 +18,7 @@ from ..engine.layout import P, Z
 from ..numerics.jit import as_python
 from ..outside.env import PlantEnv
 from ..outside.plants import OutsideInputs
+from ..record import Array
 from ..scenarios.scenario import Scenario
 from ..sensors.camera import compute_preview_offset
 from ..task import ObservationEntry, make_space
@@ -53,12 +54,8 @@ def make_keeping_vehicle() -> Vehicle:
     )  # fmt: skip
 
 
-class KeepingPlant:
-    """The car of a `lane-keeping-v0`, stepped by ticks; disturbances and torques do nothing.
-
-    Args:
-        render_mode: Render mode of highway-env's environment.
-    """
+class _KeepingPlant:
+    """The car of a `lane-keeping-v0`, stepped by ticks; disturbances and torques do nothing."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         rate = round(1.0 / TICK)
@@ -81,13 +78,9 @@ class KeepingPlant:
         self.y, self.theta, self.curvature = position.y, position.theta, position.curvature
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """Step the car over a tick, and integrate its place on the lane.
+        """Step the car over a tick of h seconds, and integrate its place on the lane.
 
         A control period's first tick is highway-env's own `step`; the others only move the car.
-
-        Args:
-            inputs: Inputs, of which the steering angle acts.
-            h: Length of the tick (s).
         """
         action = np.array([-inputs.steer / self.env.action_type.steering_range[1]])
         before = self.motion
@@ -116,16 +109,8 @@ class KeepingPlant:
         """Whether the state is made of numbers."""
         return bool(np.isfinite(self.env.vehicle.state).all())
 
-    def states(self, observation: Any, preview: float) -> tuple[float, ...]:
-        """Compute `STATES` of an observation of highway-env's.
-
-        Args:
-            observation: Its observation.
-            preview: Preview distance of y_l (m).
-
-        Returns:
-            beta (rad), gamma (rad/s), psi (rad) and y_l (m).
-        """
+    def states(self, observation: Mapping[str, Array], preview: float) -> tuple[float, ...]:
+        """Compute `STATES` of highway-env's observation, y_l at a preview distance (m)."""
         lateral, heading, slide, turn = np.ravel(observation["state"]).tolist()
         centre, lane = np.ravel(observation["reference_state"])[:2].tolist()
         psi, speed = math.remainder(lane - heading, 2.0 * math.pi), float(self.env.vehicle.speed)
@@ -161,12 +146,10 @@ class KeepingEnv(PlantEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        self.plant: KeepingPlant = KeepingPlant(render_mode)
+        self.plant: _KeepingPlant = _KeepingPlant(render_mode)
         fixed: dict[str, Any] = {"steering": True, "reference": "zero-slip"}
-        vehicle = make_keeping_vehicle()
-        super().__init__(
-            sensors, KEEPING, vehicle, control_period=control_period, **fixed | options
-        )
+        fixed |= {"control_period": control_period, **options}
+        super().__init__(sensors, KEEPING, make_keeping_vehicle(), **fixed)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -212,7 +195,11 @@ class KeepingEnv(PlantEnv):
         raise TypeError("highway-env's lane-keeping-v0 makes no snapshots")
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Refuse any snapshot: TypeError, since highway-env makes none."""
+        """Refuse any snapshot: TypeError, since highway-env makes none.
+
+        Args:
+            snapshot: Ignored.
+        """
         self.get_state()
 
 
@@ -233,9 +220,17 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
         self.layout = (*env.get_wrapper_attr("layout"), *entries)
         self.observation_space = make_space(self.layout)
 
-    def observation(self, observation: Any) -> Any:
-        """Append highway-env's `STATES` to an observation of the `KeepingEnv`, in float32."""
-        base: Any = self.env.unwrapped
+    def observation(self, observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Append highway-env's `STATES` to an observation, in float32.
+
+        Args:
+            observation: That of the `KeepingEnv`.
+
+        Returns:
+            The longer one.
+        """
+        base = self.env.unwrapped
+        assert isinstance(base, KeepingEnv)
         plant = base.plant
         native = plant.last_observation if self._returned else plant.env.observation_type.observe()
         states = plant.states(native, base.vehicle.preview)

@@ -7,11 +7,12 @@ its left (side 1) or to its right (-1). Every road begins straight.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..numerics import require_extra
+from ..record import Array
 from ..rendering import canvas
 from ..rendering.road import compute_body
 from ..scenarios.draws import Range, get_range
@@ -21,7 +22,7 @@ from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import GRAVITY, Vehicle
 
 with require_extra("highway", "roads and traffic need highway-env"):
-    from highway_env.road.lane import CircularLane, LineType, SineLane, StraightLane
+    from highway_env.road.lane import AbstractLane, CircularLane, LineType, SineLane, StraightLane
     from highway_env.road.road import RoadNetwork
 
 from highway_env.road.road import Road  # isort: skip  # after those above, which name the extra
@@ -42,10 +43,9 @@ _DIFFERENCE = 0.05  # m, of differences along a lane
 class _RoadLayout(NamedTuple):
     """A network and the lanes that our car follows in it."""
 
-    network: Any
-    route: tuple[Any, ...]  # our lanes, one after the other
-    own_lane: int  # index of our lane among those of each road
-    free_lane: int  # of the lane beside it
+    network: RoadNetwork
+    route: list[AbstractLane]  # our lanes, one after the other
+    side: int  # of the free lane
     ramp: tuple[str, str, int] | None = None  # where others merge from
 
 
@@ -63,7 +63,7 @@ def _make_straight(side: int) -> _RoadLayout:
     network = RoadNetwork()
     _add_straight(network, "start", "a", side, _BEHIND, 0.0)
     route = _add_straight(network, "a", "b", side, 0.0, _BEYOND)
-    return _RoadLayout(network, tuple(route), *_get_lane_indices(side))
+    return _RoadLayout(network, route, side)
 
 
 def _make_curved(side: int) -> _RoadLayout:
@@ -83,7 +83,7 @@ def _make_curved(side: int) -> _RoadLayout:
             route += [lane] * (offset == 0.0)
         position, heading = route[-1].position(route[-1].length, 0.0), heading - turn * ANGLE
     route += _add_straight(network, "d", "e", side, position[0], position[0] + _BEYOND, position[1])
-    return _RoadLayout(network, tuple(route), *_get_lane_indices(side))
+    return _RoadLayout(network, route, side)
 
 
 def _make_merging(side: int) -> _RoadLayout:
@@ -103,7 +103,7 @@ def _make_merging(side: int) -> _RoadLayout:
     last = StraightLane([200.0, edge], [350.0, edge], **style)
     for first, end_node, lane in (("j", "k", ramp), ("k", "b", bend), ("b", "c", last)):
         network.add_lane(first, end_node, lane)
-    return _RoadLayout(network, tuple(route), *_get_lane_indices(side), ("j", "k", 0))
+    return _RoadLayout(network, route, side, ("j", "k", 0))
 
 
 ROADS: dict[str, Callable[[int], _RoadLayout]] = {
@@ -118,22 +118,17 @@ def _list_lanes(side: int) -> list[tuple[float, tuple[int, int]]]:
     return [(left, (_LINE, _DASHES)), (left + WIDTH, (_NONE, _LINE))]
 
 
-def _get_lane_indices(side: int) -> tuple[int, int]:
-    """Get the indices of (our lane, the free lane)."""
-    return (1, 0) if side > 0 else (0, 1)
-
-
 def _add_straight(
-    network: Any, first: str, last: str, side: int, start: float, end: float, y: float = 0.0
-) -> list[Any]:
+    network: RoadNetwork, first: str, last: str, side: int, start: float, end: float, y: float = 0.0
+) -> list[AbstractLane]:
     """Add both lanes of a straight stretch from x = start to end, ours at y; return ours."""
     for offset, lines in _list_lanes(side):
         ends = [start, y + offset], [end, y + offset]
         network.add_lane(first, last, StraightLane(*ends, WIDTH, lines, speed_limit=_FAST))
-    return [network.graph[first][last][_get_lane_indices(side)[0]]]
+    return [network.graph[first][last][int(side > 0)]]
 
 
-def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
+def locate_on_lane(lane: AbstractLane, X: float, Y: float, psi: float) -> LanePosition:
     """Locate a point of our axes on a lane of highway-env's.
 
     `local_coordinates` is exact on straight and circular lanes. On others, whose coordinate is no
@@ -169,7 +164,7 @@ def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
     return LanePosition(float(longitudinal), -float(right), float(theta), float(bend))
 
 
-def _compute_scale(lane: Any, longitudinal: float) -> float:
+def _compute_scale(lane: AbstractLane, longitudinal: float) -> float:
     """Compute the metres of a unit of a lane's own coordinate."""
     before, after = longitudinal - _DIFFERENCE, longitudinal + _DIFFERENCE
     chord = lane.position(after, 0.0) - lane.position(before, 0.0)
@@ -177,7 +172,6 @@ def _compute_scale(lane: Any, longitudinal: float) -> float:
 
 
 PERIOD = 50  # ticks between two steps of the road
-_STEP = 1e-3 * PERIOD
 _SHORTEST = 0.8  # s, in which no driver changes lanes faster
 
 
@@ -212,7 +206,7 @@ class Hazard:
             object.__setattr__(self, name, tuple(map(float, ends)))
 
 
-def parse_hazard(source: Mapping[str, Any] | None) -> Hazard | None:
+def parse_hazard(source: Mapping[str, Range] | None) -> Hazard | None:
     """Parse a hazard from a mapping of its fields.
 
     Args:
@@ -226,11 +220,10 @@ def parse_hazard(source: Mapping[str, Any] | None) -> Hazard | None:
     """
     if source is None:
         return None
-    known = [entry.name for entry in dataclasses.fields(Hazard)]
-    values = dict(check_mapping("hazard", source))
-    if unknown := [name for name in values if name not in known]:
+    known = Hazard.__dataclass_fields__
+    if unknown := [name for name in check_mapping("hazard", source) if name not in known]:
         raise TypeError(describe_unknown("field of hazard", unknown, known))
-    return Hazard(**values)
+    return Hazard(**source)
 
 
 class TrafficStart(NamedTuple):
@@ -247,7 +240,7 @@ class _EgoVehicle(HighwayVehicle):  # type: ignore[misc]
 
     color = (50, 200, 0)  # highway-env's own for the car that is driven
 
-    def __init__(self, road: Any, start: TrafficStart) -> None:
+    def __init__(self, road: Road, start: TrafficStart) -> None:
         front, rear, half = compute_body(start.vehicle)
         self.LENGTH, self.WIDTH, self._centre = front - rear, 2.0 * half, 0.5 * (front + rear)
         self.target_speed = start.speed  # which those who would merge ahead of it ask for
@@ -262,14 +255,14 @@ class _EgoVehicle(HighwayVehicle):  # type: ignore[misc]
         self.heading: float = -motion.psi
         self.speed: float = motion.v_x
         leftward = np.array([direction[1], -direction[0]])
-        self._velocity = motion.v_x * direction + motion.v_y * leftward
+        self._velocity: Array = motion.v_x * direction + motion.v_y * leftward
 
     @property
-    def velocity(self) -> Any:
+    def velocity(self) -> Array:
         """Velocity (m/s), shape (2,), with the sideslip that other vehicles do not have."""
         return self._velocity
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: object = None) -> None:
         """Do nothing: its driver is ours."""
 
     def step(self, dt: float) -> None:
@@ -278,23 +271,17 @@ class _EgoVehicle(HighwayVehicle):  # type: ignore[misc]
         self.on_state_update()
 
 
-class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
-    """An IDM vehicle in its lane that from a time on brakes until it stands.
+class _BrakingVehicle(IDMVehicle):  # type: ignore[misc]
+    """An IDM vehicle in its lane that from a time (s) on brakes (m/s2) until it stands."""
 
-    Args:
-        road: highway-env's road.
-        position: Place in highway-env's axes (m), shape (2,).
-        speed: Speed (m/s).
-        onset: Time at which it brakes (s).
-        rate: Deceleration (m/s2).
-    """
-
-    def __init__(self, road: Any, position: Any, speed: float, onset: float, rate: float) -> None:
+    def __init__(
+        self, road: Road, position: Array, speed: float, onset: float, rate: float
+    ) -> None:
         super().__init__(road, position, speed=speed, target_speed=speed, enable_lane_change=False)
         self.time_left, self.rate = onset, rate
         self.speed: float = speed
 
-    def act(self, action: Any = None) -> None:
+    def act(self, action: object = None) -> None:
         """Follow the road; brake from the onset on."""
         super().act(action)
         if self.time_left <= 0.0 and not self.crashed:
@@ -337,23 +324,23 @@ class Traffic:
         draw = {name: random.uniform(*get_range(ends)) for name, ends in vars(hazard).items()}
         v, rate = start.speed, max(draw["braking"] * start.friction * GRAVITY, 0.1)
         gap = draw["headway"] * v
-        distance = 0.5 * (self.ego.LENGTH + BrakingVehicle.LENGTH) + gap
+        distance = 0.5 * (self.ego.LENGTH + _BrakingVehicle.LENGTH) + gap
         position = np.array([self.ego.position[0] + distance, 0.0])
-        self.road.vehicles.append(BrakingVehicle(self.road, position, v, draw["onset"], rate))
+        self.road.vehicles.append(_BrakingVehicle(self.road, position, v, draw["onset"], rate))
         meeting = math.sqrt(2.0 * gap / rate)  # s after the onset, while it still moves
         if meeting > v / rate:  # it already stands
             meeting = gap / v + 0.5 * v / rate
         begin = v * (draw["onset"] + draw["reaction"])
         length = v * max(draw["haste"] * (meeting - draw["reaction"]), _SHORTEST)
-        stop_position = position[0] + v * draw["onset"] + 0.5 * v * v / rate + BrakingVehicle.LENGTH
-        back = max(begin + length, stop_position) + v * draw["stay"]
-        shift = WIDTH if self.course.free_lane < self.course.own_lane else -WIDTH
+        stop = position[0] + v * draw["onset"] + 0.5 * v * v / rate + _BrakingVehicle.LENGTH
+        back = max(begin + length, stop) + v * draw["stay"]
+        shift = self.course.side * WIDTH
         return TrackPath(shift, begin, length, -shift, back, length)
 
     def _add_vehicles(self, others: int, start: TrafficStart) -> None:
         """Add IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
         random, course = self.road.np_random, self.course
-        ego, free = course.own_lane, course.free_lane
+        ego, free = int(course.side > 0), int(course.side < 0)
         slots = [(free, 80.0), (ego, -35.0), (ego, 120.0), (free, -45.0)]  # lane, m ahead
         for i in range(others):
             speed = start.speed * random.uniform(0.95, 1.05)
@@ -372,10 +359,14 @@ class Traffic:
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """Step the road by `PERIOD` ticks; `motion` is our car's at the end."""
+        """Step the road by `PERIOD` ticks.
+
+        Args:
+            motion: Our car's at the end.
+        """
         self.ego.set_motion(motion)
         self.road.act()
-        self.road.step(_STEP)
+        self.road.step(1e-3 * PERIOD)
 
     @property
     def crashed(self) -> bool:
@@ -389,10 +380,17 @@ class Traffic:
         return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Locate our car with a `Motion` on the lanes that it follows."""
-        route = self.course.route
-        position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
-        while position.longitudinal > route[self._lane].length and self._lane + 1 < len(route):
+        """Locate our car on the lanes that it follows.
+
+        Args:
+            motion: Our car's.
+
+        Returns:
+            Its position.
+        """
+        while True:
+            lane = self.course.route[self._lane]
+            position = locate_on_lane(lane, motion.X, motion.Y, motion.psi)
+            if lane is self.course.route[-1] or not position.longitudinal > lane.length:
+                return position
             self._lane += 1
-            position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
-        return position

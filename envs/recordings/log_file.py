@@ -18,16 +18,13 @@ from ..ticks import TICK
 from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
 from .tables import read_quantities
 
-_NEEDED = ("time", "speed_x", "yaw_rate", "steer")
-"""The quantities without which a log cannot be read."""
-
+_NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
 _SAMPLED = {  # column of the record: quantity of the log
     "gyro": "yaw_rate",
     **{name: name for name in ("accel_y", "accel_x", "roll_rate", "wheel_left", "wheel_right")},
 }
 _INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command", "curvature")
-_GAPS = {*TRUTH, *SLOW_QUANTITIES}
-"""Quantities that need not be known in every row."""
+_GAPS = {*TRUTH, *SLOW_QUANTITIES}  # need not be known in every row
 _GAP = 1.5  # steps of time
 _STILL = 1e-3  # of a step of time
 _DRIFT = 1e-4  # of the log's length
@@ -69,7 +66,7 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
 
 def _make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
     """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s)."""
-    dt = find_clock(values["time"])[1] if dt is None else dt
+    dt = find_step(values["time"]) if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _make_fast_rows(values)
     packets, slow = _make_packets(values, first, dt)
@@ -103,14 +100,14 @@ def make_packet_rows(
     return packets
 
 
-def find_clock(time: Array) -> tuple[int, float]:
-    """Find the first tick and the step of an even clock.
+def find_step(time: Array) -> float:
+    """Find the step of an even clock.
 
     Args:
         time: Time of each row (s), shape (n,).
 
     Returns:
-        First tick and dt (s).
+        dt (s).
 
     Raises:
         ValueError: If the clock is uneven, with the row.
@@ -135,7 +132,7 @@ def find_clock(time: Array) -> tuple[int, float]:
         raise ValueError(f"time is uneven: row {row} is {clock}")
     if dt < TICK * (1.0 - 1e-6):
         raise ValueError(f"rows are {dt:.6g} s apart; the shortest step is {TICK} s")
-    return max(round(float(time[0]) / dt), 0), dt
+    return dt
 
 
 def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
@@ -248,7 +245,7 @@ def read_parts(
         pieces, done = _split_pieces({name: column[is_used] for name, column in values.items()})
         dt = None
         if len(pieces) > 1:
-            dt = find_clock(max((piece["time"] for piece in pieces), key=len))[1]
+            dt = find_step(max((piece["time"] for piece in pieces), key=len))
             pieces = [_resample_evenly(piece, dt, _SAME_STEP) for piece in pieces]
         logs = [_make_log(piece, source, dt) for piece in pieces]
     except ValueError as error:
@@ -305,7 +302,7 @@ def _resample_evenly(
     """
     time = values["time"]
     try:
-        if abs(find_clock(time)[1] / dt - 1.0) <= tolerance:
+        if abs(find_step(time) / dt - 1.0) <= tolerance:
             return values
     except ValueError:
         pass

@@ -8,7 +8,6 @@ while here that field alone is left out. Degrees from north, knots and times of 
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import date
 from functools import cache
@@ -93,15 +92,13 @@ def _apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> 
 @cache
 def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
     """List (name, form) of each field of a kind, groups written out."""
-
-    def iterate_fields(table: dict[str, Any]) -> Iterator[tuple[str, str]]:
-        for name, form in table.items():
-            if isinstance(form, tuple):  # (count or "None", fields): GSV has up to 4 satellites
-                yield from tuple(form[1].items()) * (form[0] if isinstance(form[0], int) else 4)
-            else:
-                yield name, form
-
-    return tuple(iterate_fields(NMEA_PAYLOADS_GET[kind]))
+    forms: list[tuple[str, str]] = []
+    for name, form in NMEA_PAYLOADS_GET[kind].items():
+        if isinstance(form, tuple):  # (count or "None", fields): GSV has up to 4 satellites
+            forms += tuple(form[1].items()) * (form[0] if isinstance(form[0], int) else 4)
+        else:
+            forms.append((name, form))
+    return tuple(forms)
 
 
 def _parse_value(name: str, form: str, text: str) -> Any:
@@ -160,45 +157,40 @@ class Epoch(NamedTuple):
         return math.isfinite(self.latitude)
 
 
+_LABELS = (
+    "bytes", "sentences {}", "sentences with a bad checksum", "sentences cut short",
+    "sentences without a checksum", "sentences overlong", "sentences repeated in an epoch",
+    "bytes outside sentences", "field {} emptied", "epochs", "epochs without a fix",
+    "epochs without a time", "steps of time backward", "steps of time forward by an hour or more",
+    "epochs dated by others",
+)  # fmt: skip
+
+
 @dataclass
 class Counts:
-    """Counts of received sentences and epochs, and of their faults."""
+    """Counts of received sentences and epochs, and of their faults; `_LABELS` describes them."""
 
-    received: int = 0  # bytes
-    garbage: int = 0  # bytes outside sentences, line ends apart
+    received: int = 0
     sentences: Counter[str] = field(default_factory=Counter)  # by type, with a right checksum
     bad_checksum: int = 0
-    truncated: int = 0  # sentences cut short
-    unchecked: int = 0  # sentences without a checksum
-    overlong: int = 0  # sentences longer than `LONGEST`
+    truncated: int = 0
+    unchecked: int = 0
+    overlong: int = 0  # longer than `LONGEST`
+    repeated: int = 0
+    garbage: int = 0  # bytes, line ends apart
     emptied: Counter[str] = field(default_factory=Counter)  # bad fields, by type and name
     epochs: int = 0
     without_fix: int = 0
     without_time: int = 0
-    backward: int = 0  # steps of time
-    forward: int = 0  # steps of time by an hour or more
-    redated: int = 0  # epochs dated by others
-    repeated: int = 0  # sentences repeated in an epoch
+    backward: int = 0
+    forward: int = 0
+    redated: int = 0
 
     def rows(self) -> list[tuple[str, int]]:
         """List names and counts for a table."""
-        return [
-            ("bytes", self.received),
-            *((f"sentences {name}", n) for name, n in sorted(self.sentences.items())),
-            ("sentences with a bad checksum", self.bad_checksum),
-            ("sentences cut short", self.truncated),
-            ("sentences without a checksum", self.unchecked),
-            ("sentences overlong", self.overlong),
-            ("sentences repeated in an epoch", self.repeated),
-            ("bytes outside sentences", self.garbage),
-            *((f"field {name} emptied", n) for name, n in sorted(self.emptied.items())),
-            ("epochs", self.epochs),
-            ("epochs without a fix", self.without_fix),
-            ("epochs without a time", self.without_time),
-            ("steps of time backward", self.backward),
-            ("steps of time forward by an hour or more", self.forward),
-            ("epochs dated by others", self.redated),
-        ]
+        counts = zip(_LABELS, vars(self).values(), strict=True)
+        named = [(label, n if isinstance(n, Counter) else {"": n}) for label, n in counts]
+        return [(label.format(name), n[name]) for label, n in named for name in sorted(n)]
 
 
 class Decoder:

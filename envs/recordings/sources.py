@@ -115,8 +115,8 @@ def is_nmea(path: str | Path) -> bool:
         True if it is.
     """
     source = Path(path)
-    if source.suffix.lower() == ".nmea" or not source.is_file():
-        return source.suffix.lower() == ".nmea"
+    if (is_named := source.suffix.lower() == ".nmea") or not source.is_file():
+        return is_named
     with source.open("rb") as stream:
         return bool(_LINE.search(stream.read(_CHUNK_SIZE)))
 

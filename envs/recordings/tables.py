@@ -142,15 +142,8 @@ _NAMES = {
 }
 
 
-def make_column_name(quantity: str) -> str:
-    """Make the name of a quantity's column in SI units.
-
-    Args:
-        quantity: Name of the quantity, of `COLUMNS`.
-
-    Returns:
-        The name, such as "yaw_rate_radps".
-    """
+def _make_column_name(quantity: str) -> str:
+    """Make the name of a quantity's column in SI units, such as "yaw_rate_radps"."""
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
@@ -161,9 +154,8 @@ def _parse_column_name(name: str) -> tuple[str, float]:
     """
     if name in _NAMES:
         return _NAMES[name]
-    quantity = name.rpartition("_")[0]
-    known = [make_column_name(q) for q in COLUMNS]
-    if near := next((text for text in (name, quantity) if text in COLUMNS), None):
+    known = [_make_column_name(q) for q in COLUMNS]
+    if near := next((q for q in (name, name.rpartition("_")[0]) if q in COLUMNS), None):
         known = [f"{near}_{u}" for u in COLUMNS[near]]
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
@@ -221,10 +213,10 @@ def read_quantities(
     remarks = [*table.remarks]
     try:
         columns = _find_columns(table, mapping, remarks)
-        missing = [make_column_name(name) for name in needed if name not in columns]
+        missing = [_make_column_name(name) for name in needed if name not in columns]
         if missing:
             raise ValueError(
-                f"no column {' nor '.join(missing)}; {_list_columns(table)}; "
+                f"no column {' nor '.join(missing)}; the log has {join_names(table.names)}; "
                 f"--map {missing[0]}=COLUMN names one"
             )
         if len(table.frame) < 2:
@@ -249,12 +241,8 @@ def read_quantities(
 def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
     for quantity in quantities:
         if (unknown := np.isnan(values[quantity])).any():
-            name, row = make_column_name(quantity), int(np.argmax(unknown)) + 1
+            name, row = _make_column_name(quantity), int(np.argmax(unknown)) + 1
             raise ValueError(f"column {name!r} has no value (NaN) in row {row}")
-
-
-def _list_columns(table: _LogTable) -> str:
-    return f"the log has {join_names(table.names)}"
 
 
 def _match_column(name: str, unit: str) -> str:
@@ -279,7 +267,9 @@ def _find_columns(
     names, quantities = [str(name) for name in table.frame.columns], set()
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):
-            raise ValueError(f"no column {column!r} for {name}; {_list_columns(table)}")
+            raise ValueError(
+                f"no column {column!r} for {name}; the log has {join_names(table.names)}"
+            )
         quantity = _parse_column_name(name)[0]
         if quantity in quantities:
             raise ValueError(f"{quantity} is mapped twice")

@@ -6,20 +6,21 @@ Shapes are drawn at twice their size and shrunk, text is not. Drawing needs no d
 import functools
 import os
 import warnings
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import logger
 
 from ..numerics import require_extra
+from ..record import Array
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 with require_extra("render", "pictures need pygame"):
     import pygame as pygame  # the other files of the room take it from here
 
 Points = npt.ArrayLike
-"""Places, (n, 2)."""
+"""Places, shape (n, 2), or one, shape (2,)."""
 Box = tuple[float, float, float, float]
 """Left, top, width and height in pixels."""
 
@@ -31,8 +32,8 @@ _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
 class Canvas:
     """A picture that shapes and text are drawn on.
 
-    Places, widths and radii are in pixels of the result, x to the right and y down. Points have
-    shape (n, 2), centre, start and end shape (2,); colours are "#RRGGBB".
+    Places, widths and radii are in pixels of the result, x to the right and y down; colours are
+    "#RRGGBB".
 
     Args:
         size: Width and height of the picture (px).
@@ -44,22 +45,43 @@ class Canvas:
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
     def set_clip(self, box: Box | None) -> None:
-        """Limit the drawing of shapes to a box; None: the whole picture. Text is never clipped."""
+        """Limit the drawing of shapes to a box; text is never clipped.
+
+        Args:
+            box: The box; None: the whole picture.
+        """
         self._large.set_clip(None if box is None else _scale_box(box))
 
     def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
-        """Draw a filled box with round corners."""
+        """Draw a filled box with round corners.
+
+        Args:
+            box: The box.
+            colour: Its colour.
+            radius: Radius of the corners (px).
+        """
         scaled = pygame.Rect(_scale_box(box))
         pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
 
     def draw_polygon(self, points: Points, colour: str) -> None:
-        """Draw a filled polygon."""
+        """Draw a filled polygon.
+
+        Args:
+            points: Corners (px), shape (n, 2).
+            colour: Its colour.
+        """
         scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
     def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
-        """Draw a line through at least two points."""
+        """Draw a line.
+
+        Args:
+            points: Points on it (px), shape (n, 2), two at least.
+            colour: Its colour.
+            width: Its width (px).
+        """
         scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
         if thick > 4:
@@ -69,7 +91,15 @@ class Canvas:
     def draw_dashes(
         self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
-        """Draw a dashed line; dash and gap are lengths (px)."""
+        """Draw a dashed line.
+
+        Args:
+            points: Points on it (px), shape (n, 2), two at least.
+            colour: Its colour.
+            width: Its width (px).
+            dash: Length of a dash (px).
+            gap: Length of a gap (px).
+        """
         vertices = np.asarray(points, float)
         steps = np.hypot(*np.diff(vertices, axis=0).T)
         length = np.concatenate([[0.0], np.cumsum(steps)])
@@ -80,17 +110,30 @@ class Canvas:
         for start, end in zip(scaled[::2], scaled[1::2], strict=True):
             pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
 
-    def draw_disc(self, centre: Any, radius: float, colour: str) -> None:
-        """Draw a filled circle."""
-        pygame.draw.circle(self._large, colour, _scale_points([centre])[0], _OVERSAMPLING * radius)
+    def draw_disc(
+        self, centre: Points, radius: float, colour: str, width: float | None = None
+    ) -> None:
+        """Draw a circle.
 
-    def draw_ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
-        """Draw a circle, its radius to the middle of the line."""
-        place, thick = _scale_points([centre])[0], max(round(_OVERSAMPLING * width), 1)
-        pygame.draw.circle(self._large, colour, place, _OVERSAMPLING * radius + thick / 2, thick)
+        Args:
+            centre: Its centre (px), shape (2,).
+            radius: Its radius (px), to the middle of the line.
+            colour: Its colour.
+            width: Width of the line (px); None fills the circle.
+        """
+        thick = 0 if width is None else max(round(_OVERSAMPLING * width), 1)
+        (place,), outer = _scale_points(np.asarray(centre)[None]), _OVERSAMPLING * radius
+        pygame.draw.circle(self._large, colour, place, outer + thick / 2, thick)
 
-    def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
-        """Draw a line with a head at its end; the head shrinks with a short one."""
+    def draw_arrow(self, start: Points, end: Points, colour: str, width: float = 2.0) -> None:
+        """Draw a line with a head at its end; the head shrinks with a short one.
+
+        Args:
+            start: Its foot (px), shape (2,).
+            end: Its tip (px), shape (2,).
+            colour: Its colour.
+            width: Width of the line (px).
+        """
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
@@ -104,7 +147,7 @@ class Canvas:
 
     def draw_text(
         self,
-        place: Any,
+        place: Sequence[float] | Array,
         words: str,
         colour: str,
         size: int = 13,
@@ -178,6 +221,9 @@ def _render_words(words: str, colour: str, size: int, bold: bool) -> pygame.Surf
         return _load_font(size, bold).render(words, True, colour)
 
 
+_get_clock = functools.cache(pygame.time.Clock)
+
+
 def show_picture(picture: pygame.Surface, rate: float) -> None:
     """Show a picture in the window, no sooner than 1 / rate seconds after the last one.
 
@@ -192,16 +238,6 @@ def show_picture(picture: pygame.Surface, rate: float) -> None:
     _get_clock().tick(rate)
 
 
-def close_window() -> None:
-    """Close the window."""
-    pygame.display.quit()
-
-
-@functools.cache
-def _get_clock() -> pygame.time.Clock:
-    return pygame.time.Clock()
-
-
 def _make_screen(size: tuple[int, int]) -> pygame.Surface:
     """Open the window; without a display warn, and go on with one that shows nothing."""
     try:
@@ -211,7 +247,7 @@ def _make_screen(size: tuple[int, int]) -> pygame.Surface:
             raise pygame.error("SDL finds no screen")
         screen = pygame.display.set_mode(size)
     except pygame.error as error:
-        close_window()
+        pygame.display.quit()
         if os.environ.get("SDL_VIDEODRIVER") in _NO_WINDOW:
             raise
         logger.warn(

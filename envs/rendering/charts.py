@@ -16,20 +16,9 @@ from ..record import Array
 from ..task import FAILURES, ZERO_SLIP
 from ..ticks import TICK
 from ..vehicle.parameters import GRAVITY
+from . import road
 from .canvas import Box, Canvas, pygame
 from .palette import GREY, INK, PALETTE, find_colour, mix_colours
-from .road import (
-    BLUE,
-    ORANGE,
-    SOFT,
-    CarScene,
-    CarTrack,
-    compute_body,
-    draw_road,
-    make_body_outline,
-    make_car_scene,
-    make_wheel_outline,
-)
 from .trace import TRACE_POINT, RenderState
 
 MAX_SPAN = 10.0  # s that are shown at most
@@ -66,14 +55,11 @@ def _make_strips(
     has_yaw_reference: bool,
 ) -> list[_Strip]:
     """Make the charts of sideslip angle, yaw rate and yaw moment, with those of ghosts."""
-
     t = truth[:, TRACE_POINT.t]
 
     def make_lines(column: int, factor: float) -> list[_ChartLine]:
-        others = [
-            _ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], shade) for g, shade in ghosts
-        ]
-        return [*others, _ChartLine(t, factor * truth[:, column], INK, width=2.0)]
+        lines = [_ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], c) for g, c in ghosts]
+        return [*lines, _ChartLine(t, factor * truth[:, column], INK, width=2.0)]
 
     slip, rate = make_lines(TRACE_POINT.beta, _DEGREES), make_lines(TRACE_POINT.gamma, _DEGREES)
     slip_reference, rate_reference = (
@@ -106,8 +92,8 @@ def _draw_strips(canvas: Canvas, box: Box, strips: list[_Strip], first: float, s
     step = 1.0 if span <= 10.0 else 2.0
     for t in np.arange(math.ceil(first / step) * step, first + span + 1e-6, step):
         x = left + 48.0 + (width - 60.0) * (t - first) / span
-        canvas.draw_text((x, top + height - 10.0), f"{t:g}", SOFT, 11, 0.5)
-    canvas.draw_text((left, top + height - 10.0), "time / s", SOFT, 11)
+        canvas.draw_text((x, top + height - 10.0), f"{t:g}", road.SOFT, 11, 0.5)
+    canvas.draw_text((left, top + height - 10.0), "time / s", road.SOFT, 11)
 
 
 def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: float) -> None:
@@ -124,7 +110,7 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
     for share in (-1.0, 0.0, 1.0):
         y = top + 0.5 * height * (1.0 - share)
         canvas.draw_line([(left, y), (left + width, y)], _GRID, 1.0)
-        canvas.draw_text((left - 6.0, y), f"{share * limit:g}", SOFT, 11, 1.0)
+        canvas.draw_text((left - 6.0, y), f"{share * limit:g}", road.SOFT, 11, 1.0)
     canvas.draw_text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
     canvas.set_clip(box)
     for line in strip.lines:
@@ -160,25 +146,16 @@ MAGNIFIED = 4.0  # times the sideslip angle is drawn
 _LENGTH, _CIRCLE = 190.0, 38.0  # pixels: the car, and the circle of 0.3 of its weight
 
 
-def draw_closeup(
+def _draw_closeup(
     canvas: Canvas,
     box: Box,
-    scene: CarScene,
+    scene: road.CarScene,
     beta: float,
     reference: float,
     estimates: dict[str, tuple[float, str]],
 ) -> None:
-    """Draw the close-up of a car in a box.
-
-    Args:
-        canvas: The canvas.
-        box: The box.
-        scene: The car.
-        beta: Sideslip angle (rad).
-        reference: Reference of the sideslip angle (rad).
-        estimates: By label, estimate of the sideslip angle (rad) and its colour.
-    """
-    front, rear, half = compute_body(scene.vehicle)
+    """Draw a car, its sideslip angle, reference and estimates (rad) with their colours by label."""
+    front, rear, half = road.compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
     x_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear)
     y_0 = box[1] + 0.5 * box[3]
@@ -187,8 +164,8 @@ def draw_closeup(
         x, y = np.asarray(points, float).T * scale
         return np.stack([x_0 + x, y_0 - y], 1)
 
-    canvas.draw_polygon(to_pixels(make_body_outline(rear, front, half)), "#C9CED4")
-    inner = make_body_outline(rear + 0.02, front - 0.02, half - 1.5 / scale)
+    canvas.draw_polygon(to_pixels(road.make_body_outline(rear, front, half)), "#C9CED4")
+    inner = road.make_body_outline(rear + 0.02, front - 0.02, half - 1.5 / scale)
     canvas.draw_polygon(to_pixels(inner), "#EDEFF1")
     per_newton = _CIRCLE / (0.3 * scene.vehicle.mass * GRAVITY)
     for wheel in scene.wheels:
@@ -196,9 +173,9 @@ def draw_closeup(
         if wheel.capacity > 0.0:
             radius = wheel.capacity * per_newton
             canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
-            canvas.draw_ring(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
+            canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
     for wheel in scene.wheels:
-        outline = make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)
+        outline = road.make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)
         canvas.draw_polygon(to_pixels(outline), "#A9B0B7")
     _draw_forces(canvas, scene, to_pixels, per_newton)
     _draw_motors(canvas, box, scene, to_pixels)
@@ -209,13 +186,15 @@ def draw_closeup(
         canvas.draw_text((foot[0] + 12.0, foot[1]), f"wind {abs(scene.wind):.0f} N", PALETTE[3], 12)
     if any(wheel.capacity for wheel in scene.wheels):
         words = "tyre forces in their friction circles"
-        canvas.draw_text((box[0] + 14.0, box[1] + 12.0), words, SOFT, 12)
+        canvas.draw_text((box[0] + 14.0, box[1] + 12.0), words, road.SOFT, 12)
     degrees = round(math.degrees(beta), 1) + 0.0  # no -0.0
     words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
     canvas.draw_text((box[0] + 14.0, box[1] + box[3] - 12.0), words, INK, 12)
 
 
-def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: _ToPixels, per_newton: float) -> None:
+def _draw_forces(
+    canvas: Canvas, scene: road.CarScene, to_pixels: _ToPixels, per_newton: float
+) -> None:
     """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
         cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
@@ -223,7 +202,7 @@ def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: _ToPixels, per_newt
         left = sin * wheel.F_x + cos * wheel.F_y
         start = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
         utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
-        colour = mix_colours(ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
+        colour = mix_colours(road.ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
         canvas.draw_arrow(start, start + per_newton * np.array([forward, -left]), colour, 3.0)
         if wheel.capacity:
             gap = math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
@@ -231,7 +210,7 @@ def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: _ToPixels, per_newt
             canvas.draw_text((start[0], start[1] - gap), words, colour, 12, 0.5)
 
 
-def _draw_motors(canvas: Canvas, box: Box, scene: CarScene, to_pixels: _ToPixels) -> None:
+def _draw_motors(canvas: Canvas, box: Box, scene: road.CarScene, to_pixels: _ToPixels) -> None:
     """Draw each rear motor's torque as a bar, to the right where it drives."""
     for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
         _, y = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
@@ -239,7 +218,7 @@ def _draw_motors(canvas: Canvas, box: Box, scene: CarScene, to_pixels: _ToPixels
         canvas.draw_box((x - 30.0, y + 4.0, 60.0, 7.0), "#E4E7EA", 3.5)
         share = min(max(torque / scene.max_torque, -1.0), 1.0)
         canvas.draw_box((x + min(30.0 * share, 0.0), y + 4.0, abs(30.0 * share), 7.0), PALETTE[0])
-        canvas.draw_line([(x, y + 2.0), (x, y + 13.0)], SOFT, 1.0)
+        canvas.draw_line([(x, y + 2.0), (x, y + 13.0)], road.SOFT, 1.0)
         canvas.draw_text((x, y - 6.0), f"{torque:+.0f} N m", INK, 12, 0.5)
 
 
@@ -290,20 +269,20 @@ def draw_picture(
     first = max(now[TRACE_POINT.t] - span, 0.0)
     truth, estimates = trace.select_since(first)
     shades = _choose_shades(estimates)
-    scene = make_car_scene(shot)
-    ghost_cars = [
-        CarTrack(make_car_scene(item), item.trace.select_since(first)[0], GREY, ghost_name)
-        for ghost_name, item in ghosts
-    ]
+    scene = road.make_car_scene(shot)
+    ghost_cars = []
+    for label, state in ghosts:
+        past, _ = state.trace.select_since(first)
+        ghost_cars.append(road.CarTrack(road.make_car_scene(state), past, GREY, label))
     canvas = Canvas(SIZE)
     canvas.draw_box((0.0, 0.0, *SIZE), _PAPER)
     if draw_world is None:
-        driven_car = CarTrack(scene, truth, BLUE, name if ghosts else "")
-        draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
+        driven_car = road.CarTrack(scene, truth, road.BLUE, name if ghosts else "")
+        road.draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
     newest = {label: (float(item[-1, 0]), shades[label]) for label, item in estimates.items()}
     newest = {label: item for label, item in newest.items() if math.isfinite(item[0])}
     beta, reference = now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref]
-    draw_closeup(canvas, _CLOSEUP, scene, beta, reference, newest)
+    _draw_closeup(canvas, _CLOSEUP, scene, beta, reference, newest)
     has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
     others = [(item.truth, item.colour) for item in ghost_cars]
     full_scale = float(p[P.task.yaw_scale])
@@ -341,17 +320,17 @@ def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[
 
 
 def _draw_heading(
-    canvas: Canvas, scene: CarScene, scenario: str, t: float, failures: list[tuple[str, int]]
+    canvas: Canvas, scene: road.CarScene, scenario: str, t: float, failures: list[tuple[str, int]]
 ) -> None:
     """Draw the names of scenario and car, the speed, and whose drive failed."""
     x = 30.0 + canvas.draw_text((16.0, 20.0), scenario, INK, 17, bold=True)
     speed = 3.6 * math.hypot(scene.motion.v_x, scene.motion.v_y)
     car = f"{scene.vehicle.name}, {speed:.0f} km/h, friction {scene.friction:.2f}"
-    x += 16.0 + canvas.draw_text((x, 21.0), car, SOFT, 14)
+    x += 16.0 + canvas.draw_text((x, 21.0), car, road.SOFT, 14)
     for name, failure in failures:
         if failure:
             words = f"{name}: {FAILURES[failure]}" if name else FAILURES[failure]
             width = canvas.draw_text((x + 10.0, 20.0), words, "#FFFFFF", 13)
-            canvas.draw_box((x, 9.0, width + 20.0, 22.0), ORANGE, 11.0)
+            canvas.draw_box((x, 9.0, width + 20.0, 22.0), road.ORANGE, 11.0)
             x += width + 30.0
     canvas.draw_text((SIZE[0] - 16.0, 20.0), f"{t:.2f} s", INK, 17, 1.0, True)

@@ -15,7 +15,7 @@ from ..validation import check_choice
 from .trace import EpisodeTrace, RenderState
 
 Frame = npt.NDArray[np.uint8]
-PackedArrays = tuple[Array, Array, Any, Array, EpisodeConfig]
+PackedArrays = tuple[Array, Array, npt.NDArray[np.int64], Array, EpisodeConfig]
 """The first fields of a `RenderState`."""
 _MODES = ("human", "rgb_array")
 _TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a control period
@@ -84,7 +84,7 @@ class RenderMixin:
             ResetNeeded: If there was no reset.
         """
         if not self._traces:
-            self._traces = [EpisodeTrace() for _ in range(self._cars)]
+            self._traces = [EpisodeTrace() for _ in range(getattr(self, "num_envs", 1))]
         arrays, trace = self._get_packed_arrays(row), self._traces[row]
         render_state = RenderState(*arrays, trace, self._has_tyre_forces)
         if not render_state.params[P.car.m] > 0.0:
@@ -99,7 +99,7 @@ class RenderMixin:
             from .canvas import read_pixels
             from .charts import draw_picture
 
-            states = map(self.make_render_state, range(self._cars))
+            states = map(self.make_render_state, range(getattr(self, "num_envs", 1)))
             return tuple(read_pixels(draw_picture(state)) for state in states)
         if self.render_mode == "human":
             self._show()
@@ -107,15 +107,11 @@ class RenderMixin:
             logger.warn("render() draws nothing: the env was made without a render_mode")
         return None
 
-    @property
-    def _cars(self) -> int:
-        return int(getattr(self, "num_envs", 1))
-
     def _close_window(self) -> None:
         if self.render_mode == "human" and self._has_shown:
-            from .canvas import close_window
+            from .canvas import pygame
 
-            close_window()
+            pygame.display.quit()
 
 
 class SingleRenderMixin(RenderMixin):
@@ -166,6 +162,10 @@ class VectorRenderMixin(RenderMixin):
         """Return a frame of each car in the mode "rgb_array", else None."""
         return self._render_frames()
 
-    def close_extras(self, **_: Any) -> None:
-        """Close the window, if there is one."""
+    def close_extras(self, **kwargs: object) -> None:
+        """Close the window, if there is one.
+
+        Args:
+            kwargs: Arguments of `close`, which change nothing.
+        """
         self._close_window()

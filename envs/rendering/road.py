@@ -123,6 +123,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
         wheels.append(Wheel(*place, *forces))
     lanes = _find_lanes(params.path, config)
+    s = np.arange(motion.s - _DRAWN_LENGTH, motion.s + _DRAWN_LENGTH, 0.5) if lanes else np.empty(0)
     return CarScene(
         motion,
         config.vehicle,
@@ -134,7 +135,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         float(_compute_wind(tick, params.wind)[0]),
         _make_camera_overlay(p, motion) if "camera" in config.slow else None,
         lanes,
-        _sample_path(params.path, motion.s) if lanes else np.empty((0, 2)),
+        np.stack([s, _compute_path_offset(params.path, s)], 1),
         _sample_curvatures(params, z, motion, variant.road),
         float(params.task.half_width),
         int(z[Z.clock.failure]),
@@ -156,11 +157,6 @@ def _find_lanes(path: TrackPath, config: EpisodeConfig) -> tuple[Section, ...]:
     scale = float(path.length_1 / standard.length_1)
     start = float(path.start_1 - scale * standard.start_1)
     return make_sections(track, width, start, scale, math.copysign(1.0, path.shift_1))
-
-
-def _sample_path(path: TrackPath, s: float) -> Array:
-    distances = np.arange(s - _DRAWN_LENGTH, s + _DRAWN_LENGTH, 0.5)
-    return np.stack([distances, _compute_path_offset(path, distances)], 1)
 
 
 def _sample_curvatures(params: StepParams, z: Array, motion: Motion, road: int) -> Array:
@@ -234,6 +230,105 @@ class _CentreLine:
         return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
 
 
+class _RoadPicture(NamedTuple):
+    """The road around a car, drawn in a box of a canvas."""
+
+    canvas: Canvas
+    box: Box
+    project: _GroundProjection
+    centre_line: _CentreLine
+    scene: CarScene
+    s: Array  # m, places along the road that are drawn
+
+    def locate(self, s: Array, y: Array) -> Array:
+        """Locate points of the road, s ahead and y to the left (m), in the picture (px), (n, 2)."""
+        return self.project(self.centre_line.locate(s, y))
+
+    def fill_band(self, s: Array, right: float, left: float, colour: str) -> None:
+        """Fill a strip of the road between two lateral offsets (m)."""
+        y = np.repeat([right, left], len(s))
+        self.canvas.draw_polygon(self.locate(np.concatenate([s, s[::-1]]), y), colour)
+
+    def draw_surface(self) -> None:
+        """Draw grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
+        is_ground = self.scene.half_width > 10.0 or bool(self.scene.lanes)
+        self.canvas.draw_box(self.box, ASPHALT if is_ground else GRASS)
+        if not is_ground:
+            edge = self.scene.half_width + 0.6
+            self.fill_band(self.s, -edge, edge, ASPHALT)
+        for lane in self.scene.lanes:
+            ends, half = np.array([lane.start, lane.start + lane.length]), 0.5 * lane.width
+            shade = mix_colours(PAINT, ASPHALT, 0.5)
+            self.fill_band(ends, lane.offset - half, lane.offset + half, shade)
+
+    def draw_camera_overlay(self, overlay: _CameraOverlay) -> None:
+        """Draw the camera's field of view to the preview point, and the offset that it measures."""
+        m, colour = self.scene.motion, PALETTE[5] if overlay.has_lane else ORANGE
+        angles = m.psi + np.linspace(-overlay.half_angle, overlay.half_angle, 9)
+        reach = overlay.preview / np.cos(angles - m.psi)
+        rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
+        wedge = np.concatenate([[[m.X, m.Y]], rim])
+        self.canvas.draw_polygon(self.project(wedge), mix_colours(colour, ASPHALT, 0.2))
+        if overlay.has_lane:
+            x, y = m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)
+            lane = self.locate(np.array([m.s + overlay.preview]), np.array([0.0]))
+            offset = np.concatenate([lane, self.project(np.array([[x, y]]))])
+            self.canvas.draw_line(offset, colour, 2.5)
+            self.canvas.draw_disc(lane[0], 3.0, colour)
+
+    def draw_markings(self) -> None:
+        """Draw lane markings, or cones with the driver's path; a thin line every ten metres."""
+        canvas, scene, s = self.canvas, self.scene, self.s
+        for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
+            cross_line = self.locate(np.full(2, place), np.array([-30.0, 30.0]))
+            canvas.draw_line(cross_line, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
+            x, bottom = cross_line[:, 0].mean(), self.box[1] + self.box[3]
+            canvas.draw_text((x + 4.0, bottom - 10.0), f"{place:.0f} m", SOFT, 11)
+        if scene.lanes:
+            path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
+            canvas.draw_dashes(self.locate(*path.T), SOFT, 1.0, 2.0, 4.0)
+        else:
+            edge = scene.half_width if scene.half_width <= 10.0 else _LANE
+            for side in (-edge, edge):
+                canvas.draw_line(self.locate(s, np.full_like(s, side)), PAINT, 2.0)
+            for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
+                canvas.draw_line(self.locate(start + np.arange(4.0), np.zeros(4)), PAINT, 2.0)
+        for lane in scene.lanes:
+            count = max(round(lane.length / 3.0), 2)
+            places = np.linspace(lane.start, lane.start + lane.length, count + 1)
+            for place in places[np.abs(places - s.mean()) < 30.0]:
+                sides = lane.offset + np.array([-0.5, 0.5]) * lane.width
+                for cone in self.locate(np.full(2, place), sides):
+                    canvas.draw_disc(cone, 3.6, ORANGE)
+                    canvas.draw_disc(cone, 1.4, PAINT)
+
+    def draw_names(self, cars: list[CarTrack], poses: list[Array]) -> None:
+        """Draw the cars' names, each as near as it covers no car and no other name.
+
+        A ghost's name is on its side of the last car, whose name is on the other.
+        """
+        box, taken = self.box, []  # taken: middle, half width and half height
+        for car, (x, y) in zip(cars, poses, strict=True):
+            front, rear, half = self.project.scale * np.array(compute_body(car.scene.vehicle))
+            heading = car.scene.motion.psi - self.scene.motion.theta
+            cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
+            size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
+            taken.append((x + 0.5 * ahead * cos, y - 0.5 * ahead * sin, *size))
+        for i, car in enumerate(cars):
+            x, y, _, tall = taken[i]
+            below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
+            side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
+            is_visible = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
+            tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
+            for row in tries if is_visible else ():
+                clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
+                if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
+                    shade = mix_colours(car.colour, INK, 0.6)
+                    self.canvas.draw_text((x, row), car.name, shade, 12, 0.5)
+                    taken.append((x, row, half, 7.0))
+                    break
+
+
 def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     """Draw the road around the last of the cars, in a box; the others are ghosts beside it.
 
@@ -252,10 +347,12 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
     view = _GroundProjection(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
     s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
+    picture = _RoadPicture(canvas, box, view, road, scene, s)
     canvas.set_clip(box)
-    _draw_surface(canvas, box, view, road, scene, s)
-    _draw_camera_overlay(canvas, view, road, scene)
-    _draw_markings(canvas, box, view, road, scene, s)
+    picture.draw_surface()
+    if scene.field_of_view is not None:
+        picture.draw_camera_overlay(scene.field_of_view)
+    picture.draw_markings()
     for car in cars:
         trail = view(car.truth[-400:, [TRACE_POINT.X, TRACE_POINT.Y]])
         if len(trail) > 1:
@@ -264,110 +361,8 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     for car, pose in zip(cars, poses, strict=True):
         heading = car.scene.motion.psi - motion.theta
         _draw_car(canvas, pose, heading, scale, car.scene, car.colour)
-    _draw_names(canvas, box, cars, poses, scale)
+    picture.draw_names(cars, poses)
     canvas.set_clip(None)
-
-
-def _draw_names(
-    canvas: Canvas, box: Box, cars: list[CarTrack], poses: list[Array], scale: float
-) -> None:
-    """Draw the cars' names, each as near as it covers no car and no other name.
-
-    A ghost's name is on its side of the last car, whose name is on the other.
-    """
-    taken = []  # the middle, the half width and the half height of what is not to be covered
-    for car, (x, y) in zip(cars, poses, strict=True):
-        front, rear, half = scale * np.array(compute_body(car.scene.vehicle))
-        heading = car.scene.motion.psi - cars[-1].scene.motion.theta
-        cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
-        size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
-        taken.append((x + 0.5 * ahead * cos, y - 0.5 * ahead * sin, *size))
-    for i, car in enumerate(cars):
-        x, y, _, tall = taken[i]
-        below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
-        side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
-        is_visible = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
-        tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
-        for row in tries if is_visible else ():
-            clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
-            if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
-                canvas.draw_text((x, row), car.name, mix_colours(car.colour, INK, 0.6), 12, 0.5)
-                taken.append((x, row, half, 7.0))
-                break
-
-
-def _make_band(
-    road: _CentreLine, view: _GroundProjection, s: Array, right: float, left: float
-) -> Array:
-    """Make the outline (px) of a strip of the road between two lateral offsets (m)."""
-    edges = road.locate(s, np.full_like(s, right)), road.locate(s[::-1], np.full_like(s, left))
-    return view(np.concatenate(edges))
-
-
-def _draw_surface(
-    canvas: Canvas, box: Box, view: _GroundProjection, road: _CentreLine, scene: CarScene, s: Array
-) -> None:
-    """Draw grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
-    wide = scene.half_width > 10.0
-    canvas.draw_box(box, ASPHALT if wide or scene.lanes else GRASS)
-    if not (wide or scene.lanes):
-        edge = scene.half_width + 0.6
-        canvas.draw_polygon(_make_band(road, view, s, -edge, edge), ASPHALT)
-    for lane in scene.lanes:
-        ends = np.array([lane.start, lane.start + lane.length])
-        half = 0.5 * lane.width
-        outline = _make_band(road, view, ends, lane.offset - half, lane.offset + half)
-        canvas.draw_polygon(outline, mix_colours(PAINT, ASPHALT, 0.5))
-
-
-def _draw_markings(
-    canvas: Canvas, box: Box, view: _GroundProjection, road: _CentreLine, scene: CarScene, s: Array
-) -> None:
-    """Draw lane markings, or cones with the driver's path; a thin line every ten metres."""
-    for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
-        cross_line = view(road.locate(np.full(2, place), np.array([-30.0, 30.0])))
-        canvas.draw_line(cross_line, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
-        x, top = cross_line[:, 0].mean(), box[1] + box[3]
-        canvas.draw_text((x + 4.0, top - 10.0), f"{place:.0f} m", SOFT, 11)
-    if scene.lanes:
-        path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
-        canvas.draw_dashes(view(road.locate(*path.T)), SOFT, 1.0, 2.0, 4.0)
-    else:
-        edge = scene.half_width if scene.half_width <= 10.0 else _LANE
-        for side in (-edge, edge):
-            canvas.draw_line(view(road.locate(s, np.full_like(s, side))), PAINT, 2.0)
-        for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
-            dash = start + np.arange(4.0)
-            canvas.draw_line(view(road.locate(dash, 0.0 * dash)), PAINT, 2.0)
-    for lane in scene.lanes:
-        count = max(round(lane.length / 3.0), 2)
-        for place in np.linspace(lane.start, lane.start + lane.length, count + 1):
-            if abs(place - s.mean()) < 30.0:
-                sides = lane.offset + np.array([-0.5, 0.5]) * lane.width
-                for cone in view(road.locate(np.full(2, place), sides)):
-                    canvas.draw_disc(cone, 3.6, ORANGE)
-                    canvas.draw_disc(cone, 1.4, PAINT)
-
-
-def _draw_camera_overlay(
-    canvas: Canvas, view: _GroundProjection, road: _CentreLine, scene: CarScene
-) -> None:
-    """Draw the camera's field of view to the preview point, and the offset that it measures."""
-    m, overlay = scene.motion, scene.field_of_view
-    if overlay is None:
-        return
-    colour = PALETTE[5] if overlay.has_lane else ORANGE
-    angles = m.psi + np.linspace(-overlay.half_angle, overlay.half_angle, 9)
-    reach = overlay.preview / np.cos(angles - m.psi)
-    rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
-    wedge = np.concatenate([[[m.X, m.Y]], rim])
-    canvas.draw_polygon(view(wedge), mix_colours(colour, ASPHALT, 0.2))
-    if overlay.has_lane:
-        x, y = m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)
-        preview_point = np.array([[x, y]])
-        lane = road.locate(np.array([m.s + overlay.preview]), np.array([0.0]))
-        canvas.draw_line(view(np.concatenate([lane, preview_point])), colour, 2.5)
-        canvas.draw_disc(view(lane)[0], 3.0, colour)
 
 
 def _draw_car(

@@ -1,15 +1,19 @@
 """The trace of an episode: truth and estimates of its steps so far, and the state of a picture."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ..engine.config import EpisodeConfig
 from ..engine.layout import Z
 from ..record import Array
 from ..task import REPORT
 from ..vehicle.dynamics import Motion
+
+if TYPE_CHECKING:
+    import pygame
 
 
 class TracePoint(NamedTuple):
@@ -98,7 +102,7 @@ class EpisodeTrace:
         return self._rows[chosen], {name: x[chosen] for name, x in self._estimates.items()}
 
 
-_RoadPainter = Callable[[tuple[int, int], list[Motion]], Any]
+_RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]
 """Draws a road around a car, and others at their motions, on a surface of so many pixels."""
 
 
@@ -107,7 +111,7 @@ class RenderState(NamedTuple):
 
     params: Array  # of `engine.layout`
     state: Array
-    switches: Any
+    switches: npt.NDArray[np.int64]
     report: Array
     config: EpisodeConfig
     trace: EpisodeTrace

@@ -1,11 +1,14 @@
 """Random draws of an episode: ranges, numbers drawn from them, and redraws of unstable cars."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
 from ..numerics.packed import make_offsets, read
 from ..numerics.primitives import Scalar, Vector, select
+
+if TYPE_CHECKING:
+    from ..vehicle.dynamics import CarParams
 
 _ATTEMPTS = 64
 
@@ -61,16 +64,8 @@ def _draw_numbers(
 
 
 @jit
-def is_stable(d: Draws, car: Any) -> Scalar:
-    """Check whether the drawn linear vehicle is stable at 1.05 times the drawn speed.
-
-    Args:
-        d: `Draws`, whose tyres must give stability before they change and after.
-        car: `CarParams`, to whose stiffness the drawn factors apply.
-
-    Returns:
-        True if it is stable.
-    """
+def _is_stable(d: Draws, car: "CarParams") -> Scalar:
+    """Check whether the drawn car is stable, before its tyres change and after."""
     C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
     has_change = d.tyre_change_time > 0.0
     later_f = C_f * select(has_change, d.front_change, 1.0)
@@ -81,7 +76,7 @@ def is_stable(d: Draws, car: Any) -> Scalar:
 
 
 @jit
-def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: Any) -> Scalar:
+def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: "CarParams") -> Scalar:
     """Check whether 1.05 times a speed (m/s) is below the critical speed of linear tyres."""
     excess = C_f * car.l_f - C_r * car.l_r
     l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
@@ -90,7 +85,7 @@ def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: Any) -> Sca
 
 @jit
 def draw_stable(
-    low: Vector, high: Vector, key_low: int, key_high: int, car: Any, out: Vector
+    low: Vector, high: Vector, key_low: int, key_high: int, car: "CarParams", out: Vector
 ) -> tuple[Draws, int]:
     """Draw until the vehicle is stable, at most 64 times.
 
@@ -107,7 +102,7 @@ def draw_stable(
     """
     attempt = 0
     _draw_numbers(low, high, key_low, key_high, attempt, out)
-    while attempt + 1 < _ATTEMPTS and not is_stable(read(out, DRAWS), car):
+    while attempt + 1 < _ATTEMPTS and not _is_stable(read(out, DRAWS), car):
         attempt += 1
         _draw_numbers(low, high, key_low, key_high, attempt, out)
     return read(out, DRAWS), attempt

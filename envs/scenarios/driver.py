@@ -6,16 +6,19 @@ acceleration that brings the car onto the path within the preview time T,
 is the nominal car's for it in the steady state, behind a first-order lag and a rate limit.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..numerics.functions import sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from ..ticks import TICK
 from ..vehicle.actuators import apply_lag, limit_rate
-from ..vehicle.dynamics import compute_curvature
+from ..vehicle.dynamics import Motion, RoadParams, compute_curvature
 from ..vehicle.tyres import MIN_SPEED
-from .road import compute_path_offset
+from .road import TrackPath, compute_path_offset
+
+if TYPE_CHECKING:
+    from ..task import ReferenceParams
 
 _MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 
@@ -24,13 +27,15 @@ class DriverParams(NamedTuple):
     """Parameters of a driver who steers by preview."""
 
     preview: Scalar  # s, T
-    gain: Any
-    rest: Any  # what a tick leaves of a deviation from the wanted angle
+    gain: Scalar
+    rest: Scalar  # what a tick leaves of a deviation from the wanted angle
     slew: Scalar  # rad a tick, at the wheels
 
 
 @jit
-def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Scalar) -> Scalar:
+def _compute_lateral_error(
+    motion: Motion, path: TrackPath, road: RoadParams, preview: Scalar
+) -> Scalar:
     """Compute how far the path lies to the left of the car's course at a preview distance (m)."""
     sin_r, cos_r = sincos(motion.psi - motion.theta)
     slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
@@ -41,7 +46,12 @@ def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Scalar) -
 
 @jit
 def compute_target_angle(
-    motion: Any, path: Any, road: Any, target: Any, driver: DriverParams, stop: Scalar
+    motion: Motion,
+    path: TrackPath,
+    road: RoadParams,
+    target: "ReferenceParams",
+    driver: DriverParams,
+    stop: Scalar,
 ) -> Scalar:
     """Compute the steering angle that brings the car onto the path.
 
@@ -67,10 +77,10 @@ def compute_target_angle(
 @jit
 def compute_driver_angle(
     angle: Scalar,
-    motion: Any,
-    path: Any,
-    road: Any,
-    target: Any,
+    motion: Motion,
+    path: TrackPath,
+    road: RoadParams,
+    target: "ReferenceParams",
     driver: DriverParams,
     stop: Scalar,
 ) -> Scalar:
@@ -98,19 +108,19 @@ def compute_driver_angle(
 class SpeedProfile(NamedTuple):
     """The driver's speed, held or followed by PI control, or an acceleration."""
 
-    speed: Any  # m/s, at the start and to hold
-    hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
+    speed: Scalar  # m/s, at the start and to hold
+    hold: Scalar  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
     acceleration: Scalar  # m/s2, from start to end
-    start: Any  # tick
-    end: Any
+    start: Scalar  # tick
+    end: Scalar
     k_p: Scalar  # 1/s
-    k_i: Any  # 1/s2
+    k_i: Scalar  # 1/s2
     surge: Scalar = 0.0  # m/s2, amplitude of a sine
     surge_rate: Scalar = 1.0  # rad/s
 
 
 @inline
-def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> Any:
+def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> tuple[Scalar, Scalar]:
     """Compute the speed and the acceleration that the driver wants at a tick.
 
     Args:
@@ -133,7 +143,7 @@ def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> Any:
 @inline
 def compute_acceleration_command(
     tick: Scalar, v_x: Scalar, integral: Scalar, profile: SpeedProfile, limit: Scalar
-) -> Any:
+) -> tuple[Scalar, Scalar]:
     """Compute the driver's acceleration command: PI on the speed with feedforward.
 
     The wanted acceleration is fed forward; the integral part is held at the limit.
@@ -168,7 +178,7 @@ class Wind(NamedTuple):
 
 
 @jit
-def compute_wind(tick: Scalar, wind: Wind) -> Any:
+def compute_wind(tick: Scalar, wind: Wind) -> tuple[Scalar, Scalar, Scalar]:
     """Compute force and moments of the wind from this tick to the next.
 
     Args:

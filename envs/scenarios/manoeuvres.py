@@ -12,44 +12,25 @@ from typing import Any
 import numpy as np
 
 from ..io import has_suffix, is_document, read_document
-from ..recordings.log_file import find_clock
+from ..recordings.log_file import find_step
 from ..recordings.tables import read_quantities
 from ..validation import check_choice, describe_unknown, short_repr
 from . import tiers
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
-from .scenario import Scenario
-
-_TABLE_SUFFIXES = (".csv", ".parquet")
+from .scenario import Fields, Scenario
 
 
-def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
-    """Read a scenario that steers as a recorded drive, at its first speed, as long as it lasts.
-
-    Everything else is `Scenario`'s default; a mapping over it
-    (`{"base": "drive.csv", "friction": 0.4}`) changes that.
-
-    Args:
-        path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
-            steering angle (time_s, steer_rad or steer_deg) and optionally speed (speed_x_mps).
-        mapping: Our column names to the log's.
-
-    Returns:
-        The scenario.
-
-    Raises:
-        ValueError: For a clock that runs backward, stands still, jumps or is uneven, and for what
-            `read_log` refuses: a file that is no table, a missing column, NaN.
-    """
-    source = Path(path)
-    values, _ = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
+def _read_trace(source: Path) -> Scenario:
+    """Read a scenario that steers as a recorded drive, at its first speed, as long as it lasts."""
+    values, _ = read_quantities(source, {}, ("time", "steer"), {"speed_x"})
     try:
-        _, step = find_clock(values["time"])
+        step = find_step(values["time"])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     trace = tuple(values["steer"].tolist())
     length = round((len(trace) - 1) * step, 9)
-    fields: dict[str, Any] = {"trace": trace, "trace_step": step, "duration": length}
+    fields: Fields = {"trace": trace, "trace_step": step, "duration": length}
     speed = values.get("speed_x", np.zeros(0))
     known_speed = speed[np.isfinite(speed)]
     if len(known_speed):
@@ -57,7 +38,7 @@ def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None =
     return Scenario(name=source.stem, steering="trace", **fields)
 
 
-_DRAWN: dict[str, Any] = {
+_DRAWN: Fields = {
     "mirror": True, "speed": (18.0 * KMH, 36.0 * KMH), "front_stiffness": (0.6, 1.4),
     "rear_stiffness": (0.6, 1.4), "friction": (0.7, 1.0),
 }  # fmt: skip
@@ -66,8 +47,8 @@ _DRAWN: dict[str, Any] = {
 _HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
 _RANDOM = tiers.make_random_steering(0.005, 0.015)
 _SLALOM = tiers.SLALOM | {"amplitude": (0.04, 0.1)}
-_LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
-_BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
+_LANE: Fields = {"steering": "driver", "half_width": 1.75}
+_BEND: Fields = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
 
 _MANOEUVRES = (
     Scenario(name="random-steering", **_RANDOM, **_HARSH),
@@ -123,10 +104,12 @@ ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
 def make_scenario(source: ScenarioSource) -> Scenario:
     """Make a scenario from its name, a file, a mapping of fields, or a scenario itself.
 
-    A TOML or JSON file holds such a mapping, as `Scenario.write` makes one; a CSV or Parquet file
-    is a recorded drive, whose steering is driven again (`read_trace`). A mapping may start from
-    another scenario, a name or a file, under `base`. Without a `name` a file's stem is the name. A
-    missing file raises FileNotFoundError, an unknown name and a value out of place ValueError.
+    A TOML or JSON file holds such a mapping, as `Scenario.write` makes one. A mapping may start
+    from another scenario, a name or a file, under `base`. Without a `name` a file's stem is the
+    name. A CSV or Parquet file (needs the extra `report`) is a recorded drive: its columns for time
+    and steering angle (time_s, steer_rad or steer_deg), and speed (speed_x_mps) if it has one, are
+    driven again, with `Scenario`'s defaults for all else. A missing file raises FileNotFoundError,
+    an unknown name and a value out of place ValueError.
 
     Args:
         source: Name in `SCENARIOS`, path, mapping of fields, or a `Scenario`, returned as it is.
@@ -142,8 +125,8 @@ def make_scenario(source: ScenarioSource) -> Scenario:
         return source
     if isinstance(source, Mapping):
         return _parse_scenario(dict(source))
-    if has_suffix(source, _TABLE_SUFFIXES):
-        return read_trace(source)
+    if has_suffix(source, (".csv", ".parquet")):
+        return _read_trace(Path(source))
     if is_document(source):
         values = read_document(source, "scenario")
         try:
@@ -159,7 +142,7 @@ def make_scenario(source: ScenarioSource) -> Scenario:
     return SCENARIOS[source]
 
 
-def _parse_scenario(values: dict[str, Any]) -> Scenario:
+def _parse_scenario(values: Fields) -> Scenario:
     """Make a scenario from a mapping, which may have a `base`."""
     base = values.pop("base", None)
     known = [entry.name for entry in dataclasses.fields(Scenario)]

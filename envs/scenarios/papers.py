@@ -5,11 +5,9 @@ tie-vision's Table I at 25 km/h, with the default Ornstein-Uhlenbeck disturbance
 noise is that at HDOP 1 in the simulations; in the road tests half of it follows a varying HDOP.
 """
 
-from typing import Any
-
 from ..vehicle.parameters import COMS
 from .draws import KMH
-from .scenario import Scenario
+from .scenario import Fields, Scenario
 
 
 def _make_stiffness(stiffness: float) -> dict[str, float]:
@@ -17,13 +15,13 @@ def _make_stiffness(stiffness: float) -> dict[str, float]:
     return {"front_stiffness": stiffness, "rear_stiffness": stiffness}
 
 
-_SIMULATED: dict[str, Any] = {  # the plant of the papers' own equations
+_SIMULATED: Fields = {  # the plant of the papers' own equations
     "small_angle": True, "tyres": "linear", "lags": False, "roll": False,
     "hdop": 1.0, "hdop_spread": 0.0, "hdop_law": "constant",
 }  # fmt: skip
-_ON_THE_ROAD: dict[str, Any] = {"half_width": 200.0}  # all that the plant has
-_QUIET: dict[str, Any] = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
-_WIND: dict[str, Any] = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
+_ON_THE_ROAD: Fields = {"half_width": 200.0}  # all that the plant has
+_QUIET: Fields = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
+_WIND: Fields = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
 
 # given: sine steering, 25 km/h, tyres 1.2 times the filter's
 _FIG7 = Scenario(

@@ -8,7 +8,7 @@ lanes; the last lane's right edge is in line with the first's in both.
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..numerics.functions import smoothstep
 from ..numerics.jit import inline, jit
@@ -31,7 +31,7 @@ class NominalMotion(NamedTuple):
 @inline
 def step_nominal_car(
     nominal_motion: NominalMotion, steer: Scalar, speed: Scalar, car: Bicycle
-) -> tuple[Any, NominalMotion]:
+) -> tuple[Scalar, NominalMotion]:
     """Step the nominal car, whose path is the road, over a tick by explicit Euler.
 
     Its path has the direction psi + beta and turns by gamma + beta'. The road is a function of time
@@ -76,9 +76,9 @@ class TrackPath(NamedTuple):
     shift_1: Scalar  # m, to the left
     start_1: Scalar  # m, along the road
     length_1: Scalar  # m
-    shift_2: Any
-    start_2: Any
-    length_2: Any
+    shift_2: Scalar
+    start_2: Scalar
+    length_2: Scalar
 
 
 def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
@@ -128,10 +128,9 @@ def make_sections(
     """
     if track not in PATHS:
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
-    lanes = _TRACKS[track](width) if track in _TRACKS else ()
     return tuple(
         Section(start + scale * lane.start, scale * lane.length, lane.width, side * lane.offset)
-        for lane in lanes
+        for lane in (_TRACKS[track](width) if track in _TRACKS else ())
     )
 
 

@@ -21,7 +21,8 @@ from .draws import DRAWS_WIDTH, KMH, Draws, Range, get_range
 from .road import PATHS, ROADS
 from .steering import STEERING_KINDS
 
-Fields = Mapping[str, Any]
+Fields = dict[str, Any]
+"""Fields of a `Scenario` by name, each of a type of its own."""
 _MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 MIN_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 _MAX_SAMPLES = 1_000_000  # of a trace
@@ -42,7 +43,7 @@ _TIMES_OR_NONE = {  # how many
 }  # fmt: skip
 
 
-def _check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
+def _check_fields(fields: Fields, entries: Sequence[dataclasses.Field[object]]) -> None:
     """Check a scenario's values by field; errors name scenario and field."""
     # a field of type float is one number, neither drawn nor None
     numbers = [spec.name for spec in entries if spec.type is float]
@@ -107,7 +108,7 @@ def _check_mappings(fields: Fields) -> None:
         _check_number(f"noise {name}", value)
 
 
-def _check_number(name: str, value: Any) -> None:
+def _check_number(name: str, value: object) -> None:
     if not is_finite(value):
         raise ValueError(f"{name} {short_repr(value)} is not finite")
 
@@ -413,9 +414,9 @@ class Scenario:
         """
         write_document(path, self.to_dict())
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Convert to JSON types without defaults, which `make_scenario` reads back."""
-        values = {}
+        values: dict[str, object] = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
             default = {} if entry.name in ("vehicle", "nominal", "noise") else entry.default

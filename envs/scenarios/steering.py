@@ -1,12 +1,11 @@
 """Steering profiles: the driver's angle at a tick, from numbers drawn at reset; compiled."""
 
-from typing import Any
-
 from ..numerics.functions import PI, exp, sincos, smoothstep
 from ..numerics.jit import jit
 from ..numerics.packed import load_element
 from ..numerics.primitives import Scalar, Vector, any_lane, floor, maximum, minimum, select, sqrt
 from ..ticks import FOREVER, TICK, round_to_ticks
+from .draws import Draws
 
 (
     STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE, SINE_WITH_DWELL, RAMP,
@@ -87,7 +86,7 @@ def interpolate_trace(tick: Scalar, trace: Vector) -> Scalar:
 
 
 @jit
-def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> Any:
+def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> tuple[Scalar, Scalar]:
     """Compute decay and noise gain of a wandering driver's angle over one hold.
 
     The next angle is decay times the last one plus noise gain times a standard normal number.
@@ -106,7 +105,7 @@ def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> Any:
 
 @jit
 def _write_sine(
-    profile: Vector, i: int, amplitude: Any, hertz: Scalar, start: Any, end: Any
+    profile: Vector, i: int, amplitude: Scalar, hertz: Scalar, start: Scalar, end: Scalar
 ) -> None:
     """Write sine i (rad) between two ticks, with phase 0 at its start."""
     profile[5 * i] = amplitude
@@ -117,7 +116,7 @@ def _write_sine(
 
 
 @jit
-def _write_step(profile: Vector, i: int, amplitude: Any, start: Any, rise: Any) -> None:
+def _write_step(profile: Vector, i: int, amplitude: Scalar, start: Scalar, rise: Scalar) -> None:
     """Write smooth step i (rad), which rises for some ticks from its start."""
     k = 5 * SINES + 3 * i
     profile[k], profile[k + 1], profile[k + 2] = amplitude, start, rise
@@ -135,7 +134,7 @@ def _write_dwell(profile: Vector, a: Scalar, hertz: Scalar, start: Scalar, dwell
 
 
 @jit
-def write_steering(kind: int, d: Any, profile: Vector) -> None:
+def write_steering(kind: int, d: Draws, profile: Vector) -> None:
     """Write the steering profile of a kind from drawn numbers.
 
     A driver's and a trace's is empty; a wandering driver's has `compute_wander_gains`. The slalom,

@@ -6,15 +6,14 @@ late GPS, and an uneven camera that may lose the lane. The env names the car, a 
 """
 
 import math
-from typing import Any
 
 from ..vehicle.parameters import COMS, PASSENGER_CAR
 from .draws import KMH
-from .scenario import Scenario
+from .scenario import Fields, Scenario
 
 _DEGREE = math.radians(1.0)
 
-_DRAWN: dict[str, Any] = {
+_DRAWN: Fields = {
     "mirror": True, "front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4),
     "camera_delays": (0.030,), "camera_jitter": 0.010, "camera_loss": 0.05, "camera_heading": 0.35,
     "camera_offset": 4.0, "gps_latency": (0.1, 0.3), "gyro_bias": (-0.5 * _DEGREE, 0.5 * _DEGREE),
@@ -32,33 +31,33 @@ _COMS = _DRAWN | {
 }  # fmt: skip
 _CAR = _DRAWN | {"speed": (60.0 * KMH, 80.0 * KMH), "vehicle": _CAR_PLANT, "nominal": _CAR_PLANT}
 
-RANDOM: dict[str, Any] = {
+RANDOM: Fields = {
     "steering": "random", "onset": (0.0, 1.0), "frequency": (0.3, 0.4), "frequency_2": (0.4, 0.8),
     "frequency_3": (0.2, 0.3), "frequency_4": (0.4, 0.6),
 }  # fmt: skip
-SLALOM: dict[str, Any] = {"steering": "slalom", "onset": (0.5, 1.5), "frequency": (0.2, 0.6)}
-STEP: dict[str, Any] = {
+SLALOM: Fields = {"steering": "slalom", "onset": (0.5, 1.5), "frequency": (0.2, 0.6)}
+STEP: Fields = {
     "duration": 8.0, "steering": "step", "onset": (0.5, 1.5), "hold": (1.0, 2.0),
 }  # fmt: skip
-SINE_WITH_DWELL: dict[str, Any] = {  # FMVSS 126: 0.7 Hz, and half a second at the second peak
+SINE_WITH_DWELL: Fields = {  # FMVSS 126: 0.7 Hz, and half a second at the second peak
     "duration": 6.0, "steering": "sine-with-dwell", "onset": (0.5, 1.0), "frequency": (0.6, 0.8),
     "hold": 0.5,
 }  # fmt: skip
-BRAKE_IN_TURN: dict[str, Any] = {  # the motors brake; they share their torque with the yaw moment
+BRAKE_IN_TURN: Fields = {  # the motors brake; they share their torque with the yaw moment
     "duration": 6.0, "steering": "held-step", "onset": (0.5, 1.0), "speed_change": -12.0 * KMH,
     "change_start": 2.0, "change_length": 2.0,
 }  # fmt: skip
-DOUBLE_LANE_CHANGE: dict[str, Any] = {  # a section takes the time it takes at 25 to 32 km/h
+DOUBLE_LANE_CHANGE: Fields = {  # a section takes the time it takes at 25 to 32 km/h
     "duration": 6.0, "steering": "driver", "path": "iso-3888-2", "path_speed": (7.0, 9.0),
     "onset": (0.5, 1.0), "half_width": 2.0,
 }  # fmt: skip
-_ISO_3888_1: dict[str, Any] = {
+_ISO_3888_1: Fields = {
     "duration": 9.0, "steering": "driver", "path": "iso-3888-1", "onset": (0.5, 1.0),
     "half_width": 5.0,
 }  # fmt: skip
 
 
-def make_random_steering(low: float, high: float) -> dict[str, Any]:
+def make_random_steering(low: float, high: float) -> Fields:
     """Make the fields of a random steering whose pairs of sines have amplitudes in a range.
 
     Args:
@@ -71,18 +70,18 @@ def make_random_steering(low: float, high: float) -> dict[str, Any]:
     return RANDOM | {"amplitude": (low, high), "amplitude_2": (low, high)}
 
 
-def _set_amplitude(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+def _set_amplitude(shape: Fields, low: float, high: float) -> Fields:
     """Set the range of a manoeuvre's steering amplitude (rad)."""
     return shape | {"amplitude": (low, high)}
 
 
-def _make_scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
+def _make_scenarios(tier: str, common: Fields, **shapes: Fields) -> list[Scenario]:
     """Make a tier's scenarios from their fields by name, written with underscores."""
     scenarios = []
     for name, shape in shapes.items():
         # without a driver on a track the road follows the nominal car: the camera sees a lane
         road = "straight" if shape["steering"] == "driver" else "nominal-path"
-        fields: dict[str, Any] = {"road": road} | common | shape
+        fields: Fields = {"road": road} | common | shape
         scenarios.append(Scenario(name=name.replace("_", "-"), tier=tier, **fields))
     return scenarios
 

@@ -7,22 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
-from sideslip.benchmarks.recorded.receiver import (
-    SAME,
-    Signal,
-    Track,
-    compare,
-    compose_verdict,
-    compute_gain,
-    compute_law_size,
-    draw,
-    make_receiver_suite,
-    make_signals,
-    make_track,
-    predict_fixes,
-    replay_nmea,
-    write_kml,
-)
+from sideslip.benchmarks.recorded import receiver
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
@@ -40,10 +25,9 @@ def drive(weight: float, count: int = 700, seed: int = 0) -> list[Epoch]:
     x = np.array([[0.0, 0.0], [8.0, 8.0]])
     epochs = []
     for k in range(count):
-        x = np.array([[1.0, 1.0], [0.0, 1.0]]) @ x + np.linalg.cholesky(force) @ rng.normal(
-            size=(2, 2)
-        )
-        size = NOISE * compute_law_size(hdop[k : k + 1], weight)[0]
+        push = np.linalg.cholesky(force) @ rng.normal(size=(2, 2))
+        x = np.array([[1.0, 1.0], [0.0, 1.0]]) @ x + push
+        size = NOISE * receiver._compute_law_size(hdop[k : k + 1], weight)[0]
         place = x[0] + size * rng.normal(size=2)
         speed = math.hypot(*x[1])
         course = math.atan2(x[1, 1], x[1, 0]) + 0.05 * size / speed * rng.normal()
@@ -70,19 +54,19 @@ def log_of(epochs: list[Epoch], path: Path) -> Path:
     return path
 
 
-def position_of(track: Track) -> Signal:
+def position_of(track: receiver._Track) -> receiver._Signal:
     n = len(track.t)
     where = np.asarray(track.east + 1j * track.north, np.complex128)
-    return Signal("position", "m", 2, where, np.ones(n), 20.0, track, np.ones(n, bool))
+    return receiver._Signal("position", "m", 2, where, np.ones(n), 20.0, track, np.ones(n, bool))
 
 
 def test_predictions_are_gaussian_conditioning() -> None:
     """On all fixes between the first, where the filter starts, and the one that is predicted."""
-    n, track = 12, make_track(drive(1.0, 12))
+    n, track = 12, receiver._make_track(drive(1.0, 12))
     R = (NOISE * track.hdop) ** 2
     signal = position_of(track)
     where = signal.z
-    error, variance = predict_fixes(signal, R, Q)
+    error, variance = receiver._predict_fixes(signal, R, Q)
     assert np.isnan(error[:4]).all() and np.isfinite(error[4:]).all()
     step = np.array([[1.0, 1.0], [0.0, 1.0]])
     state, full = np.diag([R[0], 400.0]), np.zeros((2 * n, 2 * n))
@@ -101,32 +85,30 @@ def test_predictions_are_gaussian_conditioning() -> None:
 
 
 def test_likelihood_finds_the_noise_and_who_follows_hdop_rightly_wins() -> None:
-    (position, _) = make_signals(make_track(drive(1.0)))
-    found = compare(position)
+    (position, _) = receiver._make_signals(receiver._make_track(drive(1.0)))
+    found = receiver._compare(position)
     table = found["table"]
     assert table.r == pytest.approx(NOISE, rel=0.15)
     assert table.q == pytest.approx(Q, rel=0.35)
     assert table.square.mean() == pytest.approx(1.0, abs=0.15)
-    assert (
-        compute_gain(table, found[SAME]).low > 0.0
-        and compute_gain(table, found["constant"]).low > 0.0
-    )
+    for law in (receiver.SAME, "constant"):
+        assert receiver._compute_gain(table, found[law]).low > 0.0
     assert np.median(table.error) < np.median(found["constant"].error)
 
 
 def test_where_the_noise_is_constant_tuning_by_hdop_costs() -> None:
-    (position, _) = make_signals(make_track(drive(0.0)))
-    found = compare(position)
+    (position, _) = receiver._make_signals(receiver._make_track(drive(0.0)))
+    found = receiver._compare(position)
     assert found["constant"].r == pytest.approx(NOISE, rel=0.15)
-    assert compute_gain(found["table"], found["constant"]).high < 0.0
+    assert receiver._compute_gain(found["table"], found["constant"]).high < 0.0
 
 
 def test_the_same_information_is_the_mean_of_the_inverse_variances() -> None:
-    (position, _) = make_signals(make_track(drive(1.0, 300)))
-    found = compare(position)
-    sizes = compute_law_size(position.track.hdop, 1.0)[: position.half]
+    (position, _) = receiver._make_signals(receiver._make_track(drive(1.0, 300)))
+    found = receiver._compare(position)
+    sizes = receiver._compute_law_size(position.track.hdop, 1.0)[: position.half]
     variances = (found["table"].r * sizes) ** 2
-    assert found[SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)
+    assert found[receiver.SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)
 
 
 def test_a_track_leaves_out_what_steps_back_and_starts_anew_where_the_clock_is_set() -> None:
@@ -134,28 +116,27 @@ def test_a_track_leaves_out_what_steps_back_and_starts_anew_where_the_clock_is_s
     blind = epochs[5]._replace(hdop=math.nan)
     lost = epochs[6]._replace(latitude=math.nan)
     set_back = [each._replace(t=each.t - 500.0) for each in epochs[20:]]
-    track = make_track(
-        [*epochs[:5], blind, lost, *epochs[7:10], epochs[9], *epochs[10:20], *set_back]
-    )
+    sent = [*epochs[:5], blind, lost, *epochs[7:10], epochs[9], *epochs[10:20], *set_back]
+    track = receiver._make_track(sent)
     assert len(track.t) == 38 and track.t[18] < track.t[17] - 400.0
     assert track.east[0] == track.north[0] == 0.0
-    scored = np.isfinite(predict_fixes(position_of(track), np.ones(38), Q)[0])
+    scored = np.isfinite(receiver._predict_fixes(position_of(track), np.ones(38), Q)[0])
     assert not scored[[0, 1, 2, 3, 18, 19, 20, 21]].any() and scored[22:].all()
 
 
 def test_a_log_is_answered_drawn_and_laid_on_the_map(tmp_path: Path) -> None:
     path = log_of(drive(1.0, 400), tmp_path / "drive.txt")
-    replay = replay_nmea(path)
-    suite = make_receiver_suite(replay)
+    replay = receiver.replay_nmea(path)
+    suite = receiver.make_receiver_suite(replay)
     lines = suite.verdict.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert lines[0].startswith("Tuning the noise of position by HDOP pays: log-likelihood +")
     assert ["epochs", "400"] in [list(row) for row in suite.tables[-1].cells]
     assert {row.metric for row in suite.rows} >= {"prediction_error", "log_likelihood", "nis"}
     assert suite.figures
-    write_kml(tmp_path / "drive.kml", replay)
+    receiver.write_kml(tmp_path / "drive.kml", replay)
     assert "11.0" in (tmp_path / "drive.kml").read_text()
-    draw(tmp_path / "drive.png", replay)
+    receiver.draw(tmp_path / "drive.png", replay)
     assert (tmp_path / "drive.png").read_bytes().startswith(b"\x89PNG")
     assert replay_file(path).verdict == suite.verdict  # by its content, whatever its name
     with pytest.raises(ValueError, match=r"drive\.txt: a receiver's log takes no vehicle"):
@@ -167,19 +148,19 @@ def test_a_log_too_short_to_compare_is_refused_by_name(tmp_path: Path, sparse: b
     epochs = drive(1.0, 400 if sparse else 50)
     far = [each._replace(t=each.t + 20.0 * k * sparse) for k, each in enumerate(epochs)]
     with pytest.raises(ValueError, match=r"short\.nmea: \d+ fixes to score, where the car moves"):
-        replay_nmea(log_of(far, tmp_path / "short.nmea"))
+        receiver.replay_nmea(log_of(far, tmp_path / "short.nmea"))
 
 
 def test_a_log_without_hdop_is_refused(tmp_path: Path) -> None:
     path = log_of([each._replace(hdop=math.nan) for each in drive(0.0, 200)], tmp_path / "a.nmea")
     with pytest.raises(ValueError, match=r"a\.nmea: no fix has an HDOP: expected GGA"):
-        replay_nmea(path)
+        receiver.replay_nmea(path)
 
 
 @pytest.mark.skipif(ABSENT, reason=REASON)
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_the_recordings_are_answered(name: str) -> None:
-    replay = replay_nmea(RECORDINGS[name])
-    lines = compose_verdict(replay).splitlines()
+    replay = receiver.replay_nmea(RECORDINGS[name])
+    lines = receiver._compose_verdict(replay).splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert " costs: " in lines[0] if "munich" in name else " changes nothing: " in lines[0]

@@ -12,10 +12,16 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.recorded.bicycle_fit import BicycleFit, Theta, fit, make_windows
+from sideslip.benchmarks.recorded.bicycle_fit import (
+    BicycleFit,
+    Theta,
+    _estimate_noise_levels,
+    fit,
+    make_windows,
+)
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
-from sideslip.benchmarks.recorded.quality import estimate_noise_levels, find_saturated
-from sideslip.benchmarks.recorded.suite import Settings, run_estimators
+from sideslip.benchmarks.recorded.quality import find_saturated
+from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
 from sideslip.benchmarks.recorded.wires import SignalCalibration, apply_wires
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
@@ -95,15 +101,8 @@ def test_the_course_tells_what_the_yaw_rate_leaves_open() -> None:
 
 def test_an_interval_without_data_is_that_of_the_prior() -> None:
     """And a prior belongs to no stretch: it stays when one is left out."""
-    nothing = BicycleFit(
-        Theta(front=0.1),
-        ("front",),
-        np.ones(1),
-        np.zeros((20, 1, 1)),
-        np.zeros((20, 1)),
-        np.array([0.4**-2]),
-        np.array([0.0]),
-    )
+    arrays = np.ones(1), np.zeros((20, 1, 1)), np.zeros((20, 1)), np.array([0.4**-2]), np.zeros(1)
+    nothing = BicycleFit(Theta(front=0.1), ("front",), *arrays)
     assert nothing.half("front") == pytest.approx(student.ppf(0.975, 19) * 0.4)
     pulled = dataclasses.replace(nothing, H=nothing.H + 1.0, pull=np.array([0.3 * 0.4**-2]))
     gone = np.arange(20) < 15
@@ -115,7 +114,7 @@ def test_rows_that_are_alike_count_once() -> None:
     held = np.repeat(white[:, :, ::25], 25, axis=2)
     seldom = np.where(np.arange(400) % 10 == 0, white, 0.0)
     for rows, level in ((white, 0.2), (held, 0.2 * 5.0), (seldom, 0.2)):
-        assert estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
+        assert _estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
 
 
 def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
@@ -147,7 +146,7 @@ def test_five_rows_identify_nothing(tmp_path: Path) -> None:
 
 def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
     how = Settings(estimators=ESTIMATORS, seeds=1, noise=wires.noise)
-    squares = run_estimators([apply_wires(log, wires)], car, how).squares
+    squares = _run_estimators([apply_wires(log, wires)], car, how).squares
     return np.array([squares[name][0] for name in ESTIMATORS])
 
 

@@ -145,7 +145,7 @@ def test_leaving_all_lanes_is_a_departure() -> None:
     info = drive(env, 0, 800)[-1][-2]
     assert info["failure"] == DEPARTURE
     ours = env._traffic.ego  # type: ignore[union-attr]
-    edge = 2.0 if env._traffic.course.free_lane > env._traffic.course.own_lane else 6.0  # type: ignore[union-attr]
+    edge = 2.0 if env._traffic.course.side < 0 else 6.0  # type: ignore[union-attr]
     assert edge < env.motion.y < edge + 2.0 * ours.WIDTH
 
 

@@ -12,14 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.envs.highway.lane_keeping_adapter import (
-    KEEPING,
-    STATES,
-    KeepingEnv,
-    KeepingPlant,
-    NativeObservation,
-    make_keeping_vehicle,
-)
+from sideslip.envs.highway import lane_keeping_adapter as keeping
 from sideslip.envs.outside.plants import OutsideInputs
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
@@ -43,7 +36,7 @@ def test_fault_it_refuses_the_argument_render_mode(monkeypatch: pytest.MonkeyPat
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)  # with "dummy" its frames are black
     with pytest.raises(TypeError, match="render_mode"):
         gym.make("lane-keeping-v0", render_mode="rgb_array")
-    plant = KeepingPlant("rgb_array")
+    plant = keeping._KeepingPlant("rgb_array")
     plant.start(0)
     assert plant.env.render().std() > 5.0
 
@@ -66,10 +59,8 @@ def test_fault_its_step_of_a_tenth_of_a_second_is_unstable_below_5_5_m_s() -> No
 def test_fault_its_linear_model_steers_half_as_strongly() -> None:
     car = BicycleVehicle(None, [0.0, 0.0], speed=8.3)
     car.action["steering"] = 1e-6
-    full, linear = (
-        float(np.ravel(np.asarray(each, object)[5])[0])
-        for each in (car.derivative, car.derivative_linear)
-    )
+    rates = (car.derivative, car.derivative_linear)
+    full, linear = (float(np.ravel(np.asarray(rate, object)[5])[0]) for rate in rates)
     assert linear / full == pytest.approx(0.5, rel=1e-6)
 
 
@@ -82,14 +73,14 @@ def test_our_vehicle_has_the_dynamics_of_theirs() -> None:
         return car.derivative[[4, 5], 0] * [1.0 / speed, 1.0]
 
     columns = [rates(h * speed, 0.0, 0.0), rates(0.0, h, 0.0), rates(0.0, 0.0, h)]
-    model = make_bicycle_model(make_keeping_vehicle(), speed)
+    model = make_bicycle_model(keeping.make_keeping_vehicle(), speed)
     assert np.stack(columns[:2], 1) / h == pytest.approx(model.A, rel=1e-5, abs=1e-6)
     assert columns[2] / h == pytest.approx(model.B[:, 0], rel=1e-5)
 
 
 def test_a_tick_moves_their_car_and_its_place_on_the_lane() -> None:
     """Carried along for a control period, the place is that which a projection finds."""
-    plant = KeepingPlant()
+    plant = keeping._KeepingPlant()
     plant.start(0)
     for _ in range(3000):
         plant.step(OutsideInputs(0.01), 1e-3)
@@ -99,13 +90,13 @@ def test_a_tick_moves_their_car_and_its_place_on_the_lane() -> None:
 
 
 def test_the_environment_keeps_gymnasiums_contract() -> None:
-    check_env(KeepingEnv(), skip_render_check=True)
+    check_env(keeping.KeepingEnv(), skip_render_check=True)
 
 
 def test_the_same_seed_has_the_same_bits() -> None:
     found = []
     for _ in range(2):
-        env = NativeObservation(KeepingEnv(), returned=False)
+        env = keeping.NativeObservation(keeping.KeepingEnv(), returned=False)
         first = env.reset(seed=3)
         found.append([first, *(env.step([0.0, 0.1]) for _ in range(20))])
     assert bits(found[0]) == bits(found[1])
@@ -113,7 +104,7 @@ def test_the_same_seed_has_the_same_bits() -> None:
 
 def test_accelerometer_and_gyro_are_those_of_the_motion() -> None:
     """Without noise the specific force is v' + v gamma, by differences of the true motion."""
-    plant, speeds, felt = KeepingPlant(), [], []
+    plant, speeds, felt = keeping._KeepingPlant(), [], []
     plant.start(0)
     for _ in range(400):
         plant.step(OutsideInputs(0.05), 1e-3)
@@ -130,20 +121,18 @@ def test_accelerometer_and_gyro_are_those_of_the_motion() -> None:
 def test_our_filter_keeps_the_lane_where_their_observation_does_not() -> None:
     offset = {}
     for name in ("multirate-residual-kf", "returned"):
-        base: Any = KeepingEnv()
-        env: Any = (
-            NativeObservation(base, returned=True)
-            if name == "returned"
-            else EstimateObservation(base, name, outputs=STATES, std=False)
-        )
+        base: Any = keeping.KeepingEnv()
+        env: Any = keeping.NativeObservation(base, returned=True)
+        if name != "returned":
+            env = EstimateObservation(base, name, outputs=keeping.STATES, std=False)
         drive = rollout(env, make_agent("lane-keeping", env, moment=False), seed=0)
-        assert drive["t"][-1] == KEEPING.duration
+        assert drive["t"][-1] == keeping.KEEPING.duration
         offset[name] = abs(base.motion.y)
     assert offset["multirate-residual-kf"] < 0.2 < offset["returned"]
 
 
 def test_snapshots_and_options_are_refused() -> None:
-    env = KeepingEnv()
+    env = keeping.KeepingEnv()
     with pytest.raises(TypeError, match="no snapshots"):
         env.get_state()
     with pytest.raises(ValueError, match="starts as it is, got friction"):

@@ -27,8 +27,8 @@ def test_a_route_is_one_smooth_line_from_the_origin(road: str, side: int) -> Non
 def test_the_free_lane_is_on_the_side_that_was_asked_for(road: str, side: int) -> None:
     course = ROADS[road](side)
     lanes = course.network.graph["a"]["b"]
-    assert lanes[course.own_lane] is course.route[0]
-    assert -lanes[course.free_lane].position(0.0, 0.0)[1] == side * 4.0  # our y points to the left
+    assert lanes[int(side > 0)] is course.route[0]
+    assert -lanes[int(side < 0)].position(0.0, 0.0)[1] == side * 4.0  # our y points to the left
 
 
 LANES = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import make_vehicle
-from sideslip.envs.highway.traffic import PERIOD, BrakingVehicle, Hazard, Traffic, TrafficStart
+from sideslip.envs.highway.traffic import PERIOD, Hazard, Traffic, TrafficStart, _BrakingVehicle
 from sideslip.envs.vehicle.dynamics import Motion
 
 V = 20.0
@@ -28,9 +28,8 @@ def test_our_car_is_where_its_body_is() -> None:
     ours = traffic().ego
     ours.set_motion(AHEAD._replace(X=10.0, Y=2.0, psi=0.3, v_y=1.0))
     centre = 0.5 * (CAR.front_arm - CAR.rear_arm)
-    assert ours.position == pytest.approx(
-        [10.0 + centre * np.cos(0.3), -2.0 - centre * np.sin(0.3)]
-    )
+    place = [10.0 + centre * np.cos(0.3), -2.0 - centre * np.sin(0.3)]
+    assert ours.position == pytest.approx(place)
     assert ours.heading == -0.3
     course = -np.arctan2(ours.velocity[1], ours.velocity[0])
     assert course == pytest.approx(0.3 + np.arctan2(1.0, V))
@@ -40,7 +39,7 @@ def test_the_one_ahead_brakes_as_it_was_drawn_and_never_backs_up() -> None:
     hazard = Hazard(headway=1.0, onset=0.5, braking=0.8)
     around = traffic(hazard)
     lead = around.road.vehicles[1]
-    assert isinstance(lead, BrakingVehicle)
+    assert isinstance(lead, _BrakingVehicle)
     gap = lead.position[0] - around.ego.position[0] - 0.5 * (lead.LENGTH + around.ego.LENGTH)
     assert gap == pytest.approx(V)
     speeds = []
@@ -88,7 +87,7 @@ def test_an_impact_that_highway_env_foresees_is_a_crash_to_both() -> None:
 def test_a_car_has_departed_whose_width_is_beyond_the_edge(away: float) -> None:
     """The edge line is 2 m to the side where no lane is free, the car 1.8 m wide."""
     around = traffic()
-    side = -1.0 if around.course.free_lane < around.course.own_lane else 1.0
+    side = -float(around.course.side)
     around.step_road(AHEAD._replace(Y=side * away))
     assert around.departed == (away > 2.0 + 0.5 * CAR.width)
     around.step_road(AHEAD._replace(Y=-side * away))  # in the free lane

@@ -127,9 +127,8 @@ def test_a_column_that_is_given_twice(tmp_path: Path, change: Callable[[str], st
     path.write_text(csv_of(table, decimal=".").replace("again", change("steer_rad")))
     (log,), remarks = read_parts(path)
     same(log, read_log(saved(drive(300), tmp_path, "other.csv")))
-    assert [remark.casefold() for remark in remarks] == [
-        "steer_rad is given twice, with the same values."
-    ]
+    (remark,) = remarks
+    assert remark.casefold() == "steer_rad is given twice, with the same values."
     table["again"] *= 2.0
     path.write_text(csv_of(table, decimal=".").replace("again", change("steer_rad")))
     with pytest.raises(ValueError, match=r"(?i)steer_rad is given twice, in columns 3 and 8"):

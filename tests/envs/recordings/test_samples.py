@@ -50,8 +50,8 @@ def held(table: pd.DataFrame) -> pd.DataFrame:
 @pytest.mark.parametrize("first", [0, 300])
 def test_a_held_course_counts_its_changes(tmp_path: Path, every: float, first: int) -> None:
     table = with_course(every, first)
-    table = table[table["course_deg"] != held(table)["course_deg"].shift()]  # no sample repeats
-    table = with_course(every, first).assign(course_deg=table["course_deg"])
+    is_new = table["course_deg"] != held(table)["course_deg"].shift()  # no sample repeats
+    table["course_deg"] = table["course_deg"].where(is_new)
     expect(table, saved(held(table), tmp_path), "course is held between its samples")
 
 
@@ -124,9 +124,8 @@ def test_the_kind_of_samples_by_hand(tmp_path: Path) -> None:
     path = saved(held(rare), tmp_path)
     expect(held(rare), path, "")  # three samples are no evidence
     expect(rare, path, "course is held", course_deg_held="course_deg")
-    expect(
-        rare, saved(held(rare).rename(columns={"course_deg": "course_deg_held"}), tmp_path), "held"
-    )
+    named = held(rare).rename(columns={"course_deg": "course_deg_held"})
+    expect(rare, saved(named, tmp_path), "held")
     with pytest.raises(ValueError, match="unknown column name 'steer_rad_held'"):
         read_log(path, {"steer_rad_held": "steer_rad"})
 

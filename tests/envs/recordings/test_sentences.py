@@ -27,15 +27,10 @@ def test_a_position_comes_from_gns_or_gll_where_there_is_no_gga() -> None:
         assert (epoch.has_fix, epoch.hdop, epoch.satellites) == (fixed, 0.9, 11)
     vtg = sentence("GPVTG,90.0,T,,M,10.0,N,,K,A")
     for status, fixed in (("A", True), ("V", False)):
-        epochs, _ = decoded(
-            b"".join(
-                sentence(f"GPGLL,{place},12000{k}.00,{status},A") + vtg + sentence(GSA)
-                for k in range(3)
-            )
-        )
-        assert [(e.t % 60.0, e.has_fix, e.hdop) for e in epochs] == [
-            (k, fixed, 1.7) for k in range(3)
-        ]
+        times = (sentence(f"GPGLL,{place},12000{k}.00,{status},A") for k in range(3))
+        epochs, _ = decoded(b"".join(gll + vtg + sentence(GSA) for gll in times))
+        read = [(e.t % 60.0, e.has_fix, e.hdop) for e in epochs]
+        assert read == [(k, fixed, 1.7) for k in range(3)]
     (epoch,), _ = decoded(rmc() + gga() + sentence("GPGLL,,,,,120000.00,V,N"))
     assert epoch.has_fix  # what a receiver says of its other sentences does not count
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
 from sideslip.envs.rendering.canvas import Canvas
-from sideslip.envs.rendering.charts import MAGNIFIED, draw_closeup
+from sideslip.envs.rendering.charts import MAGNIFIED, _draw_closeup
 from sideslip.envs.rendering.palette import INK, PALETTE
 from sideslip.envs.rendering.road import CarScene, make_car_scene
 
@@ -49,7 +49,7 @@ def still() -> CarScene:
 
 def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
     canvas = Noted()
-    draw_closeup(canvas, BOX, scene, beta, 0.0, {"filter": (estimate, ESTIMATE)})
+    _draw_closeup(canvas, BOX, scene, beta, 0.0, {"filter": (estimate, ESTIMATE)})
     return canvas
 
 

@@ -106,9 +106,8 @@ def test_stable_baselines_records_what_its_own_function_makes(
 
 def test_a_row_is_drawn_as_the_car_alone() -> None:
     arguments: dict[str, Any] = {"scenario": "slalom", "render_mode": "rgb_array"}
-    rows = EstimateObservations(
-        gym.make_vec("sideslip/YawFusion-v0", num_envs=2, **arguments), "exact-kf"
-    )
+    cars = gym.make_vec("sideslip/YawFusion-v0", num_envs=2, **arguments)
+    rows = EstimateObservations(cars, "exact-kf")
     alone = EstimateObservation(gym.make("sideslip/YawFusion-v0", **arguments), "exact-kf")
     rows.reset(seed=4)
     alone.reset(seed=5)
@@ -158,10 +157,8 @@ def test_render_fps_is_real_time() -> None:
 def test_what_cannot_be_drawn_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown render_mode 'ansi'; known: human, rgb_array"):
         StabilityEnv(render_mode="ansi")
-    for env in (
-        StabilityEnv(render_mode="rgb_array"),
-        StabilityVectorEnv(2, render_mode="rgb_array"),
-    ):
+    drawn: dict[str, Any] = {"render_mode": "rgb_array"}
+    for env in (StabilityEnv(**drawn), StabilityVectorEnv(2, **drawn)):
         with pytest.raises(ResetNeeded, match=r"nothing to draw yet: call reset\(\)"):
             env.render()
     silent = StabilityEnv()

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.step import make_step_variant
+from sideslip.envs.rendering.canvas import read_pixels
 from sideslip.envs.rendering.charts import _CLOSEUP, _ROAD, _STRIPS, MAX_SPAN, SIZE, draw_picture
 from sideslip.envs.rendering.palette import GREY, INK, find_colour, mix_colours
 from sideslip.envs.rendering.road import BLUE, ORANGE, make_car_scene
@@ -122,11 +123,8 @@ def test_the_chart_begins_anew_with_an_episode_and_slides() -> None:
     trace = env.make_render_state().trace
     assert len(trace.select_since(0.0, 10_000)[0]) == 1101
     assert len(trace.select_since(0.0)[0]) <= 800
-    assert (
-        trace.newest[TRACE_POINT.t]
-        - trace.select_since(trace.newest[TRACE_POINT.t] - MAX_SPAN)[0][0, 0]
-        <= MAX_SPAN
-    )
+    newest = trace.newest[TRACE_POINT.t]
+    assert newest - trace.select_since(newest - MAX_SPAN)[0][0, 0] <= MAX_SPAN
     env.reset()
     assert len(env.make_render_state().trace.select_since(0.0)[0]) == 1
 
@@ -144,10 +142,8 @@ def test_estimates_are_of_their_moment_and_nan_before() -> None:
 
 
 def test_drawing_changes_no_bit() -> None:
-    still, drawn = (
-        StabilityEnv(scenario="slalom"),
-        StabilityEnv(scenario="slalom", render_mode="rgb_array"),
-    )
+    still = StabilityEnv(scenario="slalom")
+    drawn = StabilityEnv(scenario="slalom", render_mode="rgb_array")
     assert bits(still.reset(seed=3)) == bits(drawn.reset(seed=3))
     for _ in range(3):
         drawn.render()
@@ -181,21 +177,15 @@ def test_every_road_is_drawn() -> None:
         assert seen(env).shape == (*SIZE[::-1], 3) and seen(env).dtype == np.uint8
     assert len(painted(seen(cones), ORANGE, _ROAD)) > 50
     assert len(painted(seen(bend), ORANGE, _ROAD)) == 0
-    assert (
-        scene(windy).wind != 0.0
-        and scene(windy).field_of_view is None
-        and scene(bend).field_of_view.has_lane
-    )
+    assert scene(windy).wind != 0.0 and scene(windy).field_of_view is None
+    assert scene(bend).field_of_view.has_lane
 
 
 def test_a_ghost_drives_beside() -> None:
     one, other = started(), started(y=2.0, Y=2.0)
     alone = painted(seen(one), GREY, _ROAD)
-    picture = draw_picture(
-        one.make_render_state(), "with control", [("without", other.make_render_state())]
-    )
-    from sideslip.envs.rendering.canvas import read_pixels
-
+    ghosts = [("without", other.make_render_state())]
+    picture = draw_picture(one.make_render_state(), "with control", ghosts)
     both = painted(read_pixels(picture), GREY, _ROAD)
     assert len(both) > len(alone) + 500
     assert both[:, 1].mean() < 0.5 * _ROAD[3]
@@ -206,8 +196,6 @@ def test_a_ghost_drives_beside() -> None:
 def test_both_cars_are_named_and_no_name_covers_a_car_or_the_other_name(
     y: float, psi: float
 ) -> None:
-    from sideslip.envs.rendering.canvas import read_pixels
-
     one, other = started().make_render_state(), started(y=y, Y=y, psi=psi).make_render_state()
     bare = read_pixels(draw_picture(one, "", [("", other)]))
     named = read_pixels(draw_picture(one, "lqr", [("no control", other)]))

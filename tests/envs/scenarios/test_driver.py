@@ -27,10 +27,8 @@ from ..helpers import FULL, LINEAR, Moment, bits, play
 T = 1.0
 QUICK = DriverParams(T, 1.0, 0.0, 1.0)
 TARGET = make_reference_params(COMS)
-STRAIGHT, TRACK = (
-    make_path("road", 1.0),
-    transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, 1.0),
-)
+STRAIGHT = make_path("road", 1.0)
+TRACK = transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, 1.0)
 FLAT, CLOTHOID = RoadParams(0.0, 0.0, 1.0), RoadParams(0.02, 0.0, 40.0)
 KEEPING = {"steering": "driver", "half_width": 1.75}
 
@@ -64,9 +62,8 @@ def test_the_wanted_angle_is_that_of_the_circle_through_the_preview_point() -> N
         here = motion(s=s, y=y, psi=psi, v_y=v_y)
         y_dot = 7.0 * math.sin(psi) + v_y * math.cos(psi)
         x = (np.arange(10_000) + 0.5) * 7.0 * T / 10_000
-        bend = (
-            np.mean(0.02 * (s + x) / 40.0 * (7.0 * T - x)) * 7.0 * T
-        )  # curvature twice integrated
+        # the curvature, twice integrated
+        bend = np.mean(0.02 * (s + x) / 40.0 * (7.0 * T - x)) * 7.0 * T
         error = compute_path_offset(TRACK, s + 7.0 * T) + bend - (y + T * y_dot)
         expected = 2.0 * error / T**2 * l * (1.0 + G * 49.0) / 49.0
         angle = compute_target_angle(here, TRACK, CLOTHOID, TARGET, QUICK, 10.0)
@@ -93,9 +90,8 @@ def test_a_mirrored_world_is_steered_the_other_way() -> None:
     mirrored = here._replace(y=-0.2, psi=-0.03, v_y=0.1)
     other = transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, -1.0)
     a = compute_driver_angle(0.02, here, TRACK, CLOTHOID, TARGET, QUICK, 0.6)
-    b = compute_driver_angle(
-        -0.02, mirrored, other, CLOTHOID._replace(curvature=-0.02), TARGET, QUICK, 0.6
-    )
+    left = CLOTHOID._replace(curvature=-0.02)
+    b = compute_driver_angle(-0.02, mirrored, other, left, TARGET, QUICK, 0.6)
     assert a == pytest.approx(-b, rel=1e-12)
 
 
@@ -108,9 +104,8 @@ def test_compiled_plain_and_arrays_give_the_same_bits() -> None:
         return function(0.01, state, TRACK, CLOTHOID, TARGET, arms, 0.6)
 
     compiled = [call(compute_driver_angle, Motion(*row)) for row in rows.tolist()]
-    assert [
-        call(as_python(compute_driver_angle), Motion(*row)) for row in rows.tolist()
-    ] == compiled
+    plain = as_python(compute_driver_angle)
+    assert [call(plain, Motion(*row)) for row in rows.tolist()] == compiled
     arrays = call(as_python(compute_driver_angle, ARRAYS), Motion(*rows.T))
     assert bits(arrays) == bits(np.array(compiled))
 
@@ -155,14 +150,8 @@ def test_the_driver_comes_back_to_the_line_with_little_overshoot() -> None:
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
     """The nominal COMS: its corners over the axles, by place and heading, while in each lane."""
-    scene = {
-        **(FULL | KEEPING),
-        "path": "iso-3888-2",
-        "path_speed": 8.0,
-        "onset": 0.5,
-        "duration": 8.0,
-    }
-    env = StabilityEnv("fusion", scenario=scene)
+    scene = FULL | KEEPING | {"path": "iso-3888-2", "path_speed": 8.0, "onset": 0.5}
+    env = StabilityEnv("fusion", scenario=scene | {"duration": 8.0})
     env.reset(seed=0)
     snapshot = env.get_state()
     for i in (0, 3):
@@ -229,6 +218,5 @@ def test_the_driver_starts_with_the_angle_he_wants() -> None:
     env = StabilityEnv("fusion", scenario=LINEAR | KEEPING | bend)
     _, info = env.reset(seed=0)
     v = 25.0 / 3.6
-    assert info["steer"] == pytest.approx(
-        0.02 * COMS.wheelbase * (1.0 + TARGET.G * v * v), rel=1e-9
-    )
+    expected = 0.02 * COMS.wheelbase * (1.0 + TARGET.G * v * v)
+    assert info["steer"] == pytest.approx(expected, rel=1e-9)

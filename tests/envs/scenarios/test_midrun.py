@@ -20,12 +20,7 @@ pytestmark = pytest.mark.plain
 
 TURN: dict[str, Any] = {"steering": "sine", "amplitude": 0.06, "frequency": 0.5}
 CHANGE: dict[str, Any] = {"tyre_change_time": 0.503, "front_change": 0.7, "rear_change": 1.2}
-BRAKING: dict[str, Any] = {
-    "speed_change": -4.0,
-    "change_length": 1.5,
-    "speed": 8.0,
-    "duration": 1.5,
-}
+BRAKING = {"speed": 8.0, "speed_change": -4.0, "change_length": 1.5, "duration": 1.5}
 
 
 def states(env: StabilityEnv, steps: int) -> list[Any]:

@@ -13,91 +13,48 @@ from sideslip.envs.scenarios.papers import ROAD_TESTS, SIMULATIONS
 
 pytestmark = pytest.mark.plain
 
+Fields = dict[str, Any]
 OURS = [scenario.name for scenario in SIMULATIONS]
 TWINS = [scenario.name for scenario in ROAD_TESTS]
 TYRES = ("front_stiffness", "rear_stiffness")
 ROLL = ("roll_inertia", "roll_damping", "roll_stiffness")  # double-layer-gps (43)
-SINE = {"steering": "sine", "amplitude": 0.1, "frequency": 0.5, "onset": 0.0, "duration": 10.0}
-ONE_PERIOD = {"steering": "lane-change", "amplitude": 0.13, "frequency": 0.5, "onset": 0.5}
-WIND = {"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 4.0, "wind_length": 4.0}
+
+
+def fields(steering: str, amplitude: float, hertz: float, onset: float, **more: Any) -> Fields:
+    shape = {"steering": steering, "amplitude": amplitude, "frequency": hertz, "onset": onset}
+    return shape | more
+
+
+WIND: Fields = {"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 4.0, "wind_length": 4.0}
 BLOWN = {"wind_force": 200.0, "wind_height": 0.5, "wind_start": 8.0, "wind_length": 6.0}
-DOUBLE = {
-    **{"steering": "slalom", "amplitude": 0.15, "frequency": 0.2, "onset": 1.0, "duration": 20.0},
-    **{"surge": 0.5, "surge_frequency": 0.1, "roll": True},
-}
+SURGE: Fields = {"surge": 0.5, "surge_frequency": 0.1, "roll": True}
+SINE = fields("sine", 0.1, 0.5, 0.0, duration=10.0)
+FIG8 = fields("lane-change", 0.13, 0.5, 0.5, duration=5.0)
+UNEVEN = SINE | {"camera_delays": (0.020, 0.015, 0.010, 0.025)}
+DAKF = fields("lane-change", 0.2, 0.2, 0.5, duration=10.0, gps_outage=(4.0, 6.0)) | WIND
+STEP: Fields = WIND | {"steering": "step", "amplitude": 0.06, "onset": 1.0, "gps_outage": None}
+DUAL = WIND | fields("slalom", 0.1, 0.25, 1.0, duration=12.0, wind_arm=0.0, gps_period=0.1)
+DOUBLE = fields("slalom", 0.15, 0.2, 1.0, duration=20.0, **SURGE)
+PERIODS = DOUBLE | BLOWN | {"steering": "double-lane-change", "hold": 9.0}
+
+
+def noise(psi: float, y: float) -> dict[str, float]:
+    return {"camera_psi": psi, "camera_y": y}
+
+
 # PAPERS section 1: fields, real tyres, nominal tyres, OU, noise
-TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = {
+TABLE: dict[str, tuple[Fields, float, float, bool, dict[str, float]]] = {
     "tie-vision-fig7": (SINE, 7200.0, 6000.0, True, {}),
-    "tie-vision-fig8": (
-        ONE_PERIOD | {"duration": 5.0},
-        6000.0,
-        6000.0,
-        False,
-        {"camera_psi": 0.0005, "camera_y": 0.003},
-    ),
-    "tie-vision-fig8-stiff": (
-        ONE_PERIOD | {"duration": 5.0},
-        7200.0,
-        6000.0,
-        False,
-        {"camera_psi": 0.0005, "camera_y": 0.003},
-    ),
-    "uneven-delay-fig5": (
-        SINE | {"camera_delays": (0.020, 0.015, 0.010, 0.025)},
-        7200.0,
-        6000.0,
-        False,
-        {"camera_psi": 0.001, "camera_y": 0.01},
-    ),
-    "uneven-delay-fig5-noisy": (
-        SINE | {"camera_delays": (0.020, 0.015, 0.010, 0.025)},
-        7200.0,
-        6000.0,
-        False,
-        {"camera_psi": 0.003, "camera_y": 0.03},
-    ),
-    "dakf-fig6": (
-        {
-            **{"steering": "lane-change", "amplitude": 0.2, "frequency": 0.2, "onset": 0.5},
-            **WIND,
-            **{"gps_outage": (4.0, 6.0), "duration": 10.0},
-        },
-        7000.0,
-        10000.0,
-        True,
-        {},
-    ),
-    "dakf-fig7": (
-        {
-            **{"steering": "step", "amplitude": 0.06, "onset": 1.0, "duration": 10.0},
-            **WIND,
-            **{"gps_outage": None, "lags": True},
-        },
-        7000.0,
-        10000.0,
-        True,
-        {},
-    ),
-    "dual-rate-fig4": (
-        {
-            **{"steering": "slalom", "amplitude": 0.1, "frequency": 0.25, "onset": 1.0},
-            **WIND,
-            **{"wind_arm": 0.0, "gps_period": 0.1, "duration": 12.0},
-        },
-        7000.0,
-        9100.0,
-        True,
-        {},
-    ),
+    "tie-vision-fig8": (FIG8, 6000.0, 6000.0, False, noise(0.0005, 0.003)),
+    "tie-vision-fig8-stiff": (FIG8, 7200.0, 6000.0, False, noise(0.0005, 0.003)),
+    "uneven-delay-fig5": (UNEVEN, 7200.0, 6000.0, False, noise(0.001, 0.01)),
+    "uneven-delay-fig5-noisy": (UNEVEN, 7200.0, 6000.0, False, noise(0.003, 0.03)),
+    "dakf-fig6": (DAKF, 7000.0, 10000.0, True, {}),
+    "dakf-fig7": (STEP | {"lags": True, "duration": 10.0}, 7000.0, 10000.0, True, {}),
+    "dual-rate-fig4": (DUAL, 7000.0, 9100.0, True, {}),
     "double-layer-fig9": (DOUBLE | BLOWN, 7000.0, 10000.0, True, {}),
     "double-layer-fig9-fast": (DOUBLE | BLOWN | {"frequency": 0.4}, 7000.0, 10000.0, True, {}),
-    "double-layer-fig9-periods": (
-        DOUBLE | BLOWN | {"steering": "double-lane-change", "hold": 9.0},
-        7000.0,
-        10000.0,
-        True,
-        {},
-    ),
+    "double-layer-fig9-periods": (PERIODS, 7000.0, 10000.0, True, {}),
     "double-layer-fig9-calm": (DOUBLE, 7000.0, 10000.0, True, {}),
 }
 
@@ -111,21 +68,21 @@ def test_every_paper_simulation_stands_in_the_table() -> None:
 @pytest.mark.smoke
 @pytest.mark.parametrize("name", TABLE)
 def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
-    fields, real, told, disturbed, noise = TABLE[name]
+    expected, real, told, disturbed, noises = TABLE[name]
     scenario = SCENARIOS[name]
-    for field, value in fields.items():
+    for field, value in expected.items():
         assert getattr(scenario, field) == value, field
     rolls = "double-layer" in name
     assert scenario.speed == 25.0 / 3.6
     assert scenario.held_speed == (None if rolls else 25.0 / 3.6)
     assert (scenario.small_angle, scenario.tyres, scenario.roll) == (True, "linear", rolls)
-    assert scenario.lags == fields.get("lags", False)
+    assert scenario.lags == expected.get("lags", False)
     assert (scenario.hdop, scenario.hdop_spread, scenario.hdop_law) == (1.0, 0.0, "constant")
     assert (scenario.disturbance_force, scenario.disturbance_moment, scenario.disturbance_time) == (
         (50.0, 20.0, 0.3) if disturbed else (0.0, 0.0, 0.3)
     )
-    assert dict(scenario.noise) == noise
-    assert scenario.wind_force == fields.get("wind_force", 0.0)
+    assert dict(scenario.noise) == noises
+    assert scenario.wind_force == expected.get("wind_force", 0.0)
     low, high = scenario.get_draw_ranges()
     np.testing.assert_array_equal(low, high)  # nothing is drawn
     env = StabilityEnv("fusion", scenario=name)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sideslip.envs import COMS, Scenario, StabilityEnv
+from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.record import FAST, PACKET, concatenate
 from sideslip.envs.scenarios.steering import compute_steering
@@ -126,16 +126,3 @@ def test_braking_cars_are_followed_at_the_speed_that_their_drivers_want() -> Non
         < 0.8 * np.abs(even[late, Z.nominal_motion.gamma]).max()
     )
     assert math.isfinite(float(np.abs(states[:, Z.motion.theta]).max()))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"road": "winding"}, "unknown road 'winding'; known: straight, nominal-path"),
-        ({"road": "nominal-path", "steering": "driver"}, "follows a programme's steering"),
-        ({"road": "nominal-path", "curvature": 0.01}, "has no curvature, got 0.01"),
-    ],
-)
-def test_roads_that_cannot_be(fields: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Scenario(name="bad", **fields)

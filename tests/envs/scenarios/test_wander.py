@@ -12,40 +12,28 @@ from sideslip.envs.device import make_device_env
 from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike
+from .commands import commands
 
-WANDER: dict[str, Any] = {
-    "steering": "wander",
-    "amplitude": 0.01,
-    "frequency": 2.0,
-    "hold": 0.02,
-    "duration": 0.5,
-}
+WANDER: dict[str, Any] = {"steering": "wander", "amplitude": 0.01, "frequency": 2.0}
+WANDER |= {"hold": 0.02, "duration": 0.5}
 
 
-def commands(n: int = 10, seed: int = 0, **changes: Any) -> Any:
-    """The driver's angle at the ticks of an episode but the last, (T,)."""
-    env = StabilityEnv(scenario=WANDER | changes, control_period=n)
-    env.reset(seed=seed)
-    rows, over = [env.record.fast[:, FAST.steer_command]], False
-    while not over:
-        _, _, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
-        rows.append(env.record.fast[:, FAST.steer_command])
-        over = terminated or truncated
-    return np.concatenate(rows)[1:]  # a row has what acted before it
+def wander(n: int = 10, seed: int = 0, **changes: Any) -> Any:
+    return commands(StabilityEnv(scenario=WANDER | changes, control_period=n), seed)
 
 
 def test_the_angle_is_of_the_seed_alone_and_is_held() -> None:
-    angles = commands()
-    assert bits(commands(7)) == bits(angles)
-    assert bits(commands(1, vehicle={"mass": 500.0})) == bits(angles)
-    assert bits(commands(seed=1)) != bits(angles)
+    angles = wander()
+    assert bits(wander(7)) == bits(angles)
+    assert bits(wander(1, vehicle={"mass": 500.0})) == bits(angles)
+    assert bits(wander(seed=1)) != bits(angles)
     moved = 1 + np.flatnonzero(np.diff(angles))
     np.testing.assert_array_equal(moved, np.arange(20, 500, 20))
 
 
 def test_it_is_stationary_and_forgets_at_its_rate() -> None:
     """From the reset on: standard deviation, correlation of neighbours, white innovations."""
-    angles = np.array([commands(100, seed, duration=4.0)[::20] for seed in range(24)])
+    angles = np.array([wander(100, seed, duration=4.0)[::20] for seed in range(24)])
     keep = np.exp(-2.0 * np.pi * 2.0 * 0.02)
     fresh = (angles[:, 1:] - keep * angles[:, :-1]) / (0.01 * np.sqrt(1.0 - keep**2))
     count = fresh.size
@@ -67,7 +55,7 @@ def test_rows_of_a_batch_are_the_environment_alone() -> None:
 def test_a_forecast_knows_the_angles_and_a_device_refuses_them() -> None:
     env = StabilityEnv(scenario=WANDER)
     env.reset(seed=0)
-    assert bits(make_forecast(env).driver.ravel()) == bits(commands())
+    assert bits(make_forecast(env).driver.ravel()) == bits(wander())
     pytest.importorskip("torch")
     with pytest.raises(ValueError, match="'custom': no wander is driven on a device"):
         make_device_env("sideslip/YawVision-v0", scenario=WANDER)
