@@ -19,7 +19,7 @@ from sideslip.agents.live.messages import (
     Tick,
     encode,
 )
-from sideslip.agents.live.simulate import WireAgent, simulate
+from sideslip.agents.live.simulate import _WireAgent, simulate
 from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation
 
@@ -42,7 +42,7 @@ def drive(
     watch: Callable[[Tick], None] | None = None,
     speed: float = 1.0,
     **options: Any,
-) -> tuple[Rollout, WireAgent, Loop]:
+) -> tuple[Rollout, _WireAgent, Loop]:
     """A drive over loopback, its wires and the loop at the car's end."""
     with Port() as car, Port() as other:
         loop = Loop(
