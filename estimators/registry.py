@@ -15,7 +15,7 @@ from ..envs.validation import describe_unknown
 
 SUFFIX = ".py"
 _PREFIX = "sideslip_user_file_"  # of the modules that users' files become
-_Factory = Callable[..., Any]
+_Factory = Callable[..., Any]  # an agent's or an estimator's
 
 
 def is_user_file(text: str) -> bool:
@@ -74,7 +74,7 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
             yield node.id
 
 
-def _load_user_class(text: str) -> Callable[..., Any]:
+def _load_user_class(text: str) -> _Factory:
     """Load a factory of a user's file as `find_class` finds it; the file is run once."""
     path, name = find_class(text)
     try:

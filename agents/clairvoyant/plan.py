@@ -45,7 +45,7 @@ _STALL_RULE = (1e-3, 3)  # settled: a smaller fraction of the cost gained in so 
 def _simulate_run(
     env: gym.Env[Actions, Actions],
     seed: int,
-    actions: Array,
+    actions: Array | Actions,
     feedback: tuple[Array, Array] | None = None,
 ) -> PlanRun:
     """Simulate an episode; feedback: states (K + 1, n) and gains (K, width, n) for corrections."""
@@ -192,7 +192,7 @@ def record_actions(env: gym.Env[Actions, Actions], agent: "Agent", seed: int) ->
     """
     base = _get_base(env)
     _, *steps = iterate_steps(env, agent, seed)
-    actions = np.zeros((_count_periods(base), *base.action_space.shape), np.float32)
+    actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
     actions[: len(steps)] = [step.action for step in steps]
     return actions
 

@@ -1,7 +1,7 @@
 """The preview of an episode at its start: driver, wind and disturbances, step by step."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +26,6 @@ from ...envs.task import REPORT, ReferenceParams
 from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
 from ...envs.vehicle.dynamics import CarParams, RoadParams
-
-if TYPE_CHECKING:
-    from ...envs.stability import StabilityEnv
 
 
 class PreviewStep(NamedTuple):
@@ -102,7 +99,7 @@ class Forecast:
     driver: Array  # the driver's steering command at every tick (rad), shape (periods, n)
 
 
-def make_forecast(base: "StabilityEnv", actions: Array | None = None) -> Forecast:
+def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
     """Make the forecast of an episode that was just reset.
 
     Args:
@@ -148,7 +145,7 @@ def read_plan_state(z: Array) -> PlanState:
     return PlanState(*motion, *actuators)
 
 
-def _make_plan_params(base: "StabilityEnv", p: Array, switches: Array, ticks: int) -> PlanParams:
+def _make_plan_params(base: Any, p: Array, switches: Array, ticks: int) -> PlanParams:
     """Make the parameters of an episode in steps of some ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
@@ -172,7 +169,7 @@ def _make_plan_params(base: "StabilityEnv", p: Array, switches: Array, ticks: in
 
 
 def _simulate_actions(
-    base: "StabilityEnv", snapshot: dict[str, Any], actions: Array, n: int
+    base: Any, snapshot: dict[str, Any], actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
     """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
     z, window = snapshot["state"], make_window(1)

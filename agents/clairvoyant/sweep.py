@@ -75,7 +75,7 @@ def _compute_node_cost(
 def _advance(
     fixed: PlanParams, x: PlanState, action: Sequence[Scalar], known: PreviewStep
 ) -> tuple[PlanState, Scalar]:
-    """Advance a plan by one Runge-Kutta step of the env's own plant: next state, cost of the effort.
+    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort.
 
     The driver's acceleration is that of the step's start; added steering acts by its mean.
     """

@@ -87,7 +87,7 @@ class OnboardController:
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
         self._bounds = self.base.config.bounds
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
-        self._estimates: tuple[Array, Array] = tuple(np.zeros((2, 1, len(self.names))))
+        self._estimates: tuple[Array, ...] = tuple(np.zeros((2, 1, len(self.names))))
         self.x, self.std = (values[0] for values in self._estimates)
         self.begin(0)
         row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))

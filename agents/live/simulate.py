@@ -239,11 +239,14 @@ class Relay:
     speed: float = 1.0  # of a file's clock, 1 for real time
     sent: int = 0  # number of datagrams
     error: str = ""  # reason of the end, "" at a file's end
-    counts: "Counts | None" = None  # of the decoder
+    counts: "Counts" = field(init=False)  # of the decoder
     _origin: tuple[float, float] | None = field(default=None)
 
     def __post_init__(self) -> None:
-        self._chunks = make_source(self.source)
+        from ...envs.recordings.nmea import Decoder
+
+        self._chunks, self._decoder = make_source(self.source), Decoder()
+        self.counts = self._decoder.counts
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Relay until the source ends or is lost.
@@ -270,16 +273,12 @@ class Relay:
 
     def _iterate_epochs(self) -> Iterator["Epoch | None"]:
         """Iterate over the epochs, with None after each chunk of bytes."""
-        from ...envs.recordings.nmea import Decoder
-
-        decoder = Decoder()
-        self.counts = decoder.counts
         for chunk in self._chunks:
-            yield from decoder.decode_chunk(chunk)
+            yield from self._decoder.decode_chunk(chunk)
             yield None
-        yield from decoder.finish()
+        yield from self._decoder.finish()
 
-    def _make_values(self, epoch: "Epoch") -> list[float]:
+    def _make_values(self, epoch: Any) -> list[float]:
         """Make the doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
         X, Y = 0.0, 0.0  # m east and north of the first fix
         if epoch.has_fix:

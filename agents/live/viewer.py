@@ -47,7 +47,7 @@ class _ViewerProtocol(asyncio.DatagramProtocol):
         self.samples = deque[list[float]](maxlen=round(_RATE * _SECONDS))
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
-    def datagram_received(self, data: bytes, _: Address) -> None:
+    def datagram_received(self, data: bytes, _: object) -> None:
         """Process a datagram of the loop."""
         message = decode(data)
         if isinstance(message, RejectReason):

@@ -209,7 +209,7 @@ class _RemoteBatch(ForeignBatch):
         """Process some rows, as `BatchEstimator.take`."""
         obs, inner, plan, limits, *others = observed
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
-        remote: list[Any] = [self[i].inner for i in chosen.tolist()]
+        remote: list[Any] = [self[i].inner for i in chosen.tolist()]  # type: ignore[union-attr]
         records = [
             (item.row, fast[i, : rows[i]], packets[i, : counts[i]])
             for i, item in zip(chosen.tolist(), remote, strict=True)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ...envs.numerics.functions import clip, exp
 from ...envs.numerics.jit import copy_into, jit, noinline
-from ...envs.numerics.primitives import Matrix, Vector, maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum
 from ...envs.record import FAST, PACKET, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
@@ -73,7 +73,7 @@ def _make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
 
 
 @jit
-def locate_stack(net: CorrectionNet) -> int:
+def locate_stack(net: CorrectionNet) -> Scalar:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:

@@ -233,7 +233,7 @@ SUFFIX = ".safetensors"
 NO_MEMORY: dict[str, Any] = {"history": 1, "cells": []}
 """What the card says of a network without memory."""
 _DENSE = ("hidden", "activation", "output", "clip", "action_width")
-Tensors = dict[str, npt.NDArray[np.floating[Any]]]
+Tensors = dict[str, npt.NDArray[Any]]
 
 
 def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:

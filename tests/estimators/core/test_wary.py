@@ -151,7 +151,7 @@ def test_a_first_course_that_is_turned_is_found_out(delay: str, members: int) ->
     record = dataclasses.replace(log.record, packets=packets)
     filter_ = built(base, log, delay=delay, members=members)
     run = filter_.run(dataclasses.replace(log, record=record))
-    assert filter_.gated == 9
+    assert filter_.counts["gated"] == 9
     assert abs(run["psi"][-1] - log.truth["psi"][-1]) < 0.05
     errors = (run["beta"] - log.truth["beta"])[4000:] / run.std[4000:, 0]
     assert np.mean(errors**2) < 2.0
@@ -193,10 +193,10 @@ def test_a_receiver_whose_rounded_course_repeats_is_not_stuck() -> None:
     packets[:, VALUE] = 0.0
     filter_ = built(base, log)
     filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == 0
+    assert filter_.counts["stuck"] == 0
     packets[:, VALUE + 1 :] = np.nan
     filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == 0
+    assert filter_.counts["stuck"] == 0
     packets[:, VALUE + 1] = 5.0
     filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == len(packets) - 1
+    assert filter_.counts["stuck"] == len(packets) - 1
