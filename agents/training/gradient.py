@@ -63,6 +63,7 @@ class GruPolicy(BasePolicy):
         net_arch: Sizes of the dense layers.
         features_extractor_class: Class before the GRU.
         features_extractor_kwargs: Arguments of that class.
+        normalize_images: As in stable-baselines3; there are no images.
     """
 
     def __init__(
@@ -74,9 +75,15 @@ class GruPolicy(BasePolicy):
         net_arch: Sequence[int] = (64, 64),
         features_extractor_class: Any = Standardised,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
+        normalize_images: bool = True,
     ) -> None:
-        further = dict(features_extractor_kwargs or {})
-        super().__init__(observation_space, action_space, features_extractor_class, further)
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            dict(features_extractor_kwargs or {}),
+            normalize_images=normalize_images,
+        )
         self.features_extractor = self.make_features_extractor()
         inputs, last = self.features_extractor.features_dim, cells
         self.cell = nn.GRU(inputs, cells)

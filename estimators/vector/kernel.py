@@ -1,5 +1,6 @@
 """The batch's part of an observation, compiled: every filter's ticks, in lanes or alone."""
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -13,7 +14,7 @@ from ...envs.numerics.simd8 import prefetch
 from ..core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET, FilterRecord
 from ..estimator import compile_call
 from ..wrappers.kernel import observe
-from .lane_ticks import advance_block, get_gains
+from .lane_ticks import FilterBank, advance_block, get_gains
 from .lanes import LaneBlock, is_lane_compatible, make_blocks
 
 _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
@@ -53,37 +54,24 @@ def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows:
 
 @jit_nrt
 def _observe_batch(
-    filters: Matrix,
-    pool: Vector,
-    places: Any,
-    done: Vector,
-    lanes: Vector,
-    fast: Vector,
-    rows: Vector,
-    packets: Vector,
-    counts: Vector,
-    obs: Vector,
-    inner: int,
-    plan: Any,
-    limits: Any,
-    beta: Vector,
-    gamma: Vector,
-    out: Vector,
-    summary: Vector,
+    bank: FilterBank, done: Vector, lanes: Vector, record: Any, observed: Any
 ) -> int:
     """Call `observe` for every filter that has rows to do; return how many still have."""
-    # arguments are those of `observe` with N filters as first axis, but for inner, plan and limits;
-    # done: rows done, -1 where a filter has not started, updated; filters of one shape go in lanes
-    n_waiting = 0
+    # record, observed: arguments of `observe` with N filters as first axis, but for inner, plan and
+    # limits; done: rows done, -1 where a filter has not started, updated; filters of one shape go
+    # in lanes
+    fast, rows, packets, counts = record
+    obs, inner, plan, limits, beta, gamma, out, summary = observed
+    filters, n_waiting = bank.filters, 0
     for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
         b = lanes[first // LANES]
         n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
         if n_rows > 0:
-            n_done = advance_block(b, first, filters, pool, places, fast, n_rows, packets, counts)
+            n_done = advance_block(b, first, bank, fast, n_rows, packets, counts)
         for lane in range(minimum(count_lanes(), len(filters) - first)):
             i = first + lane
             if done[i] < rows[i]:
-                f, gains = filters[i], get_gains(pool, places[i])
+                f, gains = filters[i], get_gains(bank, i)
                 start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
                 outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
                 if n_done == 0 and i + 1 < len(filters):
@@ -110,11 +98,14 @@ def make_empty_outputs(count: int) -> tuple[Any, ...]:
     return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
 
 
+_INTEGERS, _CUBE = np.zeros(1, np.int64), np.zeros((1, 1, 1))
+EXAMPLE_BANK = FilterBank(np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64))
+EXAMPLE_RECORD = _CUBE, _INTEGERS, _CUBE, _INTEGERS
+"""For `compile_call`: all banks and records have these types."""
+
+
 @cache
-def compile_observe_batch() -> Any:
+def compile_observe_batch() -> Callable[..., int]:
     """Return `_observe_batch` as a plain call."""
-    filters, integers, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
-    memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), integers, make_blocks(1)
-    return compile_call(
-        _observe_batch, *memory, cube, integers, cube, integers, *make_empty_outputs(1)
-    )
+    memory = EXAMPLE_BANK, _INTEGERS, make_blocks(1)
+    return compile_call(_observe_batch, *memory, EXAMPLE_RECORD, make_empty_outputs(1))

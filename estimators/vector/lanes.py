@@ -16,9 +16,9 @@ from ...envs.numerics.primitives import Scalar
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.innovation import BUFFER, LARSEN, store_due_captures
+from ..core.innovation import BUFFER, LARSEN
 from ..core.model import KINEMATIC, VELOCITY_ROLL
-from ..core.record import N_CORE, N_FAST, N_INPUTS, N_SLOW, WINDOW, FilterRecord
+from ..core.record import N_CORE, N_FAST, N_INPUTS, FilterRecord
 from ..core.update import NONE
 
 LaneBlock = Any
@@ -98,6 +98,14 @@ def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
 
     Lanes compute models that change by speed alone, of which every tick predicts and corrects.
     Nothing is done between samples, and nothing of the past is stored but predictions.
+
+    Args:
+        b: Block of lanes.
+        lane: Index in it.
+        f: Record of the lane's filter.
+
+    Returns:
+        1 or 0.
     """
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
@@ -151,108 +159,3 @@ def _add_column(b: LaneBlock, column: int) -> None:
             return
     b.column[b.columns] = column
     b.columns += 1
-
-
-@jit
-def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load what a filter's ticks read and do not write."""
-    n, dense = f.n, f.dense
-    for i in range(n):
-        b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
-        for j in range(n):
-            b.GT[i, j, lane] = f.GT[i, j]
-        for j in range(i, n):
-            b.Q[i, j, lane] = f.Q[i, j]
-    for i in range(dense):
-        for j in range(n):
-            b.G[i, j, lane] = f.G[i, j]
-    for i in range(n, f.total):
-        b.keep[i, lane] = f.keep[i]
-    for k in range(f.inputs):
-        b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
-        for j in range(dense):
-            b.HT[k, j, lane] = f.HT[k, j]
-    for i in range(f.fasts):
-        b.y_factor[i, 0, lane], b.y_factor[i, 1, lane] = f.y_factor[i, 0], f.y_factor[i, 1]
-        b.rest_fast[i, lane], b.r_fast[i, lane] = f.rest_fast[i], f.r_fast[i]
-        for j in range(n):
-            b.C_fast[i, j, lane] = f.C_fast[i, j]
-        for k in range(f.inputs):
-            b.D_fast[i, k, lane] = f.D_fast[i, k]
-    b.model_speed[lane], b.smoothing[lane], b.step[lane] = f.model_speed, f.smoothing, f.step
-
-
-@jit
-def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load a filter's model, where its speed changed, and its state into its lane."""
-    if b.model_speed[lane] != f.model_speed:
-        _load_model(b, lane, f)
-    _load_states(b, lane, f)
-    for k in range(b.inputs):
-        b.u[k, lane] = f.u[k]
-    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
-    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
-    _load_clock(b, lane, f)
-
-
-@jit
-def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    N = b.total
-    for i in range(N):
-        b.x[i, lane] = f.x[i]
-    if b.periodic == 0:
-        for i in range(N):
-            for j in range(i, N):
-                b.P[i, j, lane] = f.P[i, j]
-
-
-@jit
-def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load the tick of the next capture."""
-    first = np.inf
-    for s in range(N_SLOW):
-        if f.period[s] > 0:
-            first = min(first, float(f.next[s]))
-    b.next[lane] = first
-
-
-@jit
-def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store the state of a lane in its filter's record."""
-    _store_states(b, lane, f)
-    for k in range(b.inputs):
-        f.u[k] = b.u[k, lane]
-    for i in range(b.fasts):
-        f.y[i] = b.y[i, lane]
-    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
-    f.tick, f.at = b.tick[lane], b.at[lane]
-
-
-@jit
-def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    N = b.total
-    for i in range(N):
-        f.x[i] = b.x[i, lane]
-    if b.periodic == 0:
-        for i in range(N):
-            for j in range(i, N):
-                f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
-
-
-@jit
-def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one."""
-    _store_states(b, lane, f)
-    f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
-    store_due_captures(f, b.tick[lane])
-    _load_states(b, lane, f)
-    _load_clock(b, lane, f)
-
-
-@jit
-def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements."""
-    slot = b.tick[lane] % WINDOW
-    f.past_road_turn[slot] = b.road_turn[lane]
-    for i in range(b.n):
-        f.predicted[slot, i] = b.x[i, lane]
