@@ -164,8 +164,8 @@ class LateEstimator(Estimator):
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
 
-    def _step(self, fast: Array, packets: Array, count: int) -> None:
-        self.take(fast, len(fast), packets, count)
+    def _step(self, fast: Array, packets: Array) -> None:
+        self.take(fast, len(fast), packets, len(packets))
 
     def _take(
         self, record: tuple[Array, int, Array, int], outputs: tuple[Array, Array, Array]

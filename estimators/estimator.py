@@ -201,33 +201,28 @@ class Estimator:
     def _begin(self) -> None:
         """Reset what a subclass has beside `filters`."""
 
-    def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
+    def step(self, fast: Array, packets: Array) -> None:
         """Process fast rows and packets, which follow the last ones taken.
 
         Args:
             fast: Fast rows, shape (k, FAST_WIDTH).
-            packets: Packets ordered as in a `Record`, shape (capacity, PACKET_WIDTH).
-            count: Number of packets to take; None takes all.
+            packets: Packets ordered as in a `Record`, shape (count, PACKET_WIDTH).
 
         Raises:
-            ValueError: An array has another shape, or `count` is out of range.
+            ValueError: An array has another shape.
         """
         fast, packets = (np.ascontiguousarray(array, np.float64) for array in (fast, packets))
         tables = ("fast rows", fast, FAST_WIDTH), ("packets", packets, PACKET_WIDTH)
         for label, array, width in tables:
             if array.shape[1:] != (width,):
                 raise ValueError(f"{label} have shape (k, {width}), got {array.shape}")
-        if count is None:
-            count = len(packets)
-        elif not 0 <= count <= len(packets):
-            raise ValueError(f"count is 0 to {len(packets)}, as many as packets, got {count}")
-        self._step(fast, packets, count)
+        self._step(fast, packets)
 
-    def _step(self, fast: Array, packets: Array, count: int) -> None:
-        done = _compile_step()(self.filters, self.gains, fast, packets, count)
+    def _step(self, fast: Array, packets: Array) -> None:
+        done = _compile_step()(self.filters, self.gains, fast, packets, len(packets))
         while done < len(fast):
             self.design_missing()
-            record = fast, len(fast), packets, count
+            record = fast, len(fast), packets, len(packets)
             done = compile_advance()(self.filters, self.gains, *record, done, EMPTY, EMPTY, NO_NIS)
 
     def take(

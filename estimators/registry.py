@@ -187,9 +187,6 @@ class Registry:
     def __contains__(self, name: object) -> bool:
         return name in self._factories
 
-    def __len__(self) -> int:
-        return len(self._factories)
-
     def __iter__(self) -> Iterator[str]:
         return iter(tuple(self._factories))
 

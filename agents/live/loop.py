@@ -194,9 +194,6 @@ class _Histogram:
         return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
 
 
-_COUNTERS = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
-
-
 @dataclass
 class _Statistics:
     """The measurements of a loop."""
@@ -241,12 +238,11 @@ class Loop:
             duration: Longest duration (s).
         """
         start_time = last_heard = time.monotonic()
-        had_gc = gc.isenabled()
+        had_gc, deadline = gc.isenabled(), 0  # ns; 0: no row has come
         gc.disable()  # a collection takes hundreds of ms
-        deadline: int | None = None
         try:
             while not self._check_end(stop, start_time + duration):
-                if deadline is None or self.step:
+                if not deadline or self.step:
                     batch = self.port.wait(_IDLE)
                     if self._take(batch) and not self.step:
                         deadline = clock() + PERIOD
@@ -321,9 +317,8 @@ class Loop:
         sender, action = self.assembler.sender, onboard.action
         if onboard.has_new_action and action is not None and sender is not None:
             self.statistics.actions += 1
-            moment = float(action[0]) * onboard.facts.full_scale
-            steer_share = float(action[1]) if len(action) > 1 else 0.0
-            control = moment, steer_share * onboard.facts.authority
+            moment, steering, *_ = (*map(float, action), 0.0)
+            control = moment * onboard.facts.full_scale, steering * onboard.facts.authority
             self.port.send(sender, DatagramKind.CONTROL, stamp, control)
         receivers = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
         for target in filter(None, receivers):
@@ -342,13 +337,11 @@ class Loop:
 
     def numbers(self) -> dict[str, object]:
         """Collect all measurements, in JSON types."""
-        statistics = self.statistics
-        times = {
-            f"{name}_us": getattr(statistics, name).summarise()
-            for name in ("jitter", "latency", "work")
-        }
-        counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
-        return {name: getattr(statistics, name) for name in _COUNTERS} | times | counts
+        m, counts = self.statistics, ("ticks", "deadlines", "misses", "per_million", "suspensions")
+        numbers = {name: getattr(m, name) for name in (*counts, "actions", "seconds")}
+        times = {"jitter_us": m.jitter, "latency_us": m.latency, "work_us": m.work}
+        numbers |= {name: histogram.summarise() for name, histogram in times.items()}
+        return numbers | {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
 
     def lines(self, name: str) -> list[str]:
         """Format the first lines of a verdict on the loop.

@@ -184,7 +184,7 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
         )
         self._process.start()
         child_pipe.close()
-        self._receive()
+        self.result()  # it is ready
 
     def start_drive(self) -> None:
         """Start the drive."""
@@ -192,9 +192,6 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
 
     def result(self) -> Any:
         """Wait for the drive's end, and return its columns, late controls and periods."""
-        return self._receive()
-
-    def _receive(self) -> Any:
         try:
             message = self._pipe.recv()
         except EOFError:
@@ -210,7 +207,7 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
 
 
 def _run_simulated_car(
-    pipe: "Connection", env_id: str, options: dict[str, Any], to: Address, seed: int, *clock: Any
+    pipe: "Connection", env_id: str, options: dict[str, Any], to: Address, seed: int, *timing: Any
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop at the car's end has the summary
     try:
@@ -222,7 +219,7 @@ def _run_simulated_car(
             gc.freeze()
             pipe.send("ready")
             pipe.recv()
-            drive, agent = simulate(env, port, to, seed, *clock)
+            drive, agent = simulate(env, port, to, seed, *timing)
         pipe.send((drive.columns, agent.late, agent.periods))
     except Exception as error:
         pipe.send(error)

@@ -16,9 +16,8 @@ from ..estimator import Estimator
 from ..protocol import Estimates
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import write_outputs
-from .kernel import compile_observe_batch, make_empty_outputs
 from .lane_ticks import FilterBank
-from .lanes import make_blocks
+from .lanes import compile_observe_batch, make_blocks, make_empty_outputs
 from .records import IntArray
 
 Build = Callable[[EstimatorSpec], AnyEstimator]

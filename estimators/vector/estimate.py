@@ -56,7 +56,8 @@ class _BatchedRecords:
         """Return the newest step's records, or with "final_" those of episodes that just ended."""
         arrays = (getattr(self._env, prefix + name) for name in _MEMBERS)
         types = (np.float64, np.int64) * 2
-        return _RecordBatch(*map(np.ascontiguousarray, arrays, types))  # copied where they are not
+        records: Any = map(np.ascontiguousarray, arrays, types)  # copied where they are not
+        return _RecordBatch(*records)
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""

@@ -29,7 +29,9 @@ from ..core.model import (
 from ..core.packets import process_packet
 from ..core.predict import compute_residual, compute_signal, propagate, read_fast_row
 from ..core.record import N_SLOW, WINDOW, X_OFFSET, FilterRecord, FilterRecords, GainTables
-from .lanes import LaneBlock
+
+LaneBlock = Any
+"""One record of the dtype `lanes.BLOCK`; `b` in compiled code."""
 
 
 class FilterBank(NamedTuple):

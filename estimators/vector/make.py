@@ -19,8 +19,8 @@ from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import EstimatorSpec, build_estimator
 from ..wrappers.kernel import observe_corrected
 from .batch import BatchEstimator, Build, ForeignBatch, Sensors
-from .kernel import EXAMPLE_BANK, EXAMPLE_RECORD, make_empty_outputs
 from .lane_ticks import FilterBank, get_gains
+from .lanes import EXAMPLE_BANK, EXAMPLE_RECORD, make_empty_outputs
 
 
 @jit_nrt

@@ -225,11 +225,3 @@ def test_the_first_course_far_off_sets_the_heading() -> None:
             estimates = filter_.run(Record(rows, np.array(courses)))
             assert np.abs(estimates["beta"]).max() < 0.02
             assert np.abs(estimates["psi"] - heading).max() < 0.05
-
-
-@pytest.mark.parametrize("count", [-1, 1, 10**9])
-def test_a_count_beyond_the_packets_is_refused(count: int) -> None:
-    """Memory behind the array would be read as packets."""
-    filter_ = make_estimator("multirate-kf", sensors={"camera": CAMERA})
-    with pytest.raises(ValueError, match=f"count is 0 to 0, as many as packets, got {count}"):
-        filter_.step(np.zeros((10, FAST_WIDTH)), np.zeros((0, PACKET_WIDTH)), count)
