@@ -34,8 +34,8 @@ def wrap(env: Any = None, estimator: Any = "multirate-kf", **options: Any) -> An
     return EstimateObservation(FLEET() if env is None else env, estimator, **options)
 
 
-def reset(estimator: Any, options: Any = None, **arguments: Any) -> Any:
-    return wrap(native("NextStep"), estimator, **arguments).reset(seed=0, options=options)
+def reset(estimator: Any, told: Any = None, **arguments: Any) -> Any:
+    return wrap(native("NextStep"), estimator, **arguments).reset(seed=0, options=told)
 
 
 def batch(**changes: Any) -> Any:
