@@ -77,13 +77,8 @@ class GruPolicy(BasePolicy):
         features_extractor_kwargs: Mapping[str, Any] | None = None,
         normalize_images: bool = True,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor_class,
-            dict(features_extractor_kwargs or {}),
-            normalize_images=normalize_images,
-        )
+        further = dict(features_extractor_kwargs or {}), None, normalize_images
+        super().__init__(observation_space, action_space, features_extractor_class, *further)
         self.features_extractor = self.make_features_extractor()
         inputs, last = self.features_extractor.features_dim, cells
         self.cell = nn.GRU(inputs, cells)
