@@ -6,17 +6,15 @@ The gyro's own innovations are left out: tyres that build up their force late lo
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from ..envs.sensors.link import SlowSensor
-from .core.record import FILTER
-from .design.config import FilterConfig
+from .core.record import FILTER, FilterRecords
 from .design.options import FIND, find_columns
-from .design.periodic import Schedule, count_ticks
+from .design.periodic import count_ticks
 from .estimator import EMPTY, NO_NIS, Estimator, compile_advance, compile_process_packet
 from .protocol import compute_std
 
@@ -52,7 +50,7 @@ class _LatencySearch:
         # latency in force and its standard deviation (ticks), whether no more looks are needed
         self.lag, self.sd, self.done = 0, np.inf, False
 
-    def begin(self, filters: Any, rows: Array, packets: Array) -> None:
+    def begin(self, filters: FilterRecords, rows: Array, packets: Array) -> None:
         """Begin a new stretch at a filter's memory, with what that has not taken yet."""
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
@@ -67,7 +65,9 @@ class _LatencySearch:
         self._packets.append(packets)
         self._count += len(rows)
 
-    def look(self, delayed_filters: Any, rows: Array, packets: Array, gains: Any) -> Any:
+    def look(
+        self, delayed_filters: FilterRecords, rows: Array, packets: Array, gains: Array
+    ) -> FilterRecords:
         """Compare latencies where a look is due; return the memory for the latency in force."""
         if self._count in self._looks:
             delayed_filters = self._compare(delayed_filters, gains)
@@ -75,8 +75,8 @@ class _LatencySearch:
             self.begin(delayed_filters, rows, packets)
         return delayed_filters
 
-    def _compare(self, delayed_filters: Any, gains: Any) -> Any:
-        rows, results = np.concatenate(self._rows), dict[int, tuple[float, int, Any]]()
+    def _compare(self, delayed_filters: FilterRecords, gains: Array) -> FilterRecords:
+        rows, results = np.concatenate(self._rows), dict[int, tuple[float, int, FilterRecords]]()
 
         def sum_nis(lag: int) -> float:
             if lag not in results:
@@ -97,7 +97,7 @@ class _LatencySearch:
         self.lag = lag
         return memory
 
-    def _minimise_nis(self, sum_nis: Any) -> tuple[int, float, float]:
+    def _minimise_nis(self, sum_nis: Callable[[int], float]) -> tuple[int, float, float]:
         """Find the lag of least NIS, the second derivative there and the margin to distant lags."""
         max_lag, (coarse, *finer) = self.max_lag, self._steps
         grid = range(0, max_lag + 1, coarse)
@@ -114,7 +114,9 @@ class _LatencySearch:
         distant_nis = min(sum_nis(lag) for lag in grid if abs(lag - best) >= coarse)
         return best, curvature, distant_nis - sum_nis(best)
 
-    def _filter_stretch(self, lag: int, rows: Array, gains: Any) -> tuple[float, int, Any]:
+    def _filter_stretch(
+        self, lag: int, rows: Array, gains: Array
+    ) -> tuple[float, int, FilterRecords]:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
         fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
@@ -130,7 +132,7 @@ class _LatencySearch:
 
 
 class LateEstimator(Estimator):
-    """A filter with the option `latency`; arguments are those of `Estimator`.
+    """A filter with the option `latency`; arguments and methods are those of `Estimator`.
 
     `delayed_filters` is the filter at the time t - L of the latest channel, with every channel at
     the time when it was true. The estimate at t is a copy, propagated to t with all that has come.
@@ -139,26 +141,19 @@ class LateEstimator(Estimator):
 
     compiled = False
 
-    def __init__(
-        self, config: FilterConfig, dt: float, filters: Any, schedules: tuple[Schedule, ...]
-    ) -> None:
-        self._fixed_lags, self._unknown_channel = dict[int, int](), ""
-        for channel, late in config.latency.items():
-            if late == FIND:
-                self._unknown_channel, late = channel, 0.0
-            lag = count_ticks(float(late), dt, f"{config.name}: a latency of {channel}")
-            self._fixed_lags |= dict.fromkeys(find_columns(channel), lag)
-        super().__init__(config, dt, filters, schedules)
-
-    def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Reset as `Estimator.reset` does; the search for a latency begins anew."""
-        super().reset(sensors, first)
+    def _begin(self) -> None:
+        """Reset the delayed filter; the search for a latency begins anew."""
         self.delayed_filters = self.filters.copy()
         self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
+        self._fixed_lags = dict[int, int]()
         self._search: _LatencySearch | None = None
-        if self._unknown_channel:
-            self._search = _LatencySearch(find_columns(self._unknown_channel), self.dt)
-            self._search.begin(self.delayed_filters, self._rows, self._waiting)
+        for channel, late in self.config.latency.items():
+            if late == FIND:
+                self._search = _LatencySearch(find_columns(channel), self.dt)
+                self._search.begin(self.delayed_filters, self._rows, self._waiting)
+                late = 0.0
+            lag = count_ticks(float(late), self.dt, f"{self.name}: a latency of {channel}")
+            self._fixed_lags |= dict.fromkeys(find_columns(channel), lag)
 
     @property
     def _lags(self) -> dict[int, int]:
@@ -169,23 +164,14 @@ class LateEstimator(Estimator):
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
 
-    def _step(self, fast: Array, packets: Array, count: int) -> None:
-        self.take(fast, len(fast), packets, count)
+    def _step(self, fast: Array, packets: Array) -> None:
+        self.take(fast, len(fast), packets, len(packets))
 
-    def take(
-        self,
-        fast: Array,
-        rows: int,
-        packets: Array,
-        count: int,
-        X: Array = EMPTY,
-        S: Array = EMPTY,
-        nis: Array = NO_NIS,
+    def _take(
+        self, record: tuple[Array, int, Array, int], outputs: tuple[Array, Array, Array]
     ) -> None:
-        """Process rows and packets as `Estimator.take` does.
-
-        A packet that `delayed_filters` uses in a later call has no NIS.
-        """
+        """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS."""
+        (fast, rows, packets, count), (X, S, nis) = record, outputs
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
         self._waiting[:, _INDEX_COLUMN] = -1.0
         tick, start = self.tick, 0
@@ -266,6 +252,10 @@ class LateEstimator(Estimator):
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot as `Estimator.set_state` does."""
+        """Restore a snapshot as `Estimator.set_state` does.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.delayed_filters[:] = filters, delayed_filters

@@ -2,10 +2,10 @@
 
 import itertools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -24,12 +24,13 @@ from .design.periodic import Schedule, compute_table_shape, count_ticks
 from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
+_T = TypeVar("_T")
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 EMPTY = np.zeros((0, 0))
 NO_NIS = np.zeros(0)
 
 
-def compile_call(function: Any, *example_args: Any) -> Any:
+def compile_call(function: Callable[..., _T], *example_args: object) -> Callable[..., _T]:
     """Return a function compiled for exactly the types and layouts of the example's arguments.
 
     numba finds out the types at every other call, which costs more than a filter's step.
@@ -43,37 +44,38 @@ def compile_call(function: Any, *example_args: Any) -> Any:
     """
     if not is_jitted(function):
         return function
-    return function.compile(tuple(map(numba.typeof, example_args)))
+    jitted: Any = function
+    return jitted.compile(tuple(map(numba.typeof, example_args)))  # type: ignore[no-any-return]
 
 
-def _make_example() -> tuple[Any, Any]:
-    return np.zeros(1, FILTER), np.zeros((1, 1, 1))
+_MATRIX, _VECTOR = np.zeros((1, 1)), np.zeros(1)
+
+
+def _compile_filter_call(function: Callable[..., _T], *example_args: object) -> Callable[..., _T]:
+    """Return a function of a filter's memory, its gains and these arguments as a plain call."""
+    return compile_call(function, np.zeros(1, FILTER), np.zeros((1, 1, 1)), *example_args)
 
 
 @cache
-def compile_advance() -> Any:
+def compile_advance() -> Callable[..., int]:
     """Return `advance` as a plain call."""
-    matrix, vector = np.zeros((1, 1)), np.zeros(1)
-    return compile_call(advance, *_make_example(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
+    return _compile_filter_call(advance, _MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX, _VECTOR)
 
 
 @cache
-def _compile_estimate() -> Any:
-    """Return `write_estimate` as a plain call."""
-    return compile_call(write_estimate, *_make_example(), np.zeros(1), np.zeros((1, 1)))
-
-
-@cache
-def compile_process_packet() -> Any:
+def compile_process_packet() -> Callable[..., None]:
     """Return `process_packet_all` as a plain call."""
-    return compile_call(process_packet_all, *_make_example(), np.zeros(PACKET_WIDTH))
+    return _compile_filter_call(process_packet_all, np.zeros(PACKET_WIDTH))
 
 
 @cache
-def _compile_step() -> Any:
-    """Return `step_all` as a plain call."""
-    matrix = np.zeros((1, 1))
-    return compile_call(step_all, *_make_example(), matrix, matrix, 0)
+def _compile_estimate() -> Callable[..., bool]:
+    return _compile_filter_call(write_estimate, _VECTOR, _MATRIX)
+
+
+@cache
+def _compile_step() -> Callable[..., int]:
+    return _compile_filter_call(step_all, _MATRIX, _MATRIX, 0)
 
 
 class Estimator:
@@ -92,14 +94,6 @@ class Estimator:
         unobservable: Directions that its sensors cannot see.
         spectral_radius: Spectral radius of its error over a cycle.
         compiled: Whether compiled code may run it by `filters` and `gains` alone.
-        refused: Number of packets older than the filter's window.
-        duplicates: Number of packets with a captured tick that came before.
-        future: Number of packets captured or arriving after the present tick.
-        invalid: Number of packets and fast rows that are not finite.
-        poor: Number of packets of quality 0 or with too few satellites.
-        unknown: Number of packets of an unknown sensor or with an unknown time stamp.
-        gated: Number of packets whose innovation fails the chi-square gate.
-        stuck: Number of packets that repeat the values of the last one.
     """
 
     compiled = True
@@ -177,7 +171,6 @@ class Estimator:
         self._design_cell(int(self._f.wanted))
 
     def _design_cell(self, cell: int) -> None:
-        """Fill the table of gains of one cell."""
         f = self._f
         speed = float(f.low + cell * f.spacing) if f.measured else float(f.speed)
         self.gains[cell] = self._design_table(f, self._schedules[-1], speed)[0]
@@ -198,40 +191,39 @@ class Estimator:
                 raise ValueError(
                     f"{self.name} was built for the {name} {sensor}, the reset has {new}"
                 )
-            s = SLOW_NAMES.index(name)
             label = f"{self.name}: the {name}'s phase"
             phase = count_ticks(new.phase or 0.0, self.dt, label)
             for f in self.filters:
-                f.phase[s] = f.origin = phase
+                f.phase[SLOW_NAMES.index(name)] = f.origin = phase
         reset_filters(self.filters, first)
+        self._begin()
 
-    def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
+    def _begin(self) -> None:
+        """Reset what a subclass has beside `filters`."""
+
+    def step(self, fast: Array, packets: Array) -> None:
         """Process fast rows and packets, which follow the last ones taken.
 
         Args:
             fast: Fast rows, shape (k, FAST_WIDTH).
-            packets: Packets ordered as in a `Record`, shape (capacity, PACKET_WIDTH).
-            count: Number of packets to take; None takes all.
+            packets: Packets ordered as in a `Record`, shape (count, PACKET_WIDTH).
 
         Raises:
-            ValueError: An array has another shape, or `count` is out of range.
+            ValueError: An array has another shape.
         """
-        fast = np.ascontiguousarray(fast, np.float64)
-        packets = np.ascontiguousarray(packets, np.float64)
-        if fast.shape[1:] != (FAST_WIDTH,):
-            raise ValueError(f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}")
-        if packets.shape[1:] != (PACKET_WIDTH,):
-            raise ValueError(f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}")
-        if count is None:
-            count = len(packets)
-        elif not 0 <= count <= len(packets):
-            raise ValueError(f"count is 0 to {len(packets)}, as many as packets, got {count}")
-        self._step(fast, packets, count)
+        fast, packets = (np.ascontiguousarray(array, np.float64) for array in (fast, packets))
+        tables = ("fast rows", fast, FAST_WIDTH), ("packets", packets, PACKET_WIDTH)
+        for label, array, width in tables:
+            if array.shape[1:] != (width,):
+                raise ValueError(f"{label} have shape (k, {width}), got {array.shape}")
+        self._step(fast, packets)
 
-    def _step(self, fast: Array, packets: Array, count: int) -> None:
-        done, rows = _compile_step()(self.filters, self.gains, fast, packets, count), len(fast)
-        if done < rows:  # gains are missing
-            self._finish_rows(done, rows, (fast, rows, packets, count), (EMPTY, EMPTY, NO_NIS))
+    def _step(self, fast: Array, packets: Array) -> None:
+        done = _compile_step()(self.filters, self.gains, fast, packets, len(packets))
+        while done < len(fast):
+            self.design_missing()
+            record = fast, len(fast), packets, len(packets)
+            done = compile_advance()(self.filters, self.gains, *record, done, EMPTY, EMPTY, NO_NIS)
 
     def take(
         self,
@@ -254,14 +246,14 @@ class Estimator:
             S: Output for the standard deviations, shape (rows, n), or empty.
             nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
         """
-        record, outputs = (fast, rows, packets, count), (X, S, nis)
-        done = compile_advance()(self.filters, self.gains, *record, 0, *outputs)
-        if done < rows:
-            self._finish_rows(done, rows, record, outputs)
+        self._take((fast, rows, packets, count), (X, S, nis))
 
-    def _finish_rows(self, done: int, rows: int, record: Any, outputs: Any) -> None:
-        """Process the other rows: record, outputs are arguments of `advance` around `start`."""
-        while done < rows:
+    def _take(
+        self, record: tuple[Array, int, Array, int], outputs: tuple[Array, Array, Array]
+    ) -> None:
+        """Process rows and packets: record, outputs are arguments of `advance` around `start`."""
+        done = compile_advance()(self.filters, self.gains, *record, 0, *outputs)
+        while done < record[1]:
             self.design_missing()
             done = compile_advance()(self.filters, self.gains, *record, done, *outputs)
 
@@ -367,18 +359,13 @@ class Estimator:
 
     @property
     def counts(self) -> dict[str, int]:
-        """All counters by name."""
+        """All counters of what was skipped, by the names of `core.record.SkipCounters`."""
         return dict(zip(SkipCounters._fields, map(int, self._f.counts), strict=True))
 
     @property
     def nis(self) -> float:
         """NIS of the last packet; NaN where it was not used, or the gains are precomputed."""
         return float(self._f.nis)
-
-    def __getattr__(self, name: str) -> int:
-        if name in SkipCounters._fields:
-            return self.counts[name]
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
@@ -16,13 +16,15 @@ from .filters import FILTERS
 from .protocol import EstimatorFactory, ForeignEstimator, get_label
 from .registry import Registry
 
+if TYPE_CHECKING:
 
-@overload
-def make_estimator(name: str, **arguments: Any) -> Estimator: ...
+    @overload
+    def make_estimator(name: str, **arguments: Any) -> Estimator: ...
 
-
-@overload
-def make_estimator(name: EstimatorFactory, **arguments: Any) -> Estimator | ForeignEstimator: ...
+    @overload
+    def make_estimator(
+        name: EstimatorFactory, **arguments: Any
+    ) -> Estimator | ForeignEstimator: ...
 
 
 def make_estimator(

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,21 +19,13 @@ class UnobservableWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Estimates:
-    """A filter's states at every row of a record.
+    """A filter's states at every row of a record."""
 
-    Attributes:
-        time: Time (s), shape (K,).
-        x: States, shape (K, n).
-        std: Their standard deviations, shape (K, n).
-        names: Names of the n states.
-        nis: Normalised innovation squared of each packet, shape (packets,); NaN without use.
-    """
-
-    time: Array
-    x: Array
-    std: Array
-    names: tuple[str, ...]
-    nis: Array
+    time: Array  # s, shape (K,)
+    x: Array  # states, shape (K, n)
+    std: Array  # their standard deviations, shape (K, n)
+    names: tuple[str, ...]  # of the n states
+    nis: Array  # normalised innovation squared of each packet, shape (packets,); NaN without use
 
     def __getitem__(self, name: str) -> Array:
         """Return one state by name, shape (K,)."""
@@ -111,8 +103,7 @@ class ForeignEstimator:
     def __init__(
         self, inner: EstimatorLike, name: str, dt: float, sensors: Mapping[str, SlowSensor]
     ) -> None:
-        missing = [word for word in ("names", "reset", "step") if not hasattr(inner, word)]
-        if missing:
+        if missing := [word for word in ("names", "reset", "step") if not hasattr(inner, word)]:
             raise TypeError(
                 f"{name} is no estimator: {type(inner).__name__} has no "
                 f"{', '.join(missing)}; see sideslip.estimators.EstimatorLike"
@@ -125,12 +116,22 @@ class ForeignEstimator:
         self.units = tuple(STATES.get(state, FOREIGN_STATE).unit for state in self.names)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Reset as `EstimatorLike.reset` does; without sensors those of the last episode stay."""
+        """Reset as `EstimatorLike.reset` does.
+
+        Args:
+            sensors: Slow sensors by name; None keeps those of the last episode.
+            first: Tick of the first fast row.
+        """
         self.sensors = self.sensors if sensors is None else dict(sensors)
         self.inner.reset(self.sensors, first)
 
     def step(self, rows: Array, packets: Array) -> None:
-        """Process copies of fast rows and packets as `EstimatorLike.step` does."""
+        """Process copies of fast rows and packets as `EstimatorLike.step` does.
+
+        Args:
+            rows: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets, shape (count, PACKET_WIDTH).
+        """
         self.inner.step(np.array(rows, np.float64), np.array(packets, np.float64))
 
     @property
@@ -158,7 +159,14 @@ class ForeignEstimator:
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
-        ValueError says that the record is empty or has another tick than `dt`.
+        Args:
+            source: Record, or a log that has one.
+
+        Returns:
+            States and standard deviations of the record.
+
+        Raises:
+            ValueError: The record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
@@ -175,19 +183,23 @@ class ForeignEstimator:
         nis = np.full(len(record.packets), np.nan)
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), x, std, self.names, nis)
 
-    def get_state(self) -> Any:
+    def get_state(self) -> EstimatorLike:
         """Return a deep copy of the user's object for `set_state`."""
         return copy.deepcopy(self.inner)
 
-    def set_state(self, snapshot: Any) -> None:
-        """Replace `inner` by a copy of what `get_state` returned."""
+    def set_state(self, snapshot: EstimatorLike) -> None:
+        """Replace `inner` by a copy of a snapshot.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.inner = copy.deepcopy(snapshot)
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)}>"
 
 
-def get_label(source: Any) -> str:
+def get_label(source: object) -> str:
     """Return the name of an estimator or its factory for messages.
 
     Args:

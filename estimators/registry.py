@@ -15,7 +15,7 @@ from ..envs.validation import describe_unknown
 
 SUFFIX = ".py"
 _PREFIX = "sideslip_user_file_"  # of the modules that users' files become
-_Factory = Callable[..., Any]
+_Factory = Callable[..., Any]  # an agent's or an estimator's
 
 
 def is_user_file(text: str) -> bool:
@@ -74,7 +74,7 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
             yield node.id
 
 
-def _load_user_class(text: str) -> Callable[..., Any]:
+def _load_user_class(text: str) -> _Factory:
     """Load a factory of a user's file as `find_class` finds it; the file is run once."""
     path, name = find_class(text)
     try:
@@ -186,9 +186,6 @@ class Registry:
 
     def __contains__(self, name: object) -> bool:
         return name in self._factories
-
-    def __len__(self) -> int:
-        return len(self._factories)
 
     def __iter__(self) -> Iterator[str]:
         return iter(tuple(self._factories))

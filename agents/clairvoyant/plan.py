@@ -7,8 +7,8 @@ the env computes, failures included. It is a local optimum, sought from several 
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +21,16 @@ from .preview import Forecast, PlanState, make_forecast, read_plan_state
 from .sweep import (
     N_INPUTS,
     IlqrProblem,
-    Trajectory,
+    PlanRun,
     compute_limits,
     linearise_run,
     make_problem,
     run_backward_pass,
 )
+
+if TYPE_CHECKING:
+    from ...envs.stability import StabilityEnv
+    from .. import Agent
 
 Actions = npt.NDArray[np.float32]
 
@@ -38,41 +42,15 @@ MAX_ITERATIONS = 60
 _STALL_RULE = (1e-3, 3)  # settled: a smaller fraction of the cost gained in so many steps in a row
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Actions for an episode: the best run that a start led to."""
-
-    actions: Actions  # actions, shape (K, width)
-    cost: float  # cost of the run in the env
-    status: str  # "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`)
-    seconds: float  # CPU time (s)
-
-
-@dataclass(frozen=True)
-class _PlanRun:
-    """The env's run of actions."""
-
-    trajectory: Trajectory  # states and applied actions
-    cost: float  # cost J
-    length: int  # periods until it ended
-
-
-def simulate_run(
-    env: gym.Env[Any, Any], seed: int, actions: Array, feedback: tuple[Array, Array] | None = None
-) -> _PlanRun:
-    """Simulate one episode in the env.
-
-    Args:
-        env: Single env.
-        seed: Seed of the episode.
-        actions: Actions, shape (K, width).
-        feedback: States (K + 1, n) and gains (K, width, n) by which the actions are corrected.
-
-    Returns:
-        Trajectory, cost and number of control periods of the run.
-    """
+def _simulate_run(
+    env: gym.Env[Actions, Actions],
+    seed: int,
+    actions: Array | Actions,
+    feedback: tuple[Array, Array] | None = None,
+) -> PlanRun:
+    """Simulate an episode; feedback: states (K + 1, n) and gains (K, width, n) for corrections."""
     env.reset(seed=seed)
-    base: Any = env.unwrapped
+    base = _get_base(env)
     applied = np.array(actions, np.float32)
     states, cost, length = np.empty((len(actions) + 1, len(PlanState._fields))), 0.0, 0
     states[0] = read_plan_state(base.get_state()["state"])
@@ -87,60 +65,28 @@ def simulate_run(
         length = k + 1
         if terminated or truncated:
             break
-    return _PlanRun(Trajectory(states, applied.astype(np.float64)), cost, length)
+    return PlanRun(states, applied.astype(np.float64), cost, length)
 
 
-def evaluate_actions(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
-    """Evaluate the cost of actions in an episode of the env.
+def _solve_ilqr(
+    env: gym.Env[Actions, Actions], seed: int, start: npt.ArrayLike | None = None
+) -> tuple[PlanRun, str]:
+    """Return the best run that the steps from a start lead to, and how they ended.
 
-    Args:
-        env: Single env.
-        seed: Seed of the episode.
-        actions: Actions, shape (K, width).
-
-    Returns:
-        Cost J of the episode.
+    It is "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`).
     """
-    return simulate_run(env, seed, np.asarray(actions, np.float64)).cost
-
-
-def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) -> Plan:
-    """Solve for the best plan of an episode that a start leads to.
-
-    Args:
-        env: Single env.
-        seed: Seed of the episode.
-        start: Actions, shape (K, width); None: zeros.
-
-    Returns:
-        Best actions in the env, their cost and the solver's status.
-
-    Raises:
-        ModuleNotFoundError: The extra `mpc` is not installed.
-        ValueError: The start has another shape.
-    """
-    start_time = time.process_time()
     env.reset(seed=seed)
-    forecast = make_forecast(env.unwrapped)
+    forecast = make_forecast(_get_base(env))
     shape = (forecast.fixed.periods, forecast.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
-    best, status = _search(env, seed, forecast, actions)
-    applied = best.trajectory.actions.astype(np.float32)
-    return Plan(applied, best.cost, status, time.process_time() - start_time)
-
-
-def _search(
-    env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array
-) -> tuple[_PlanRun, str]:
-    """Search the best run that the steps from a start lead to, and return how they ended."""
-    problem, best = make_problem(forecast.fixed), simulate_run(env, seed, actions)
+    problem, best = make_problem(forecast.fixed), _simulate_run(env, seed, actions)
     damping, n_stalled = _FIRST_DAMPING, 0
     for iteration in range(MAX_ITERATIONS):
         if forecast.fixed.kind.has_driver:  # the driver answers to the newest run
             env.reset(seed=seed)
-            forecast = make_forecast(env.unwrapped, best.trajectory.actions)
+            forecast = make_forecast(_get_base(env), best.actions)
         previous_cost = best.cost
         best, damping = _run_line_search(env, seed, problem, forecast, best, damping)
         if best.cost >= previous_cost:
@@ -152,16 +98,16 @@ def _search(
 
 
 def _run_line_search(
-    env: gym.Env[Any, Any],
+    env: gym.Env[Actions, Actions],
     seed: int,
     problem: IlqrProblem,
     forecast: Forecast,
-    run: _PlanRun,
+    run: PlanRun,
     damping: float,
-) -> tuple[_PlanRun, float]:
+) -> tuple[PlanRun, float]:
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
-    nominal_run = _use_achieved_steering(problem, run.trajectory)
+    nominal_run = _use_achieved_steering(problem, run)
     linearisation = linearise_run(problem, forecast.known, nominal_run)
     limits = compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
@@ -173,7 +119,7 @@ def _run_line_search(
         gains[:, :, problem.state_indices] = -G[:, : fixed.width] / problem.scale
         for length in STEP_LENGTHS:
             candidate = nominal_run.actions + length * d[:, : fixed.width]
-            trial = simulate_run(env, seed, candidate, (nominal_run.states, gains))
+            trial = _simulate_run(env, seed, candidate, (nominal_run.states, gains))
             if trial.cost < run.cost:
                 whole, short = STEP_LENGTHS[0], STEP_LENGTHS[-1]
                 factors = {whole: 1.0 / _DAMPING_FACTOR, short: _DAMPING_FACTOR}
@@ -183,13 +129,13 @@ def _run_line_search(
     return run, damping
 
 
-def _use_achieved_steering(problem: IlqrProblem, run: Trajectory) -> Trajectory:
+def _use_achieved_steering(problem: IlqrProblem, run: PlanRun) -> PlanRun:
     """Replace a run's steering by what its rate achieved: the linearisation has no rate limit."""
     if run.actions.shape[1] < N_INPUTS:
         return run
     actions, column = run.actions.copy(), PlanState._fields.index("slewing")
     actions[:, 1] = run.states[1:, column] / problem.fixed.task.authority
-    return Trajectory(run.states, actions)
+    return replace(run, actions=actions)
 
 
 @dataclass(frozen=True)
@@ -205,7 +151,7 @@ class ClairvoyantResult:
 
 
 def compute_clairvoyant(
-    env: gym.Env[Any, Any], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
+    env: gym.Env[Actions, Actions], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
 ) -> ClairvoyantResult:
     """Compute the best of the plans from other methods' runs, and of those runs themselves.
 
@@ -217,22 +163,23 @@ def compute_clairvoyant(
     Returns:
         Actions of the least cost, and the costs of all candidates.
     """
-    start_time, base = time.process_time(), env.unwrapped
+    start_time, base = time.process_time(), _get_base(env)
     env.reset(seed=seed)
     shape = (_count_periods(base), *(base.action_space.shape or ()))
     candidates: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
     candidates |= {name: np.asarray(run, np.float32) for name, run in (starts or {}).items()}
-    costs = {name: evaluate_actions(env, seed, actions) for name, actions in candidates.items()}
-    plans = {name: solve_ilqr(env, seed, candidates[name]) for name in starts or candidates}
-    for name, solved in plans.items():
-        candidates[f"from {name}"], costs[f"from {name}"] = solved.actions, solved.cost
+    costs = {name: _simulate_run(env, seed, run).cost for name, run in candidates.items()}
+    plans = {name: _solve_ilqr(env, seed, candidates[name]) for name in starts or candidates}
+    for name, (run, _) in plans.items():
+        candidates[f"from {name}"] = run.actions.astype(np.float32)
+        costs[f"from {name}"] = run.cost
     winner = min(costs, key=lambda label: costs[label])
-    statuses = {name: solved.status for name, solved in plans.items()}
+    statuses = {name: status for name, (_, status) in plans.items()}
     actions, cost, seconds = candidates[winner], costs[winner], time.process_time() - start_time
     return ClairvoyantResult(actions, cost, winner, costs, statuses, seconds)
 
 
-def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
+def record_actions(env: gym.Env[Actions, Actions], agent: "Agent", seed: int) -> Actions:
     """Record an agent's actions in an episode.
 
     Args:
@@ -243,13 +190,17 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
     Returns:
         Actions in fractions of full scale, shape (K, width), zeros after a failure.
     """
-    base: Any = env.unwrapped
+    base = _get_base(env)
     _, *steps = iterate_steps(env, agent, seed)
-    actions = np.zeros((_count_periods(base), *base.action_space.shape), np.float32)
+    actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
     actions[: len(steps)] = [step.action for step in steps]
     return actions
 
 
-def _count_periods(base: Any) -> int:
+def _get_base(env: gym.Env[Actions, Actions]) -> "StabilityEnv":
+    return cast("StabilityEnv", env.unwrapped)
+
+
+def _count_periods(base: "StabilityEnv") -> int:
     """Count the control periods of the episode that was last reset."""
     return -int(-base.get_state()["params"][P.task.duration] // base.control_period)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
@@ -52,20 +53,20 @@ class PreviewStep(NamedTuple):
 class PlanState(NamedTuple):
     """States of a plan in SI units: motion, actuators, the driver's integral."""
 
-    v_x: Any
-    v_y: Any
-    gamma: Any
-    psi: Any
-    X: Any
-    Y: Any
-    s: Any
-    y: Any
-    theta: Any
-    phi: Any
-    phi_dot: Any
+    v_x: Scalar
+    v_y: Scalar
+    gamma: Scalar
+    psi: Scalar
+    X: Scalar
+    Y: Scalar
+    s: Scalar
+    y: Scalar
+    theta: Scalar
+    phi: Scalar
+    phi_dot: Scalar
     T_l: Scalar  # torque of the left motor (N m)
-    T_r: Any
-    integral: Any
+    T_r: Scalar
+    integral: Scalar
     slewing: Scalar  # added steering that is commanded (rad)
     added: Scalar  # added steering that is applied (rad)
 
@@ -144,7 +145,7 @@ def read_plan_state(z: Array) -> PlanState:
     return PlanState(*motion, *actuators)
 
 
-def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanParams:
+def _make_plan_params(base: Any, p: Array, switches: Array, ticks: int) -> PlanParams:
     """Make the parameters of an episode in steps of some ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
@@ -168,7 +169,7 @@ def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanPar
 
 
 def _simulate_actions(
-    base: Any, snapshot: Any, actions: Array, n: int
+    base: Any, snapshot: dict[str, Any], actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
     """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
     z, window = snapshot["state"], make_window(1)
@@ -197,7 +198,7 @@ def _compute_preview(
     names = ActuatorState._fields
     angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
-    def compute_wheel_angle(ticks: Any, rest: float) -> Array:
+    def compute_wheel_angle(ticks: npt.NDArray[np.int64], rest: float) -> Array:
         """Compute the front wheels' angle without the added one, after a tick's lag."""
         return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
 

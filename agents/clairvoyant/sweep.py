@@ -1,38 +1,138 @@
-"""Linearisation of an episode along a run, and the backward pass within limits of the inputs.
+"""Linearisation of an episode on CasADi's symbols, and the backward pass within limits.
 
 Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 """
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
+from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
+from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector
 from ...envs.record import Array
-from ...envs.vehicle.actuators import limit_angle
-from .plant import (
-    advance,
-    compute_node_cost,
-    compute_node_errors,
-    get_state_scales,
-    list_active_states,
-)
+from ...envs.scenarios.road import NOMINAL_PATH
+from ...envs.task import LAGGED, compute_cost_rate, compute_reference
+from ...envs.ticks import TICK
+from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment, limit_angle
+from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle, rk4
 from .preview import Forecast, PlanParams, PlanState, PreviewStep
 
 N_INPUTS = 2  # in a sweep: fractions of moment and added steering; the latter is 0 if unused
+_rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
+_motor_torques, _sideslip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
+_apply_lag, _yaw_moment = to_casadi(apply_lag), to_casadi(compute_yaw_moment)
+_reference = to_casadi(compute_reference)
+# compute_cost_rate as a plain sum of squares, smooth for the solver: its cap and its `absolute`,
+# whose slope is undefined at zero, are identities here
+_uncapped_cost_rate = as_python(
+    compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
+)
+
+_TORQUES = ("T_l", "T_r")
+
+
+def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
+    """List the states that matter to an episode's cost, in the order of `PlanState`."""
+    road = fixed.road
+    active = {"v_x", "v_y", "gamma", *_TORQUES}
+    if fixed.kind.roll:
+        active |= {"phi", "phi_dot"}
+    if fixed.speed_profile.hold and fixed.speed_profile.k_i:
+        active |= {"integral"}
+    if fixed.width > 1:
+        active |= {"slewing", "added"}
+    if road.curvature or road.lateral or road.longitudinal:
+        active |= {"psi", "s", "y", "theta"}
+    return tuple(name for name in PlanState._fields if name in active)
+
+
+def _compute_node_errors(
+    fixed: PlanParams, x: PlanState, known: PreviewStep
+) -> tuple[Scalar, Scalar]:
+    """Compute the errors of sideslip angle (rad) and yaw rate (rad/s) at a step's start."""
+    kind = fixed.kind
+    beta = _sideslip(x.v_x, x.v_y, kind.small_angle)
+    beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
+    if kind.reference != LAGGED:
+        beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
+    return beta - beta_ref, x.gamma - gamma_ref
+
+
+def _compute_node_cost(
+    fixed: PlanParams, errors: tuple[Scalar, Scalar], known: PreviewStep
+) -> Scalar:
+    """Compute the weighted cost of a step's first errors, without the cap."""
+    return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
+
+
+def _advance(
+    fixed: PlanParams, x: PlanState, action: Sequence[Scalar], known: PreviewStep
+) -> tuple[PlanState, Scalar]:
+    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort.
+
+    The driver's acceleration is that of the step's start; added steering acts by its mean.
+    """
+    car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
+    task, kind, q = fixed.task, fixed.kind, fixed.ticks
+    speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
+    held = x.v_x, x.integral, speed_profile, car, task.yaw_first
+    T_l, T_r, _, integral = _motor_torques(action[0] * task.yaw_scale, 0.0, *held)
+    slewing = action[1] * task.authority if fixed.width > 1 else 0.0
+    moved = slewing - x.slewing if fixed.width > 1 else 0.0
+    # The command (rad) moves at `slew` (rad a tick) and then rests. Its mean over q ticks is
+    # command - moved |moved| / (2 q slew), for |moved| <= q slew.
+    mean_added = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
+    motor, steering, road = fixed.motor, fixed.steering, fixed.road
+    if kind.road == NOMINAL_PATH:
+        road = road._replace(turn=known.turn)
+    loads = tuple(
+        _load_at(angle + _apply_lag(mean_added, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
+        for angle, rest, motor_rest in (
+            (known.steer_start, steering.start, motor.start),
+            (known.steer_middle, steering.middle, motor.middle),
+            (known.steer_end, steering.end, motor.end),
+        )
+    )
+    start = Motion(*x[: len(Motion._fields)])
+    forces = DisturbanceForces(known.F_d, known.N_d, known.N_x)
+    variant = kind.small_angle, kind.law, kind.roll
+    motion = _rk4(start, loads, forces, car, road, q * TICK, *variant)
+    effort = 0.0
+    for tick in range(q):
+        motor_tick, steering_tick = fixed.motor_tick, fixed.steering_tick
+        rest = motor_tick.mean * motor_tick.end**tick
+        moment = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
+        added = _apply_lag(mean_added, x.added, steering_tick.mean * steering_tick.end**tick)
+        share = moment / task.yaw_scale
+        effort += TICK * _uncapped_cost_rate(0.0, 0.0, share, added, kind.reference)
+    torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
+    new_integral = x.integral + q * (integral - x.integral)
+    new_added = _apply_lag(mean_added, x.added, steering.end)
+    next_state = PlanState._make((*motion, *torques, new_integral, slewing, new_added))
+    return next_state, effort
+
+
+def _get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
+    """Get the SI unit of each state in the solver, in which all are of order one."""
+    small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
+    return [fixed.car.T_max if name in _TORQUES else small.get(name, 1.0) for name in names]
 
 
 @dataclass(frozen=True)
-class Trajectory:
-    """A run of an episode."""
+class PlanRun:
+    """The env's run of actions."""
 
     states: Array  # `PlanState` at the start of every period and at the end, shape (K + 1, n)
-    actions: Array  # fractions of full scale, shape (K, width)
+    actions: Array  # applied, fractions of full scale, shape (K, width)
+    cost: float  # cost J
+    length: int  # periods until it ended
 
 
 class Linearisation(NamedTuple):
@@ -79,20 +179,20 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     Returns:
         Functions of the episode.
     """
-    names = list_active_states(fixed)
-    scale, size = np.array(get_state_scales(fixed, names)), len(names)
+    names = _list_active_states(fixed)
+    scale, size = np.array(_get_state_scales(fixed, names)), len(names)
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
     zero = PlanState(*(0.0,) * len(PlanState._fields))
     x = zero._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
     step_inputs = PreviewStep(*ca.vertsplit(known))
-    step = advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
-    next_state = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
-    e, errors = ca.SX.sym("e", 2), ca.vertcat(*compute_node_errors(fixed, x, step_inputs))
-    node_cost = compute_node_cost(fixed, (e[0], e[1]), step_inputs)
+    state, effort = _advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
+    next_state = ca.vertcat(*(getattr(state, name) for name in names)) / scale
+    e, errors = ca.SX.sym("e", 2), ca.vertcat(*_compute_node_errors(fixed, x, step_inputs))
+    node_cost = _compute_node_cost(fixed, (e[0], e[1]), step_inputs)
     error_hessian, error_gradient = ca.hessian(node_cost, e)
     error_jacobian = ca.jacobian(errors, w)
     # the effort is a sum of squares of nearly linear terms
-    effort_hessian, effort_gradient = ca.hessian(step.effort, w)
+    effort_hessian, effort_gradient = ca.hessian(effort, w)
     gradient = error_jacobian.T @ ca.substitute(error_gradient, e, errors) + effort_gradient
     hessian = error_jacobian.T @ error_hessian @ error_jacobian + effort_hessian
     derivatives = [ca.jacobian(next_state, w), gradient, hessian]
@@ -100,7 +200,7 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
 
 
-def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linearisation:
+def linearise_run(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation:
     """Linearise every period of a run; an input that the action lacks has a unit Hessian alone.
 
     Args:
@@ -125,7 +225,7 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
     return result
 
 
-def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) -> Limits:
+def compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> Limits:
     """Compute limits by full scale, the wheels' stop, and the steering's rate from a run's angle.
 
     Args:
@@ -152,18 +252,8 @@ def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) ->
 
 
 @jit
-def solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
-    """Minimise q'd + d'Qd / 2 with low <= d <= high.
-
-    Args:
-        Q: Positive definite matrix, shape (2, 2).
-        q: Gradient, shape (2,).
-        low: Lower limits, shape (2,).
-        high: Upper limits, shape (2,).
-
-    Returns:
-        d_0, d_1, and whether each is free of its limits.
-    """
+def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
+    """Minimise q'd + d'Qd / 2 with low <= d <= high: d, and whether each part is free of limits."""
     det = Q[0, 0] * Q[1, 1] - Q[0, 1] * Q[0, 1]
     x = (Q[0, 1] * q[1] - Q[1, 1] * q[0]) / det
     y = (Q[0, 1] * q[0] - Q[0, 0] * q[1]) / det
@@ -226,7 +316,7 @@ def run_backward_pass(
             low[1] = min(max(limits.rate_low[k] - inputs[k, 1], low_1), high_1)
             high[1] = max(min(limits.rate_high[k] - inputs[k, 1], high_1), low_1)
         damped = Quu + damping * np.eye(2)
-        d[k, 0], d[k, 1], free_0, free_1 = solve_input_qp(damped, q[size:], low, high)
+        d[k, 0], d[k, 1], free_0, free_1 = _solve_input_qp(damped, q[size:], low, high)
         gain = G[k]
         if not free_1 and low_1 < d[k, 1] < high_1:
             gain[1, limits.column] = limits.slope

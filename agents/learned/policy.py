@@ -100,13 +100,12 @@ class Card:
         Returns:
             Card of the env.
         """
-        options, further = dict(env_options or {}), dict(estimator_options or {})
-        env = make_env(env_id, options)
+        rest["env_options"], further = dict(env_options or {}), dict(estimator_options or {})
+        env = make_env(env_id, rest["env_options"])
         if estimator:
             env = EstimateObservation(env, estimator, **further)
-        known = {"env_id": env_id, "env_options": options}
-        known |= {"estimator": estimator, "estimator_options": further}
-        card = cls.from_env(env, **known, **rest)
+        rest |= {"env_id": env_id, "estimator": estimator, "estimator_options": further}
+        card = cls.from_env(env, **rest)
         env.close()
         return card
 
@@ -278,9 +277,7 @@ def load_policy(path: str | Path) -> Policy:
 def _find_file(path: str | Path) -> Path:
     """Find the file of a path or of a shipped policy's name."""
     name = str(path)
-    if name in list_shipped():
-        return FOLDER / f"{name}{SUFFIX}"
-    file = Path(path)
+    file = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(path)
     if file.is_dir():
         raise FileNotFoundError(f"policy {name} is a folder")
     if not file.is_file():

@@ -9,8 +9,9 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +32,9 @@ from ...estimators.wrappers.kernel import compile_observe
 from ...estimators.wrappers.outputs import write_outputs
 from ..env_info import get_env_facts
 from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
+
+if TYPE_CHECKING:
+    from .. import Agent
 
 MAGIC = b"SLIPSES1"
 MAX_BATCHES, _MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
@@ -58,11 +62,17 @@ class OnboardController:
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
 
+    Attributes:
+        x: Estimated states, shape (n,); written anew by every tick.
+        std: Their standard deviations, shape (n,); likewise.
+
     Raises:
         TypeError: The env is another one.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], agent: "Agent | None" = None, seed: int | None = 0
+    ) -> None:
         if not isinstance(env, EstimateObservation):
             raise TypeError(f"it reads an EstimateObservation, got {type(env).__name__}")
         base: Any = env.unwrapped
@@ -77,25 +87,13 @@ class OnboardController:
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
         self._bounds = self.base.config.bounds
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
-        self._estimates: Array = np.zeros((1, len(self.names)))
-        self._deviations = np.zeros_like(self._estimates)
+        self._estimates: tuple[Array, ...] = tuple(np.zeros((2, 1, len(self.names))))
+        self.x, self.std = (values[0] for values in self._estimates)
         self.begin(0)
         row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
             self.take(Tick(number, row, 0.0, packet, number == 0))
         self.begin(0)
-
-    @property
-    def x(self) -> Array:
-        """Estimated states, shape (n,)."""
-        estimate: Array = self._estimates[0]
-        return estimate
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations of the estimated states, shape (n,)."""
-        deviation: Array = self._deviations[0]
-        return deviation
 
     @property
     def refused(self) -> dict[str, int]:
@@ -128,14 +126,11 @@ class OnboardController:
             self.begin(tick.number)
         n, row = self.facts.control_period, tick.row
         if self._is_native:
-            rows, packets = row.reshape(1, -1), tick.packets
-            self.estimator.take(rows, 1, packets, len(packets), self._estimates, self._deviations)
+            packets = tick.packets
+            self.estimator.take(row.reshape(1, -1), 1, packets, len(packets), *self._estimates)
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
-            self._estimates[0], self._deviations[0] = (
-                self.estimator.x,
-                compute_std(self.estimator.P),
-            )
+            self.x[:], self.std[:] = self.estimator.x, compute_std(self.estimator.P)
         self._rows[self._count] = row
         self._count += 1
         if len(tick.packets):
@@ -143,9 +138,9 @@ class OnboardController:
             for packet in tick.packets:
                 update_newest(self._z, packet, float(tick.number))
         v = 0.5 * float(row[FAST.wheel_left] + row[FAST.wheel_right])
-        steady = _reference(tick.steer_next, v, self._target, self._kind)
-        before, target, kind = self._refs, self._target, self._kind
-        self._refs = steady if before is None else _filter_reference(before, steady, target, kind)
+        before, params = self._refs, (self._target, self._kind)
+        steady = _reference(tick.steer_next, v, *params)
+        self._refs = steady if before is None else _filter_reference(before, steady, *params)
         self.has_new_action = tick.number % n == 0
         if self.has_new_action:
             self._compute_action(tick.number)
@@ -153,11 +148,11 @@ class OnboardController:
             self._count = 0
 
     def _compute_action(self, number: int) -> None:
+        """Compute the action of a tick and begin the next period."""
         obs, start = self._make_observation(number), self._start
         self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
-        if self.agent is None:
-            self.action = np.zeros(self.facts.width, np.float32)
-        else:
+        self.action = np.zeros(self.facts.width, np.float32)
+        if self.agent is not None:
             prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
             self.action, self._memory = prediction
 
@@ -191,7 +186,7 @@ class Recorder:
         setup: Setup of the replay, in JSON types.
     """
 
-    def __init__(self, path: Path | str, setup: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path | str, setup: Mapping[str, object]) -> None:
         self._file = open(path, "xb", buffering=0)  # noqa: SIM115, closed by `close`
         text = json.dumps(dict(setup)).encode()
         self._file.write(MAGIC + _LENGTH.pack(len(text)) + text)
@@ -261,14 +256,10 @@ def read_setup(path: Path | str) -> dict[str, Any]:
     return setup
 
 
-def _read_header(path: Path | str, file: Any) -> dict[str, Any]:
+def _read_header(path: Path | str, file: BinaryIO) -> dict[str, Any]:
     if file.read(len(MAGIC)) == MAGIC:
-        length = file.read(_LENGTH.size)
-        if len(length) == _LENGTH.size:
-            try:
-                setup = json.loads(file.read(*_LENGTH.unpack(length)))
-            except (ValueError, RecursionError):
-                setup = None
+        with suppress(ValueError, RecursionError, struct.error):
+            setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
             if isinstance(setup, dict):
                 return setup
     raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
@@ -310,8 +301,8 @@ class _SessionReplay(NamedTuple):
     """The result of a replay."""
 
     ticks: npt.NDArray[np.int64]  # numbers of the ticks, shape (T,)
-    x: npt.NDArray[np.float64]  # estimates, shape (T, n)
-    std: npt.NDArray[np.float64]  # standard deviations, shape (T, n)
+    x: Array  # estimates, shape (T, n)
+    std: Array  # standard deviations, shape (T, n)
     same: bool  # whether every block's checksum of the estimates is the session's
 
 
@@ -328,16 +319,14 @@ def replay(path: Path | str, onboard: OnboardController, patience: int | None) -
     """
     synchroniser, digest, same = StreamSynchroniser(patience), 0, True
     ticks: list[int] = []
-    numbers: list[list[npt.NDArray[np.float64]]] = [[], []]
+    estimates: list[Array] = []
     for block in read_blocks(path):
         for batch in block.batches:
             for tick in synchroniser.take(batch):
                 onboard.take(tick)
                 digest = _update_digest(onboard, digest)
                 ticks.append(tick.number)
-                numbers[0].append(onboard.x.copy())
-                numbers[1].append(onboard.std.copy())
+                estimates.append(np.stack([onboard.x, onboard.std]))
         same = same and digest == block.digest
-    shape = len(ticks), len(onboard.names)
-    x, std = (np.array(values).reshape(shape) for values in numbers)
+    x, std = np.array(estimates).reshape(-1, 2, len(onboard.names)).swapaxes(0, 1)
     return _SessionReplay(np.array(ticks, np.int64), x, std, same)

@@ -1,5 +1,6 @@
 """The loop of an on-board controller: UDP port, a tick every millisecond, missed deadlines."""
 
+import bisect
 import errno
 import gc
 import math
@@ -9,12 +10,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import accumulate
 
 from .controller import OnboardController, Recorder
 from .messages import (
     MAX_BYTES,
     TICK_US,
+    Address,
     Arrival,
     DatagramKind,
     LoopStatus,
@@ -33,12 +35,11 @@ clock = time.monotonic_ns
 """Time of the monotonic clock, which is never set (ns)."""
 
 
-def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
+def parse_address(text: str) -> Address:
     """Parse HOST:PORT or PORT to an IPv4 address.
 
     Args:
-        text: Text of the address.
-        host: Host of a text without one.
+        text: Text of the address; without a host it is `LOOPBACK`'s.
 
     Returns:
         Host as an IPv4 address, and port.
@@ -46,11 +47,11 @@ def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
     Raises:
         ValueError: The text is no address, or the host is unknown.
     """
-    host_text, _, number = text.rpartition(":")
+    host, _, number = text.rpartition(":")
     if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
         raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
     try:
-        return socket.gethostbyname(host_text or host), int(number)
+        return socket.gethostbyname(host or LOOPBACK), int(number)
     except OSError as error:
         raise ValueError(f"{text!r} is no address of IPv4: {error}") from None
 
@@ -89,12 +90,16 @@ class Port(AbstractContextManager["Port"]):
             in_use = error.errno == errno.EADDRINUSE
             reason = "is in use" if in_use else f"is none: {error.strerror}"
             raise OSError(f"UDP port {port} of {host} {reason}") from None
-        self.address: tuple[str, int] = self._socket.getsockname()  # bound host and port
-
+        self.address: Address = self._socket.getsockname()
         self._sent: dict[int, int] = {}
 
     def send(
-        self, to: Any, kind: DatagramKind, stamp: int, values: Sequence[float] = (), names: Any = ()
+        self,
+        to: Address,
+        kind: DatagramKind,
+        stamp: int,
+        values: Sequence[float] = (),
+        names: Sequence[str] = (),
     ) -> None:
         """Send a message.
 
@@ -133,15 +138,8 @@ class Port(AbstractContextManager["Port"]):
         select.select([self._socket], [], [], max(seconds, 0.0))
         return self._receive_available([])
 
-    def receive_until(self, deadline: int) -> list[Arrival]:
-        """Receive datagrams until a point in time, each with its time of arrival.
-
-        Args:
-            deadline: Time of `clock` (ns).
-
-        Returns:
-            Datagrams in the order of their arrival.
-        """
+    def _receive_until(self, deadline: int) -> list[Arrival]:
+        """Receive datagrams until a time of `clock` (ns), each with its time of arrival."""
         batch: list[Arrival] = []
         while (left := deadline - clock() - _SPIN) > 0:
             if len(batch) >= MAX_BATCH:
@@ -171,7 +169,7 @@ _IDLE = 0.1  # s, longest wait for a datagram before the end's conditions are ch
 _TOP = 100_000  # us, from which on times share a histogram's last bin
 
 
-class Histogram:
+class _Histogram:
     """Histogram of times in us, by whole ones; `newest` and `largest` are kept exactly."""
 
     def __init__(self) -> None:
@@ -179,30 +177,15 @@ class Histogram:
         self.newest = self.largest = 0.0
 
     def add(self, us: float) -> None:
-        """Count a time.
-
-        Args:
-            us: Time (us).
-        """
+        """Count a time (us)."""
         self.counts[min(max(int(us), 0), _TOP)] += 1
         self.number += 1
         self.newest, self.largest = us, max(self.largest, us)
 
     def quantile(self, share: float) -> float:
-        """Compute a quantile to 1 us (us); NaN without times.
-
-        Args:
-            share: Fraction of the times that do not exceed it.
-
-        Returns:
-            Upper edge of the quantile's bin, or the largest time (us).
-        """
-        n_missing = math.ceil(share * self.number)
-        for us, count in enumerate(self.counts):
-            n_missing -= count
-            if count and n_missing <= 0:
-                return us + 1.0 if us < _TOP else self.largest
-        return math.nan
+        """Compute the upper edge of a quantile's bin, or the largest time (us)."""
+        us = bisect.bisect_left(list(accumulate(self.counts)), math.ceil(share * self.number))
+        return us + 1.0 if us < _TOP else self.largest
 
     def summarise(self) -> dict[str, float]:
         """Compute median, 99.9 % quantile and maximum (us)."""
@@ -211,17 +194,13 @@ class Histogram:
         return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
 
 
-_COUNTERS = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
-_TIMES = ("jitter", "latency", "work")
-
-
 @dataclass
 class _Statistics:
     """The measurements of a loop."""
 
-    jitter: Histogram = field(default_factory=Histogram)  # times from a deadline to waking up (us)
-    latency: Histogram = field(default_factory=Histogram)  # oldest datagram to sending (us)
-    work: Histogram = field(default_factory=Histogram)  # times of a tick's work (us)
+    jitter: _Histogram = field(default_factory=_Histogram)  # from a deadline to waking up (us)
+    latency: _Histogram = field(default_factory=_Histogram)  # oldest datagram to sending (us)
+    work: _Histogram = field(default_factory=_Histogram)  # times of a tick's work (us)
     deadlines: int = 0  # number of deadlines that were due
     misses: int = 0  # deadlines that passed during the work of an earlier one
     suspensions: int = 0  # delays of more than `_SUSPENDED`
@@ -242,8 +221,8 @@ class Loop:
     onboard: OnboardController  # estimator and agent
     assembler: StreamSynchroniser  # synchroniser of the datagrams
     port: Port  # receives and sends
-    targets: Sequence[Any] = ()  # addresses that get every estimate
-    viewer: Any = None  # address that gets every tenth estimate and the status
+    targets: Sequence[Address] = ()  # which get every estimate
+    viewer: Address | None = None  # which gets every tenth estimate and the status
     step: bool = False  # whether time is that of the stamps: datagrams are processed as they arrive
     recorder: Recorder | None = None  # of the session
     watch: Callable[[Tick], None] | None = None  # called after each tick
@@ -259,12 +238,11 @@ class Loop:
             duration: Longest duration (s).
         """
         start_time = last_heard = time.monotonic()
-        had_gc = gc.isenabled()
+        had_gc, deadline = gc.isenabled(), 0  # ns; 0: no row has come
         gc.disable()  # a collection takes hundreds of ms
-        deadline: int | None = None
         try:
             while not self._check_end(stop, start_time + duration):
-                if deadline is None or self.step:
+                if not deadline or self.step:
                     batch = self.port.wait(_IDLE)
                     if self._take(batch) and not self.step:
                         deadline = clock() + PERIOD
@@ -273,7 +251,12 @@ class Loop:
                 if not self.assembler.silent:
                     last_heard = time.monotonic()
                 elif time.monotonic() - last_heard > self.patience:
-                    self._handle_silence()
+                    (host, port), limit = self.port.address, f"{self.patience:g} s"
+                    if not self.statistics.ticks:
+                        raise TimeoutError(
+                            f"no inertial datagram came to {host}:{port} within {limit}"
+                        )
+                    self.ended = f"no inertial data for {limit}"
                     break
         finally:
             if had_gc:
@@ -289,15 +272,9 @@ class Loop:
         self.ended = next((reason for reason, holds in reasons.items() if holds), "")
         return bool(self.ended)
 
-    def _handle_silence(self) -> None:
-        (host, port), limit = self.port.address, f"{self.patience:g} s"
-        if not self.statistics.ticks:
-            raise TimeoutError(f"no inertial datagram came to {host}:{port} within {limit}")
-        self.ended = f"no inertial data for {limit}"
-
     def _run_tick(self, deadline: int) -> int:
         """Wait for a deadline, process the arrivals, and return the next deadline."""
-        batch, statistics = self.port.receive_until(deadline), self.statistics
+        batch, statistics = self.port._receive_until(deadline), self.statistics
         wake_time = clock()
         rows = self._take(batch)
         end_time = clock()
@@ -340,31 +317,31 @@ class Loop:
         sender, action = self.assembler.sender, onboard.action
         if onboard.has_new_action and action is not None and sender is not None:
             self.statistics.actions += 1
-            moment = float(action[0]) * onboard.facts.full_scale
-            steer_share = float(action[1]) if len(action) > 1 else 0.0
-            control = moment, steer_share * onboard.facts.authority
+            moment, steering, *_ = (*map(float, action), 0.0)
+            control = moment * onboard.facts.full_scale, steering * onboard.facts.authority
             self.port.send(sender, DatagramKind.CONTROL, stamp, control)
         receivers = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
         for target in filter(None, receivers):
             values = (*onboard.x.tolist(), *onboard.std.tolist())
             self.port.send(target, DatagramKind.ESTIMATE, stamp, values, onboard.names)
         if self.viewer is not None and tick.number % _STATUS_EVERY == 0:
-            self.port.send(self.viewer, DatagramKind.STATUS, stamp, self.status())
+            self.port.send(self.viewer, DatagramKind.STATUS, stamp, self._make_status())
 
-    def status(self) -> LoopStatus:
+    def _make_status(self) -> LoopStatus:
         """Collect the counts so far."""
         statistics, counts = self.statistics, self.assembler.counts
         bad = sum(counts[reason] for reason in RejectReason)
         numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
         times = statistics.jitter.newest, statistics.latency.newest, statistics.work.newest
-        return LoopStatus._make(map(float, (*numbers, *times)))
+        return LoopStatus._make(map(float, (*numbers, *times, statistics.deadlines)))
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         """Collect all measurements, in JSON types."""
-        statistics = self.statistics
-        times = {f"{name}_us": getattr(statistics, name).summarise() for name in _TIMES}
-        counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
-        return {name: getattr(statistics, name) for name in _COUNTERS} | times | counts
+        m, counts = self.statistics, ("ticks", "deadlines", "misses", "per_million", "suspensions")
+        numbers = {name: getattr(m, name) for name in (*counts, "actions", "seconds")}
+        times = {"jitter_us": m.jitter, "latency_us": m.latency, "work_us": m.work}
+        numbers |= {name: histogram.summarise() for name, histogram in times.items()}
+        return numbers | {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
 
     def lines(self, name: str) -> list[str]:
         """Format the first lines of a verdict on the loop.
@@ -383,7 +360,9 @@ class Loop:
         if m.deadlines:
             jitter, latency = (
                 f"median {t['median']:.0f}, 99.9 % {t['p999']:.0f}, most {t['max']:.0f} us"
-                for t in (m.jitter.summarise(), m.latency.summarise())
+                if (t := times.summarise())
+                else "unknown"
+                for times in (m.jitter, m.latency)
             )
             missed = f"{m.misses} of {m.deadlines} deadlines missed"
             lines[0] = f"{ended}; {missed}, {m.per_million:.0f} per million."

@@ -13,7 +13,7 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 
 FIELDS names the doubles of each kind, in SI units but for STATUS, `LoopStatus`. ESTIMATE has the
 states' values, then their standard deviations, then their names as ASCII with commas between. A
-change of any of it is another VERSION.
+change of any of it is another VERSION, but for STATUS, which no other program gets.
 
 A fast row is the doubles of INERTIAL: what the sensors that speak in every tick measured in one.
 Time is that of its stamps. It ends its tick; packets of slow sensors belong to the next row. They
@@ -27,7 +27,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from enum import IntEnum, StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,7 @@ MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
 MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
 _WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
 _MAX_WAITING = 64  # packets of slow sensors before a fast row
+Address = tuple[str, int]  # host and port
 
 
 class DatagramKind(IntEnum):
@@ -86,6 +87,7 @@ class LoopStatus(NamedTuple):
     jitter: float = 0.0  # us, of the last tick
     latency: float = 0.0  # us, of the last tick with a datagram
     time: float = 0.0  # us, of the last tick's work
+    deadlines: float = 0.0  # that were due: one a tick of the loop's clock
 
 
 SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
@@ -185,8 +187,8 @@ class Arrival(NamedTuple):
     """A datagram and its arrival."""
 
     at: int  # time of the monotonic clock (ns)
-    data: bytes  # bytes of the datagram
-    sender: Any = None  # address of its sender
+    data: bytes
+    sender: Address | None = None
 
 
 class Tick(NamedTuple):
@@ -209,7 +211,7 @@ class StreamSynchroniser:
     def __init__(self, patience: int | None = PATIENCE) -> None:
         self.patience = patience
         self.counts = Counter[str]({name: 0 for name in (*RejectReason, *_STREAM_COUNTS)})
-        self.sender: Any = None  # of the newest row
+        self.sender: Address | None = None  # of the newest row
         self.accepted: list[bytes] = []  # of the newest batch
         self.over, self.silent = False, 0  # the drive's end came; calls since the last fast row
         self._newest: dict[int, int] = {}  # sequence numbers by kind

@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import Z
-from ...envs.record import FAST, PACKET
+from ...envs.record import FAST, PACKET, Array
 from ...envs.recordings.dialect import to_metres
 from ...envs.recordings.sources import make_source
 from ...envs.sensors.slow import WIDTHS
@@ -23,7 +23,21 @@ from ...envs.ticks import TICK
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout
 from .loop import Port, clock, wait_until
-from .messages import MAX_AGE, SENSORS, TICK_US, DatagramKind, RejectReason, decode
+from .messages import (
+    MAX_AGE,
+    SENSORS,
+    TICK_US,
+    Address,
+    Arrival,
+    DatagramKind,
+    RejectReason,
+    decode,
+)
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+    from ...envs.recordings.nmea import Counts, Epoch
 
 MAX_TICKS = 250  # of a control period in lock-step: the kernel buffers so many rows
 _SLACK = 150_000  # ns before the next row is due, at which a control is too late
@@ -34,12 +48,12 @@ _KINDS = {place: kind for kind, place in SENSORS.items()}
 
 
 @dataclass
-class WireAgent:
+class _WireAgent:
     """An agent on the wires: it sends the env's record and returns the controls that arrive."""
 
     env: gym.Env[Any, Any]  # bare `StabilityEnv`
     port: Port  # sends
-    to: Any  # address of the receiver
+    to: Address  # of the receiver
     step: bool = False  # wait for the control of every period
     speed: float = 1.0  # of the clock, 1 for real time
     late: int = 0  # late controls: the last action holds
@@ -51,20 +65,8 @@ class WireAgent:
     def __post_init__(self) -> None:
         self._facts = get_env_facts(self.env)
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: Any = 1
-    ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Return the action that comes back for the newest record.
-
-        Args:
-            observation: Without effect.
-            state: Returned unchanged.
-            episode_start: Without effect.
-            deterministic: Without effect.
-
-        Returns:
-            Action in fractions of full scale, shape (width,), and `state`.
-        """
+    def predict(self, *_: object, **__: object) -> tuple[npt.NDArray[np.float32], None]:
+        """Return the action, in fractions of full scale, that comes back for the newest record."""
         if not self.periods:
             self._action = np.zeros(self._facts.width, np.float32)
             self._start_time = clock() + round(1e9 * TICK)
@@ -77,7 +79,7 @@ class WireAgent:
             while self._newest < tick * TICK_US and clock() < end:
                 self._read(self.port.wait((end - clock()) * 1e-9))
             self.late += self._newest < tick * TICK_US
-        return self._action.copy(), state
+        return self._action.copy(), None
 
     def send(self) -> int:
         """Send the newest record, each tick when it is due, and return the last tick."""
@@ -113,7 +115,7 @@ class WireAgent:
                 )
             self._read(self.port.wait(0.1))
 
-    def _read(self, arrivals: Any) -> None:
+    def _read(self, arrivals: list[Arrival]) -> None:
         for arrival in arrivals:
             message = decode(arrival.data)
             if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
@@ -125,7 +127,7 @@ class WireAgent:
                 self._newest = message.stamp
 
 
-def _make_values(kind: DatagramKind, packet: Any) -> list[float]:
+def _make_values(kind: DatagramKind, packet: Array) -> list[float]:
     """Make a packet's doubles: its values, its age (s) and its quality."""
     age = (packet[PACKET.arrived] - packet[PACKET.captured]) * TICK
     values = packet[PACKET.value : PACKET.value + WIDTHS[SENSORS[kind]]].tolist()
@@ -135,11 +137,11 @@ def _make_values(kind: DatagramKind, packet: Any) -> list[float]:
 def simulate(
     env: gym.Env[Any, Any],
     port: Port,
-    to: Any,
+    to: Address,
     seed: int = 0,
     step: bool = False,
     speed: float = 1.0,
-) -> tuple[Rollout, WireAgent]:
+) -> tuple[Rollout, _WireAgent]:
     """Simulate one episode whose agent is at the other end of the wires.
 
     In lock-step the drive is that of `rollout` with the same agent, bit for bit; in real time it
@@ -161,7 +163,7 @@ def simulate(
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
-    agent = WireAgent(env, port, to, step, speed)
+    agent = _WireAgent(env, port, to, step, speed)
     drive = rollout(env, agent, seed)
     agent.end()
     return drive, agent
@@ -174,14 +176,15 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
         arguments: Id and options of the env, then `to`, `seed`, `step` and `speed` of `simulate`.
     """
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, *arguments: object) -> None:
         context = get_context("spawn")
         self._pipe, child_pipe = context.Pipe()
-        arguments = (child_pipe, *arguments)
-        self._process = context.Process(target=_run_simulated_car, args=arguments, daemon=True)
+        self._process = context.Process(
+            target=_run_simulated_car, args=(child_pipe, *arguments), daemon=True
+        )
         self._process.start()
         child_pipe.close()
-        self._receive()
+        self.result()  # it is ready
 
     def start_drive(self) -> None:
         """Start the drive."""
@@ -189,9 +192,6 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
 
     def result(self) -> Any:
         """Wait for the drive's end, and return its columns, late controls and periods."""
-        return self._receive()
-
-    def _receive(self) -> Any:
         try:
             message = self._pipe.recv()
         except EOFError:
@@ -207,19 +207,19 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
 
 
 def _run_simulated_car(
-    pipe: Any, env_id: str, options: dict[str, Any], to: Any, seed: int, step: bool, speed: float
+    pipe: "Connection", env_id: str, options: dict[str, Any], to: Address, seed: int, *timing: Any
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop at the car's end has the summary
     try:
         env = gym.make(env_id, **options)
         with Port() as port:
-            warm_up_agent = WireAgent(env, port, port.address, speed=10.0)
+            warm_up_agent = _WireAgent(env, port, port.address, speed=10.0)
             rollout(env, warm_up_agent, seed, {"duration": 0.1})  # compiles before the drive
             gc.collect()
             gc.freeze()
             pipe.send("ready")
             pipe.recv()
-            drive, agent = simulate(env, port, to, seed, step, speed)
+            drive, agent = simulate(env, port, to, seed, *timing)
         pipe.send((drive.columns, agent.late, agent.periods))
     except Exception as error:
         pipe.send(error)
@@ -231,16 +231,19 @@ class Relay:
 
     source: str  # as for `envs.recordings.sources.make_source`, whose errors it raises
     port: Port  # sends
-    to: Any  # address of the receiver
+    to: Address  # of the receiver
     latency: float = 0.0  # s from an epoch to its sentences, added to the age
     speed: float = 1.0  # of a file's clock, 1 for real time
     sent: int = 0  # number of datagrams
     error: str = ""  # reason of the end, "" at a file's end
-    counts: Any = None  # of the decoder
+    counts: "Counts" = field(init=False)  # of the decoder
     _origin: tuple[float, float] | None = field(default=None)
 
     def __post_init__(self) -> None:
-        self._chunks = make_source(self.source)
+        from ...envs.recordings.nmea import Decoder
+
+        self._chunks, self._decoder = make_source(self.source), Decoder()
+        self.counts = self._decoder.counts
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Relay until the source ends or is lost.
@@ -265,16 +268,12 @@ class Relay:
         except OSError as error:
             self.error = str(error)
 
-    def _iterate_epochs(self) -> Iterator[Any]:
+    def _iterate_epochs(self) -> Iterator["Epoch | None"]:
         """Iterate over the epochs, with None after each chunk of bytes."""
-        from ...envs.recordings.nmea import Decoder
-
-        decoder = Decoder()
-        self.counts = decoder.counts
         for chunk in self._chunks:
-            yield from decoder.decode_chunk(chunk)
+            yield from self._decoder.decode_chunk(chunk)
             yield None
-        yield from decoder.finish()
+        yield from self._decoder.finish()
 
     def _make_values(self, epoch: Any) -> list[float]:
         """Make the doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""

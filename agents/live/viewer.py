@@ -15,11 +15,18 @@ from html import escape
 from ipaddress import ip_address
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...estimators.design.models import FOREIGN_STATE, STATES
 from .loop import LOOPBACK, Port
-from .messages import DatagramKind, LoopStatus, Message, RejectReason, decode
+from .messages import Address, DatagramKind, LoopStatus, Message, RejectReason, decode
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+    from aiohttp import web
+    from aiohttp.typedefs import Handler
+    from rich.table import Table
 
 _PAGE = Path(__file__).with_name("page.html")
 _SECONDS = 20.0  # s, of the page's plots
@@ -31,7 +38,7 @@ _CONTENT_SECURITY_POLICY = (
 )
 
 
-class ViewerProtocol(asyncio.DatagramProtocol):
+class _ViewerProtocol(asyncio.DatagramProtocol):
     """The newest datagrams of a loop: its status, and estimates with angles in degrees."""
 
     def __init__(self) -> None:
@@ -40,12 +47,8 @@ class ViewerProtocol(asyncio.DatagramProtocol):
         self.samples = deque[list[float]](maxlen=round(_RATE * _SECONDS))
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
-    def datagram_received(self, data: bytes, _: Any) -> None:
-        """Process a datagram of the loop.
-
-        Args:
-            data: Bytes of the datagram.
-        """
+    def datagram_received(self, data: bytes, _: object) -> None:
+        """Process a datagram of the loop."""
         message = decode(data)
         if isinstance(message, RejectReason):
             return
@@ -72,16 +75,8 @@ def _get_unit(name: str) -> str:
     return STATES.get(name, FOREIGN_STATE).unit.replace("rad", "deg")
 
 
-def make_table(protocol: ViewerProtocol, title: str) -> Any:
-    """Make the table of the estimates and the loop's counts.
-
-    Args:
-        protocol: Newest datagrams.
-        title: Title of the table.
-
-    Returns:
-        Table of rich.
-    """
+def _make_table(protocol: _ViewerProtocol, title: str) -> "Table":
+    """Make the table of the estimates and the loop's counts."""
     from rich.table import Table
     from rich.text import Text
 
@@ -93,23 +88,15 @@ def make_table(protocol: ViewerProtocol, title: str) -> Any:
     counts = protocol.status
     time = f"t {newest[0]:.1f} s; " if newest else "no inertial data yet; "
     table.caption = (
-        f"{time}{counts.misses:.0f} of {counts.ticks:.0f} deadlines missed, "
+        f"{time}{counts.misses:.0f} of {counts.deadlines:.0f} deadlines missed, "
         f"{counts.held:.0f} ticks held\n{counts.bad:.0f} datagrams bad, {counts.lost:.0f} lost; "
         f"jitter {counts.jitter:.0f} us, latency {counts.latency:.0f} us"
     )
     return table
 
 
-def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
-    """Make an event of new samples as JSON; of all samples where none were sent.
-
-    Args:
-        protocol: Newest datagrams.
-        sent: Number of samples that were sent.
-
-    Returns:
-        JSON, and the number of samples so far.
-    """
+def _make_event(protocol: _ViewerProtocol, sent: int) -> tuple[str, int]:
+    """Make JSON of the samples after so many, of all where none were sent; count them all."""
     n_new = min(protocol.count - sent, len(protocol.samples))
     event = {
         "all": sent == 0,
@@ -120,7 +107,7 @@ def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
     return json.dumps(event), protocol.count
 
 
-async def _send_events(protocol: ViewerProtocol, request: Any) -> Any:
+async def _send_events(protocol: _ViewerProtocol, request: "web.Request") -> "web.StreamResponse":
     """Send server-sent events of new samples, twenty times a second."""
     from aiohttp import web
 
@@ -129,19 +116,19 @@ async def _send_events(protocol: ViewerProtocol, request: Any) -> Any:
     sent = 0
     with suppress(ConnectionError):
         while not protocol.over.is_set():
-            text, sent = make_event(protocol, sent)
+            text, sent = _make_event(protocol, sent)
             await response.write(f"data: {text}\n\n".encode())
             await asyncio.sleep(0.05)
     return response
 
 
-async def _render_page(title: str, protocol: ViewerProtocol, _: Any) -> Any:
+async def _render_page(title: str, protocol: _ViewerProtocol, _: "web.Request") -> "web.Response":
     from aiohttp import web
 
-    text, _ = make_event(protocol, 0)  # so that it is drawn as soon as it is loaded
+    event, _count = _make_event(protocol, 0)  # so that it is drawn as soon as it is loaded
     nonce = secrets.token_urlsafe(16)
     page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
-    text = page.replace("FIRST", text.replace("<", "\\u003c"))
+    text = page.replace("FIRST", event.replace("<", "\\u003c"))
     headers = {
         "Content-Security-Policy": _CONTENT_SECURITY_POLICY.format(nonce),
         "Cache-Control": "no-store",
@@ -158,14 +145,14 @@ def _is_same_origin(host: str, origin: str | None) -> bool:
     return name == "localhost" and origin in (None, f"http://{host}")
 
 
-async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
+async def _run_viewer(title: str, page: Address | None, screen: bool, pipe: "Connection") -> None:
     loop, runner, url, local = asyncio.get_running_loop(), None, "", (LOOPBACK, 0)
-    transport, protocol = await loop.create_datagram_endpoint(ViewerProtocol, local_addr=local)
+    transport, protocol = await loop.create_datagram_endpoint(_ViewerProtocol, local_addr=local)
     if page is not None:
         from aiohttp import web
 
         @web.middleware
-        async def check_origin(request: Any, handler: Any) -> Any:
+        async def check_origin(request: web.Request, handler: "Handler") -> web.StreamResponse:
             if not _is_same_origin(request.host, request.headers.get("Origin")):
                 raise web.HTTPForbidden(text="this page is served by its address, to itself alone")
             return await handler(request)
@@ -184,7 +171,7 @@ async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pi
 
         with Live(refresh_per_second=5, auto_refresh=False) as live:
             while not protocol.over.is_set():
-                live.update(make_table(protocol, f"{title} {url}"), refresh=True)
+                live.update(_make_table(protocol, f"{title} {url}"), refresh=True)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(protocol.over.wait(), 0.2)
     await protocol.over.wait()
@@ -193,7 +180,7 @@ async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pi
         await runner.cleanup()
 
 
-def _run_process(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
+def _run_process(title: str, page: Address | None, screen: bool, pipe: "Connection") -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ends it, with its summary
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # whatever the loop's is
     os.nice(5)
@@ -217,7 +204,7 @@ class Viewer(AbstractContextManager["Viewer"]):
         ModuleNotFoundError: aiohttp is not installed.
     """
 
-    def __init__(self, title: str, page: tuple[str, int] | None, screen: bool) -> None:
+    def __init__(self, title: str, page: Address | None, screen: bool) -> None:
         context = get_context("spawn")
         pipe, child_pipe = context.Pipe()
         arguments = title, page, screen, child_pipe

@@ -6,7 +6,7 @@ the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -23,13 +23,16 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # iso
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # isort: skip
 from torch import nn  # isort: skip
 
+if TYPE_CHECKING:
+    from ...envs.device.torch_env import DeviceVectorEnv
+
 _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
 class TrainingSource(NamedTuple):
     """The cars of a training."""
 
-    cars: Any  # `DeviceVectorEnv` with gradients, which resets itself in the same step
+    cars: "DeviceVectorEnv"  # with gradients, which resets itself in the same step
     seeds: list[int]  # seeds of the cars
     reward_scale: RewardScale  # factor of each car's reward
 
@@ -70,6 +73,7 @@ class GruPolicy(BasePolicy):
         net_arch: Sizes of the dense layers.
         features_extractor_class: Class before the GRU.
         features_extractor_kwargs: Arguments of that class.
+        normalize_images: As in stable-baselines3; there are no images.
     """
 
     def __init__(
@@ -81,9 +85,10 @@ class GruPolicy(BasePolicy):
         net_arch: Sequence[int] = (64, 64),
         features_extractor_class: type[BaseFeaturesExtractor] = Standardised,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
+        normalize_images: bool = True,
     ) -> None:
-        further = dict(features_extractor_kwargs or {})
-        super().__init__(observation_space, action_space, features_extractor_class, further)
+        further = dict(features_extractor_kwargs or {}), None, normalize_images
+        super().__init__(observation_space, action_space, features_extractor_class, *further)
         self.features_extractor = self.make_features_extractor()
         self.cell = nn.GRU(self.features_extractor.features_dim, cells)
         self.layers = make_dense_layers(cells, *net_arch, action_space.shape[0])
@@ -279,7 +284,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
 def _unroll_window(
     policy: GruPolicy,
-    cars: DeviceVectorEnv,
+    cars: "DeviceVectorEnv",
     obs: torch.Tensor,
     state: torch.Tensor,
     reward_scale: RewardScale,

@@ -210,7 +210,7 @@ class _RemoteBatch(ForeignBatch):
         """Process some rows, as `BatchEstimator.take`."""
         fast, rows, packets, counts, obs, inner, plan, limits, *others = arguments
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
-        remote: list[Any] = [self[i].inner for i in chosen.tolist()]
+        remote: list[Any] = [self[i].inner for i in chosen.tolist()]  # type: ignore[union-attr]
         records = [
             (item.row, fast[i, : rows[i]], packets[i, : counts[i]])
             for i, item in zip(chosen.tolist(), remote, strict=True)

@@ -7,11 +7,12 @@ correction, whose history begins anew.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.numerics.functions import clip, exp
 from ...envs.numerics.jit import copy_into, jit, noinline
@@ -21,7 +22,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
 from ..core.filter import advance, compute_deviation
-from ..core.record import FILTER
+from ..core.record import FILTER, FilterRecord, GainTables
 from ..estimator import Estimator, compile_call
 from ..make import make_estimator
 from .correction_file import FAST_INPUTS, LAGS, Correction, load_correction
@@ -39,28 +40,28 @@ is added to beta (rad), the deviation of the sum (rad, 0: there is no correction
 HISTORY = SLIP_RATE + 1 + len(COLUMNS)
 
 
-class _CorrectionNet(NamedTuple):
+class CorrectionNet(NamedTuple):
     """A correction as compiled code takes it."""
 
-    states: Any  # places of the filter's states that are read, beta's among them
+    states: npt.NDArray[np.int64]  # places of the states that are read, beta's among them
     beta: int  # place of beta among the filter's states
-    mean: Any  # of the inputs, shape (inputs,)
-    scale: Any
+    mean: Array  # of the inputs, shape (inputs,)
+    scale: Array  # of the same shape
     clip: float  # bound of normalised inputs
-    sizes: Any  # of the layers, inputs first
-    numbers: Any  # each layer's weights, (inputs, outputs) row by row, then its biases
+    sizes: npt.NDArray[np.int64]  # of the layers, inputs first
+    numbers: Array  # each layer's weights, (inputs, outputs) row by row, then its biases
 
 
 _INTEGERS, _FLOATS = np.zeros(1, np.int64), np.zeros(1)
-EXAMPLE = _CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
+EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 """For `compile_call`: all nets have these types."""
 
 
-def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:
+def _make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
     """Make the net for a filter's states by name, all of the card's among them."""
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
-    return _CorrectionNet(
+    return CorrectionNet(
         np.array([states.index(name) for name in correction.card.states], np.int64),
         states.index("beta"),
         np.array(network.mean),
@@ -72,11 +73,11 @@ def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet
 
 
 @jit
-def locate_stack(net: _CorrectionNet) -> Scalar:
+def locate_stack(net: CorrectionNet) -> Scalar:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:
-        net: `_CorrectionNet`.
+        net: A correction.
 
     Returns:
         Index of its first number.
@@ -104,7 +105,9 @@ def _gather(m: Vector, row: Vector) -> None:
 
 
 @jit
-def _write_frame(f: Any, gains: Any, m: Vector, net: Any, offset: int) -> int:
+def _write_frame(
+    f: FilterRecord, gains: GainTables, m: Vector, net: CorrectionNet, offset: int
+) -> int:
     """Write the frame of this pace at a place; return how many of its numbers are not finite."""
     k, n = len(COLUMNS) + 1, len(net.states)
     for i in range(k):  # the slip rate stands before the columns
@@ -120,7 +123,7 @@ def _write_frame(f: Any, gains: Any, m: Vector, net: Any, offset: int) -> int:
 
 
 @jit
-def _run_layers(m: Vector, net: Any, offset: int) -> int:
+def _run_layers(m: Vector, net: CorrectionNet, offset: int) -> int:
     """Run the network on the stack at a place, which it normalises; return the outputs' place."""
     inputs, at = net.sizes[0], 0
     for i in range(inputs):
@@ -142,7 +145,7 @@ def _run_layers(m: Vector, net: Any, offset: int) -> int:
 
 
 @jit
-def _update_correction(f: Any, gains: Any, m: Vector, net: Any) -> None:
+def _update_correction(f: FilterRecord, gains: GainTables, m: Vector, net: CorrectionNet) -> None:
     """Update the correction at this pace."""
     width, stack, newest = net.sizes[0] // len(LAGS), locate_stack(net), int(m[FRAMES])
     if _write_frame(f, gains, m, net, HISTORY + width * (newest % RING_FRAMES)) > 0:
@@ -166,7 +169,7 @@ def filter_and_correct(
     packets: Matrix,
     count: int,
     m: Vector,
-    net: _CorrectionNet,
+    net: CorrectionNet,
 ) -> None:
     """Advance a filter whose gains follow P, pace by pace, and update its correction.
 
@@ -178,7 +181,7 @@ def filter_and_correct(
         packets: Packets, shape (count or more, PACKET_WIDTH).
         count: Number of packets to take.
         m: Memory of the correction, shape (memory_size,).
-        net: `_CorrectionNet`.
+        net: The correction.
     """
     start, first_packet, empty, last = 0, 0, fast[:0], m[TICK_PLACE] + rows
     for j in range(rows):
@@ -199,7 +202,7 @@ def filter_and_correct(
 
 
 @jit
-def apply_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
+def apply_correction(f: FilterRecord, m: Vector, net: CorrectionNet) -> None:
     """Add the correction to a filter's record, whose own numbers go to the memory's end.
 
     How the sum's error depends on those of the other states is not known: covariances are zero.
@@ -207,7 +210,7 @@ def apply_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `_CorrectionNet`.
+        net: The correction.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(f.P[b, :n], row)
@@ -220,13 +223,13 @@ def apply_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
 
 
 @jit
-def remove_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
+def remove_correction(f: FilterRecord, m: Vector, net: CorrectionNet) -> None:
     """Restore a filter's own numbers in its record.
 
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `_CorrectionNet`.
+        net: The correction.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(row[:n], f.P[b])
@@ -309,11 +312,10 @@ class LearnedEstimator:
 
 
 @functools.cache
-def _compile_step() -> Any:
+def _compile_step() -> Callable[..., None]:
     """Return `filter_and_correct` as a plain call."""
-    record = np.zeros((1, 1)), 0, np.zeros((1, 1)), 0
-    layers = np.zeros(1, FILTER), np.zeros((1, 1, 1))
-    return compile_call(filter_and_correct, *layers, *record, np.zeros(1), EXAMPLE)
+    matrix, layers = np.zeros((1, 1)), (np.zeros(1, FILTER), np.zeros((1, 1, 1)))
+    return compile_call(filter_and_correct, *layers, matrix, 0, matrix, 0, np.zeros(1), EXAMPLE)
 
 
 def learned(

@@ -33,33 +33,19 @@ LAGS = (0, 1, 2, 4, 6, 9, 13, 17, 22, 27, 33, 40)
 class CorrectionCard:
     """The inputs of a correction and how it was made; JSON types only.
 
-    Attributes:
-        base: The filter, a name of `FILTERS` with gains "covariance".
-        states: States of the filter that the network reads beside the standard deviation of its
-            beta.
-        base_options: Options of the filter.
-        scenarios: Scenarios of the training.
-        seed: Seed of the training.
-        command: Command of the training.
-        cpu_seconds: CPU time of the training (s).
-        temperature: Factor on the deviation, from held-out seeds.
-        evaluation: What was measured on other seeds.
-        sideslip: Version of the package in the training.
-
-    Raises:
-        ValueError: Another base, or states without beta.
+    ValueError says that the base is another, or that beta is not among the states.
     """
 
-    base: str
-    states: tuple[str, ...]
-    base_options: dict[str, Any] = field(default_factory=dict)
-    scenarios: tuple[str, ...] = ()
-    seed: int = 0
-    command: str = ""
-    cpu_seconds: float = 0.0
-    temperature: float = 1.0
-    evaluation: dict[str, float] = field(default_factory=dict)
-    sideslip: str = ""
+    base: str  # the filter, a name of `FILTERS` with gains "covariance"
+    states: tuple[str, ...]  # of the filter, which the network reads beside the deviation of beta
+    base_options: dict[str, Any] = field(default_factory=dict)  # of the filter
+    scenarios: tuple[str, ...] = ()  # of the training
+    seed: int = 0  # of the training
+    command: str = ""  # of the training
+    cpu_seconds: float = 0.0  # of the training
+    temperature: float = 1.0  # factor on the deviation, from held-out seeds
+    evaluation: dict[str, float] = field(default_factory=dict)  # measured on other seeds
+    sideslip: str = ""  # version of the package in the training
 
     def __post_init__(self) -> None:
         allowed = [name for name, row in FILTERS.items() if row.gains == "covariance"]
@@ -73,27 +59,17 @@ class CorrectionCard:
 
     @property
     def inputs(self) -> int:
-        """Number of the network's inputs.
-
-        A frame has a_y / v - gyro, the fast inputs, states, the deviation of beta, and the filter's
-        mass.
-        """
+        """Number of the network's inputs."""
+        # of a frame: a_y / v - gyro, fast inputs, states, deviation of beta, the filter's mass
         return (len(FAST_INPUTS) + len(self.states) + 3) * len(LAGS)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A network and its card.
+    """A network and its card; ValueError says that the network does not fit.
 
     The network's two outputs are what is added to beta (rad) and the logarithm of the standard
     deviation of the sum (rad).
-
-    Attributes:
-        card: What the network reads and how it was trained.
-        network: The network.
-
-    Raises:
-        ValueError: Another network.
     """
 
     card: CorrectionCard

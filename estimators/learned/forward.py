@@ -29,25 +29,16 @@ CELL_WEIGHTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 class RecurrentCell:
     """One layer of cells, whose state is all zero where an episode begins.
 
-    Arrays are rounded to single precision, their gates one below the other.
-
-    Attributes:
-        kind: Name of `GATES`.
-        weight_in: Weights of the input, shape (gates size, inputs).
-        weight_state: Weights of the state, shape (gates size, size).
-        bias_in: Biases of the input, shape (gates size,).
-        bias_state: Biases of the state, shape (gates size,).
-
-    Raises:
-        ValueError: Another kind, or shapes that do not fit together.
+    Arrays are rounded to single precision, their gates one below the other. ValueError says that
+    the kind is another, or that shapes do not fit together.
     """
 
     parts: ClassVar[tuple[str, ...]] = CELL_WEIGHTS
-    kind: str
-    weight_in: Array
-    weight_state: Array
-    bias_in: Array
-    bias_state: Array
+    kind: str  # name of `GATES`
+    weight_in: Array  # of the input, shape (gates size, inputs)
+    weight_state: Array  # of the state, shape (gates size, size)
+    bias_in: Array  # of the input, shape (gates size,)
+    bias_state: Array  # of the state, shape (gates size,)
 
     def __post_init__(self) -> None:
         if self.kind not in GATES:
@@ -87,24 +78,16 @@ class MovingAverages:
 
     A mean is that of the episode so far, and from its time on a leaky one: a new u counts for
     max(1 / steps so far, 1 - exp(-1 / time)). No gate decides what is kept, so that minutes of a
-    small signal add up; what is to be averaged, products too, the SiLU units make.
-
-    Attributes:
-        weight_in: Weights, shape (units, inputs), rounded to single precision.
-        bias_in: Biases, shape (units,), rounded to single precision.
-        n_silu: Number of SiLU units.
-        times: Times of the means (steps).
-
-    Raises:
-        ValueError: Shapes that do not fit together, or a number out of range.
+    small signal add up; what is to be averaged, products too, the SiLU units make. ValueError says
+    that shapes do not fit together, or that a number is out of range.
     """
 
     kind: ClassVar[str] = "traces"
     parts: ClassVar[tuple[str, ...]] = ("weight_in", "bias_in")
-    weight_in: Array
-    bias_in: Array
-    n_silu: int
-    times: Sequence[float]
+    weight_in: Array  # shape (units, inputs), rounded to single precision
+    bias_in: Array  # shape (units,), rounded to single precision
+    n_silu: int  # number of SiLU units
+    times: Sequence[float]  # of the means (steps)
 
     def __post_init__(self) -> None:
         for name in self.parts:
@@ -139,10 +122,7 @@ class MovingAverages:
 
     @property
     def numbers(self) -> Array:
-        """Arrays as compiled code takes them.
-
-        Final weights of a new number by time, weights (inputs, units) row by row, biases.
-        """
+        """Final weights of a new number by time, weights (inputs, units) row by row, biases."""
         shares = -np.expm1(-1.0 / np.array(self.times))
         return np.concatenate([shares, self.weight_in.T.ravel(), self.bias_in])
 
@@ -238,12 +218,9 @@ def _step_cell(z: Vector, h: Vector, gates: int, numbers: Vector, offset: int) -
             candidate = _tanh(from_input[2 * n + i] + reset * from_state[2 * n + i])
             h[i] = (1.0 - update) * candidate + update * h[i]
         else:
-            enter, forget, candidate, leave = (
-                from_input[i] + from_state[i],
-                from_input[n + i] + from_state[n + i],
-                from_input[2 * n + i] + from_state[2 * n + i],
-                from_input[3 * n + i] + from_state[3 * n + i],
-            )
+            enter, forget = from_input[i] + from_state[i], from_input[n + i] + from_state[n + i]
+            candidate = from_input[2 * n + i] + from_state[2 * n + i]
+            leave = from_input[3 * n + i] + from_state[3 * n + i]
             h[n + i] = _sigmoid(forget) * h[n + i] + _sigmoid(enter) * _tanh(candidate)
             h[i] = _sigmoid(leave) * _tanh(h[n + i])
     return offset
@@ -259,10 +236,8 @@ def _compute_gates(
         from_input[o] = numbers[offset + n_inputs * n + o]
         from_state[o] = numbers[offset + (n_inputs + 1) * n + o]
     for i in range(n_inputs):
-        row, target = (
-            numbers[offset + i * n : offset + i * n + n],
-            from_input if i < len(z) else from_state,
-        )
+        row = numbers[offset + i * n : offset + i * n + n]
+        target = from_input if i < len(z) else from_state
         x = z[i] if i < len(z) else h[i - len(z)]
         for o in range(n):
             target[o] += row[o] * x
@@ -292,7 +267,7 @@ def forward(net: PackedNetwork, x: Matrix, state: Matrix, out: Matrix) -> None:
     """Compute the network's outputs.
 
     Args:
-        net: `PackedNetwork`.
+        net: The network.
         x: Observations, shape (N, inputs).
         state: Memory of each row, shape (N, memory), updated.
         out: Output, shape (N, width).
@@ -318,9 +293,8 @@ def forward(net: PackedNetwork, x: Matrix, state: Matrix, out: Matrix) -> None:
             gates, size = net.cells[c, 0], net.cells[c, 1]
             if gates == 0:
                 n_state = 1 + size * net.cells[c, 3]
-                z, offset = _step_averages(
-                    z, m[position : position + n_state], net.cells[c], net.numbers, offset
-                )
+                memory = m[position : position + n_state]
+                z, offset = _step_averages(z, memory, net.cells[c], net.numbers, offset)
             else:
                 n_state = size * (gates - 2)
                 offset = _step_cell(z, m[position : position + n_state], gates, net.numbers, offset)

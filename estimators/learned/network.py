@@ -36,34 +36,19 @@ class Network:
 
     Weights and biases are rounded to single precision, in which networks are trained. Sums are in
     double precision, so that a row's result depends on the batch around it by rounding of the
-    sixteenth digit only.
-
-    Attributes:
-        mean: Mean of each frame before it is stacked, shape (inputs,), or of the stack, (history
-            inputs,).
-        scale: Scale of the same shape; what has scale 0 is not read.
-        weights: Weights of each layer, shape (outputs, inputs).
-        biases: Biases of each layer, shape (outputs,).
-        activation: Name of `ACTIVATIONS`, between layers.
-        output: Name of `OUTPUTS`, after the last one.
-        clip: z lies within +-clip; None does not clip.
-        history: Number of frames side by side in z, oldest first, those before the episode zero
-            (the stack of stable-baselines3's VecFrameStack).
-        cells: Cells between z and the first layer.
-
-    Raises:
-        ValueError: Shapes that do not fit, a number that is not finite, an unknown name.
+    sixteenth digit only. ValueError says that shapes do not fit, that a number is not finite, or
+    that a name is unknown.
     """
 
-    mean: Array
-    scale: Array
-    weights: Sequence[Array]
-    biases: Sequence[Array]
-    activation: str = "tanh"
-    output: str = "linear"
-    clip: float | None = None
-    history: int = 1
-    cells: Sequence[MemoryLayer] = ()
+    mean: Array  # of a frame before it is stacked, shape (inputs,), or of the stack
+    scale: Array  # of the same shape; what has scale 0 is not read
+    weights: Sequence[Array]  # of each layer, shape (outputs, inputs)
+    biases: Sequence[Array]  # of each layer, shape (outputs,)
+    activation: str = "tanh"  # name of `ACTIVATIONS`, between layers
+    output: str = "linear"  # name of `OUTPUTS`, after the last one
+    clip: float | None = None  # z lies within +-clip; None does not clip
+    history: int = 1  # frames side by side in z, oldest first, those before the episode zero
+    cells: Sequence[MemoryLayer] = ()  # between z and the first layer
 
     def __post_init__(self) -> None:
         for name in ("mean", "scale"):
@@ -73,8 +58,7 @@ class Network:
             object.__setattr__(self, name, tuple(array.astype(np.float64) for array in single))
         object.__setattr__(self, "cells", tuple(self.cells))
         for name, known in (("activation", ACTIVATIONS), ("output", OUTPUTS)):
-            if getattr(self, name) not in known:
-                value = getattr(self, name)
+            if (value := getattr(self, name)) not in known:
                 raise ValueError(f"unknown {name} {value!r}; known: {', '.join(known)}")
         if self.clip is not None and not self.clip > 0.0:
             raise ValueError(f"clip is above zero or None, got {self.clip!r}")
@@ -203,13 +187,13 @@ class Network:
         """Replace the dense layers.
 
         Args:
-            dense: Network of what they read, with the new layers.
+            dense: Network of what they read, with the new layers, activation and output.
 
         Returns:
-            The network with its layers, activation and output.
+            The new network.
         """
-        layers = replace(self, weights=dense.weights, biases=dense.biases)
-        return replace(layers, activation=dense.activation, output=dense.output)
+        names = ("weights", "biases", "activation", "output")
+        return replace(self, **{name: getattr(dense, name) for name in names})
 
     def compute_features(self, x: Array, state: Array) -> Array:
         """Compute what the first dense layer reads.
@@ -221,9 +205,9 @@ class Network:
         Returns:
             Features, shape (N, k).
         """
-        memory_part = self._network_arrays._replace(sizes=self._network_arrays.sizes[:1])
-        out = np.empty((len(x), int(memory_part.sizes[0])))
-        forward(memory_part, x, state, out)
+        arrays = self._network_arrays
+        out = np.empty((len(x), int(arrays.sizes[0])))
+        forward(arrays._replace(sizes=arrays.sizes[:1]), x, state, out)
         return out
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
@@ -237,8 +221,7 @@ class Network:
         Returns:
             Actions, shape (N, width).
         """
-        if state is None:
-            state = np.zeros((len(x), self.memory))
+        state = np.zeros((len(x), self.memory)) if state is None else state
         out = np.empty((len(x), self.width))
         forward(self._network_arrays, x, state, out)
         return out
@@ -298,7 +281,7 @@ def parse_json_object(text: str) -> dict[str, Any]:
     return fields
 
 
-def describe_network(network: Network) -> dict[str, Any]:
+def describe_network(network: Network) -> dict[str, object]:
     """Describe a network for its card.
 
     Args:
@@ -307,28 +290,22 @@ def describe_network(network: Network) -> dict[str, Any]:
     Returns:
         Sizes and kinds by name, JSON types only.
     """
-    cells: list[list[Any]] = [
+    cells: list[list[object]] = [
         [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
         if isinstance(cell, MovingAverages)
         else [cell.kind, cell.size]
         for cell in network.cells
     ]
-    return dict(
-        hidden=list(network.hidden),
-        activation=network.activation,
-        output=network.output,
-        clip=network.clip,
-        action_width=network.width,
-        history=network.history,
-        cells=cells,
-    )
+    plain = {name: getattr(network, name) for name in ("activation", "output", "clip")}
+    sizes = {"action_width": network.width, "history": network.history}
+    return {"hidden": list(network.hidden), **plain, **sizes, "cells": cells}
 
 
-def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
+def build_network(fields: object, inputs: int, tensors: Tensors) -> Network:
     """Build the network that a card describes.
 
     Args:
-        fields: The card's description, see `describe_network`.
+        fields: Description in the card, as `describe_network` makes it.
         inputs: Number of entries of an observation.
         tensors: Tensors by name, of the shapes that the card has.
 
@@ -341,9 +318,8 @@ def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
     if not isinstance(fields, dict) or set(fields) != {*_DENSE, *NO_MEMORY}:
         names = ", ".join((*_DENSE, *NO_MEMORY))
         raise ValueError(f"the card's network holds {names}, got {fields!r}")
-    hidden, cells, clip = fields["hidden"], fields["cells"], fields["clip"]
+    hidden, cells, clip, history = (fields[key] for key in ("hidden", "cells", "clip", "history"))
     sizes = [*hidden, fields["action_width"]] if isinstance(hidden, list) else []
-    history = fields["history"]
     if not sizes or not all(type(size) is int and size > 0 for size in (*sizes, history)):
         raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
     if not (isinstance(cells, list) and all(map(_is_cell, cells))):
@@ -367,7 +343,7 @@ def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
     )
 
 
-def _is_cell(cell: Any) -> bool:
+def _is_cell(cell: object) -> bool:
     if not isinstance(cell, list) or not cell:
         return False
     kind, *numbers = cell

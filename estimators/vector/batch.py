@@ -2,7 +2,7 @@
 
 import copy
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,61 @@ from ...envs.numerics.simd8 import allocate_aligned
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ...envs.sensors.link import SlowSensor
 from ..core.record import FILTER, SkipCounters
+from ..estimator import Estimator
 from ..protocol import Estimates
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import write_outputs
-from .kernel import compile_observe_batch, make_empty_outputs
-from .lane_ticks import Build, GainPool
-from .lanes import make_blocks
+from .lane_ticks import FilterBank
+from .lanes import compile_observe_batch, make_blocks, make_empty_outputs
+from .records import IntArray
 
-IntArray = npt.NDArray[np.int64]
+Build = Callable[[EstimatorSpec], AnyEstimator]
 Sensors = Mapping[str, SlowSensor]
+
+
+class _GainPool:
+    """Estimators by the design of their specs, and their gains in one flat array, the pool."""
+
+    def __init__(self, build: Build) -> None:
+        self._build = build
+        self._estimators: dict[Any, Estimator] = {}
+        self._places: dict[Any, tuple[int, ...]] = {}
+        self.pool = np.zeros(0)
+
+    def __getitem__(self, design: Any) -> Estimator:
+        return self._estimators[design]
+
+    def get_estimator(self, spec: EstimatorSpec) -> Estimator:
+        """Return the estimator for a spec, built unless it is at hand."""
+        design = spec.design
+        if design not in self._estimators:
+            estimator = self._build(spec)
+            if not isinstance(estimator, Estimator):
+                raise TypeError(
+                    f"a batch is of filters of ours or of none, got {estimator!r} as well"
+                )
+            self._estimators[design] = estimator
+        return self._estimators[design]
+
+    def gains(self, design: Any) -> Array:
+        """Return a design's table in the pool, shape (cells, rows, columns)."""
+        start, *shape = self._places[design]
+        return self.pool[start : start + int(np.prod(shape))].reshape(shape)
+
+    def place(self, used_keys: Sequence[Any]) -> npt.NDArray[np.int64]:
+        """Lay the gains of all rows' designs side by side in a new pool: their places, (N, 4)."""
+        self._estimators = {design: self._estimators[design] for design in dict.fromkeys(used_keys)}
+        tables = [
+            self.gains(design) if design in self._places else estimator.gains
+            for design, estimator in self._estimators.items()
+        ]
+        ends = np.cumsum([table.size for table in tables])
+        self.pool = np.concatenate([table.ravel() for table in tables])
+        self._places = {
+            design: (int(end) - table.size, *table.shape)
+            for design, table, end in zip(self._estimators, tables, ends, strict=True)
+        }
+        return np.array([self._places[design] for design in used_keys], np.int64)
 
 
 class BatchEstimator:
@@ -43,7 +89,7 @@ class BatchEstimator:
 
     def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:
         self.name, self.dt = name, dt
-        self._designs = GainPool(build)
+        self._designs = _GainPool(build)
         self._specs: list[EstimatorSpec] = list(specs)
         self._design_keys: list[Any] = [None] * len(specs)  # each row's design
         first = self._designs.get_estimator(specs[0])
@@ -141,6 +187,10 @@ class BatchEstimator:
         counts = _parse_counts("counts", counts, N, packets.shape[1])
         self.take(None, fast, rows, packets, counts, *self._empty_outputs)
 
+    @property
+    def _bank(self) -> FilterBank:
+        return FilterBank(self.filters, self._designs.pool, self._places)
+
     @functools.cached_property
     def _empty_outputs(self) -> tuple[Any, ...]:
         return make_empty_outputs(len(self))
@@ -181,11 +231,9 @@ class BatchEstimator:
             *observed: Arguments of `wrappers.kernel.observe` from `obs` on, of N filters.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
-        memory = self.filters, self._designs.pool, self._places, done, self._lanes
-        while compile_observe_batch()(*memory, fast, rows, packets, counts, *observed) > 0:
-            missing = np.flatnonzero(
-                done < rows
-            )  # rows without gains, of which each is designed once
+        arguments = done, self._lanes, (fast, rows, packets, counts), observed
+        while compile_observe_batch()(self._bank, *arguments) > 0:
+            missing = np.flatnonzero(done < rows)  # without gains; each design is made once
             keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
             for i in dict(zip(keys, missing.tolist(), strict=True)).values():
                 self[i].design_missing()
@@ -195,7 +243,11 @@ class BatchEstimator:
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs."""
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.filters[:] = snapshot
 
     @property
@@ -268,7 +320,12 @@ class ForeignBatch(BatchEstimator):
         return self._estimators[i]
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does."""
+        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does.
+
+        Args:
+            rows: Indices of the estimators.
+            specs: Spec of each of these estimators.
+        """
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._design_keys[i]:
                 self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
@@ -276,7 +333,12 @@ class ForeignBatch(BatchEstimator):
             self[i].sensors = dict(spec.sensors)
 
     def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
-        """Process rows and packets as `BatchEstimator.take` does."""
+        """Process rows and packets as `BatchEstimator.take` does.
+
+        Args:
+            mask: Estimators at work, bool, shape (N,); None for all.
+            *arguments: Its other arguments.
+        """
         fast, rows, packets, counts, obs, inner, plan, limits, *row_arrays = arguments
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         for i in chosen.tolist():
@@ -289,6 +351,10 @@ class ForeignBatch(BatchEstimator):
         return [estimator.get_state() for estimator in self._estimators]
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs."""
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)

@@ -1,69 +1,108 @@
 """EstimateObservation for vector environments: all rows' estimators in one compiled call."""
 
-import copy
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import VehicleSource
-from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec
+from ..wrappers.estimate import (
+    Arguments,
+    EstimatorSource,
+    EstimatorSpec,
+    find_base_env,
+    make_spec,
+)
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, make_outputs
 from ..wrappers.truth import choose_vehicle, set_stiffness
 from .make import build_batch
-from .records import (
-    BatchedEnv,
-    BatchedRecords,
-    RecordBatch,
-    SyncRecords,
-    get_env_state,
-    get_true_vehicles,
-)
+from .records import BatchedEnv, IntArray, get_env_state, get_true_vehicles, make_vector_spec
 
 _Observations = npt.NDArray[np.float32]
 _Mask = npt.NDArray[np.bool_]
 _Step = tuple[_Observations, Any, Any, Any, dict[str, Any]]
 
 
-def make_vector_spec(
-    spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]
-) -> EnvSpec | None:
-    """Make the spec of a vector env whose rows wear the wrapper `single(**kwargs)`.
+class _RecordBatch(NamedTuple):
+    """The records of N cars' newest step."""
 
-    `gym.make_vec` of it makes environments that are wrapped one by one: it puts no wrappers around
-    an env that is a vector by itself.
+    fast: Array  # (N, k, FAST_WIDTH)
+    rows: IntArray  # (N,), how many of them are there
+    packets: Array  # (N, capacity, PACKET_WIDTH)
+    counts: IntArray  # (N,)
 
-    Args:
-        spec: Spec of the vector env, or None.
-        single: Class of the single wrapper.
-        kwargs: Keyword arguments of the wrapper.
 
-    Returns:
-        A JSON-able spec; None without one.
-    """
-    if spec is None:
-        return None
-    spec = copy.deepcopy(spec)
-    entry = f"{single.__module__}:{single.__name__}"
-    wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
-    spec.additional_wrappers += (wrapper,)
-    if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
-        spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
-        spec.kwargs.pop("info", None)
-        if "autoreset_mode" in spec.kwargs:
-            spec.kwargs["vector_kwargs"] = {"autoreset_mode": spec.kwargs.pop("autoreset_mode")}
-    vector_kwargs = spec.kwargs.get("vector_kwargs", {})
-    if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
-        vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
-    return spec
+_MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `_RecordBatch` in the env
+
+
+class _BatchedRecords:
+    """The records of a `BatchedEnv`."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self.layout: tuple[ObservationEntry, ...] = env.layout
+        self.dt: float = env.dt
+
+    def read(self, prefix: str, rows: Iterable[int]) -> _RecordBatch:
+        """Return the newest step's records, or with "final_" those of episodes that just ended."""
+        arrays = (getattr(self._env, prefix + name) for name in _MEMBERS)
+        types = (np.float64, np.int64) * 2
+        records: Any = map(np.ascontiguousarray, arrays, types)  # copied where they are not
+        return _RecordBatch(*records)
+
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
+        """Make the specs of some rows' estimators."""
+        env = self._env
+        return [EstimatorSpec(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+
+    def annotate(self, label: str, beta: Array, std: Array, rows: _Mask) -> None:
+        """Pass estimates (rad) of some rows to an env that draws, beside the truth."""
+        if hasattr(self._env, "annotate"):
+            self._env.annotate(label, beta, std, rows)
+
+
+class _SyncRecords:
+    """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
+
+    def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
+        self._bases = bases = [find_base_env(sub_env) for sub_env in env.envs]
+        layouts = [sub_env.get_wrapper_attr("layout") for sub_env in env.envs]
+        for i, layout in enumerate(layouts):
+            if layout != layouts[0]:
+                raise ValueError(f"environment {i} of the vector env has another layout than 0")
+        self.layout: tuple[ObservationEntry, ...] = layouts[0]
+        self.dt: float = bases[0].dt
+        N = len(bases)
+        fast = np.zeros((N, max(len(base.rows) for base in bases), FAST_WIDTH))
+        packets = np.zeros((N, max(len(base.packets) for base in bases), PACKET_WIDTH))
+        self._records = _RecordBatch(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
+
+    def read(self, prefix: str, rows: Iterable[int]) -> _RecordBatch:
+        """Copy the records of some environments, those before a reset with "final_"."""
+        records = self._records
+        for i in rows:
+            ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in _MEMBERS)
+            records.fast[i, :n], records.packets[i, :m] = ticks[:n], arrived[:m]
+            records.rows[i], records.counts[i] = n, m
+        return records
+
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
+        """Make the specs of some rows' estimators."""
+        return [make_spec(self._bases[i]) for i in rows]
+
+    def annotate(self, label: str, beta: Array, std: Array, rows: _Mask) -> None:
+        """Pass estimates (rad) of some rows to the envs that draw."""
+        for i in np.flatnonzero(rows):
+            self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
 
 class EstimateObservation(
@@ -153,8 +192,15 @@ class EstimateObservation(
     ) -> tuple[_Observations, dict[str, Any]]:
         """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0.
 
-        ResetNeeded says that a mask leaves out rows, and no step succeeded since the last whole
-        reset.
+        Args:
+            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
+            options: Options of the env.
+
+        Returns:
+            Observations and infos.
+
+        Raises:
+            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
         """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
@@ -172,13 +218,21 @@ class EstimateObservation(
             np.zeros(self.num_envs, np.bool_) if ended_before is None else ended_before & ~rows
         )
         self._reset_rows(rows)
-        self._observe(self._records.read_latest(), obs, infos, rows, self._out)
+        records = self._records.read("", range(self.num_envs))
+        self._observe(records, obs, infos, rows, self._out)
         return self._out.copy(), infos
 
     def step(self, actions: Any) -> _Step:
         """Step all rows; the estimators take their records before observations are made.
 
-        ResetNeeded says that it is called before `reset`, or after a step that failed.
+        Args:
+            actions: Actions of all rows.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos.
+
+        Raises:
+            ResetNeeded: It is called before `reset`, or after a step that failed.
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:
@@ -196,14 +250,14 @@ class EstimateObservation(
         elif ended.any():
             self._finish(infos, ended)
             self._reset_rows(ended)
-        all_rows = np.ones(self.num_envs, np.bool_)
-        self._observe(self._records.read_latest(), obs, infos, all_rows, self._out)
+        records, all_rows = self._records.read("", range(self.num_envs)), np.ones_like(ended)
+        self._observe(records, obs, infos, all_rows, self._out)
         self._ended = ended
         return self._out.copy(), rewards, terminated, truncated, infos
 
     def _restore_ended(self, ended_before: _Mask | None) -> None:
         """Restore the flags after an error: a `BatchedEnv` raises it before it moves any row."""
-        if isinstance(self._records, BatchedRecords):
+        if isinstance(self._records, _BatchedRecords):
             self._ended = ended_before
 
     def get_state(self) -> dict[str, Any]:
@@ -216,7 +270,11 @@ class EstimateObservation(
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._update_cars(range(self.num_envs))
@@ -260,13 +318,15 @@ class EstimateObservation(
         obs = np.zeros((self.num_envs, inner), np.float32)
         if inner > 0:
             obs[ended] = np.stack(infos["final_obs"][ended])
-        self._observe(self._records.read_final(ended), obs, infos["final_info"], ended, out)
-        for i in np.flatnonzero(ended):
+        indices = np.flatnonzero(ended).tolist()
+        records = self._records.read("final_", indices)
+        self._observe(records, obs, infos["final_info"], ended, out)
+        for i in indices:
             infos["final_obs"][i] = out[i].copy()
 
     def _observe(
         self,
-        records: RecordBatch,
+        records: _RecordBatch,
         obs: _Observations,
         infos: dict[str, Any],
         mask: _Mask,
@@ -292,7 +352,7 @@ class EstimateObservation(
                 self._records.annotate(self._title, values, summary[:, STD], mask)
 
 
-def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
+def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:
     """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
         raise TypeError(
@@ -315,11 +375,11 @@ def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords
             "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
         )
     if isinstance(layer, SyncVectorEnv):
-        return SyncRecords(layer)
+        return _SyncRecords(layer)
     missing = [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]
     if missing:
         raise TypeError(
             "EstimateObservation reads the records of a sideslip vector environment; "
             f"{type(layer).__name__} has no {', '.join(missing)}"
         )
-    return BatchedRecords(layer)
+    return _BatchedRecords(layer)

@@ -1,11 +1,10 @@
-"""The ticks of a block of filters, by lanes, and the pool of their tables of gains.
+"""The ticks of a block of filters, by lanes.
 
 A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
 row is not sound. So is every packet, and what is stored of a capture.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +16,7 @@ from ...envs.numerics.simd8 import prefetch
 from ...envs.record import FAST, FAST_WIDTH, PACKET, Array
 from ..core.covariance import correct_scalar, project
 from ..core.filter import run_tick
+from ..core.innovation import store_due_captures
 from ..core.model import (
     CURVATURE,
     LATERAL,
@@ -28,104 +28,143 @@ from ..core.model import (
 )
 from ..core.packets import process_packet
 from ..core.predict import compute_residual, compute_signal, propagate, read_fast_row
-from ..core.record import X_OFFSET, FilterRecord, GainTables
-from ..estimator import Estimator
-from ..wrappers.estimate import AnyEstimator, EstimatorSpec
-from .lanes import LaneBlock, load_lane, store_captures, store_lane, store_prediction
+from ..core.record import N_SLOW, WINDOW, X_OFFSET, FilterRecord, FilterRecords, GainTables
 
-Build = Callable[[EstimatorSpec], AnyEstimator]
+LaneBlock = Any
+"""One record of the dtype `lanes.BLOCK`; `b` in compiled code."""
+
+
+class FilterBank(NamedTuple):
+    """The filters of a batch, and the gains of all of them in one array."""
+
+    filters: FilterRecords  # dtype `FILTER`, shape (N, layers)
+    pool: Array  # gains, shape (total,)
+    places: npt.NDArray[np.int64]  # offset, cells, rows and columns of each in the pool, (N, 4)
 
 
 @jit_nrt
-def get_gains(pool: Vector, place: Vector) -> Any:
-    """Return the table of gains at a place in the pool.
+def get_gains(bank: FilterBank, i: int) -> GainTables:
+    """Return the table of gains of a filter.
 
     Args:
-        pool: Gains of all filters in one array, shape (total,).
-        place: Offset, cells, rows and columns, shape (4,).
+        bank: Filters and gains.
+        i: Index of the filter.
 
     Returns:
         View of shape (cells, rows, columns).
     """
+    place = bank.places[i]
     start, cells, height, width = place[0], place[1], place[2], place[3]
-    return pool[start : start + cells * height * width].reshape((cells, height, width))
-
-
-class GainPool:
-    """Estimators by the design of their specs, and their gains in one flat array, the pool.
-
-    Args:
-        build: Function that builds one estimator from its spec.
-    """
-
-    def __init__(self, build: Build) -> None:
-        self._build = build
-        self._estimators: dict[Any, Estimator] = {}
-        self._places: dict[Any, tuple[int, ...]] = {}
-        self.pool = np.zeros(0)
-
-    def __getitem__(self, design: Any) -> Estimator:
-        return self._estimators[design]
-
-    def get_estimator(self, spec: EstimatorSpec) -> Estimator:
-        """Return the estimator for a spec, built unless it is at hand.
-
-        Args:
-            spec: Vehicle, sensors and speed.
-
-        Returns:
-            An estimator of the spec's design.
-
-        Raises:
-            TypeError: The factory builds an `Estimator` for other specs, but not for this one.
-        """
-        design = spec.design
-        if design not in self._estimators:
-            estimator = self._build(spec)
-            if not isinstance(estimator, Estimator):
-                raise TypeError(
-                    f"a batch is of filters of ours or of none, got {estimator!r} as well"
-                )
-            self._estimators[design] = estimator
-        return self._estimators[design]
-
-    def gains(self, design: Any) -> Array:
-        """Return the table of a design, to be read and written in the pool.
-
-        Args:
-            design: `EstimatorSpec.design`.
-
-        Returns:
-            View of shape (cells, rows, columns).
-        """
-        start, *shape = self._places[design]
-        return self.pool[start : start + int(np.prod(shape))].reshape(shape)
-
-    def place(self, used_keys: Sequence[Any]) -> npt.NDArray[np.int64]:
-        """Lay the gains of the designs in use side by side in a new pool and drop the others.
-
-        Args:
-            used_keys: Design of each row, N of them.
-
-        Returns:
-            Offset and shape of each row's table, shape (N, 4).
-        """
-        self._estimators = {design: self._estimators[design] for design in dict.fromkeys(used_keys)}
-        tables = [
-            self.gains(design) if design in self._places else estimator.gains
-            for design, estimator in self._estimators.items()
-        ]
-        ends = np.cumsum([table.size for table in tables])
-        self.pool = np.concatenate([table.ravel() for table in tables])
-        self._places = {
-            design: (int(end) - table.size, *table.shape)
-            for design, table, end in zip(self._estimators, tables, ends, strict=True)
-        }
-        return np.array([self._places[design] for design in used_keys], np.int64)
+    return bank.pool[start : start + cells * height * width].reshape((cells, height, width))
 
 
 @jit
-def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Any, j: int, rows: int) -> None:
+def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load what a filter's ticks read and do not write."""
+    n, dense = f.n, f.dense
+    for i in range(n):
+        b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
+        for j in range(n):
+            b.GT[i, j, lane] = f.GT[i, j]
+        for j in range(i, n):
+            b.Q[i, j, lane] = f.Q[i, j]
+    for i in range(dense):
+        for j in range(n):
+            b.G[i, j, lane] = f.G[i, j]
+    for i in range(n, f.total):
+        b.keep[i, lane] = f.keep[i]
+    for k in range(f.inputs):
+        b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
+        for j in range(dense):
+            b.HT[k, j, lane] = f.HT[k, j]
+    for i in range(f.fasts):
+        b.y_factor[i, 0, lane], b.y_factor[i, 1, lane] = f.y_factor[i, 0], f.y_factor[i, 1]
+        b.rest_fast[i, lane], b.r_fast[i, lane] = f.rest_fast[i], f.r_fast[i]
+        for j in range(n):
+            b.C_fast[i, j, lane] = f.C_fast[i, j]
+        for k in range(f.inputs):
+            b.D_fast[i, k, lane] = f.D_fast[i, k]
+    b.model_speed[lane], b.smoothing[lane], b.step[lane] = f.model_speed, f.smoothing, f.step
+
+
+@jit
+def _load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load a filter's model, where its speed changed, and its state into its lane."""
+    if b.model_speed[lane] != f.model_speed:
+        _load_model(b, lane, f)
+    _load_states(b, lane, f)
+    for k in range(b.inputs):
+        b.u[k, lane] = f.u[k]
+    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
+    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
+    _load_clock(b, lane, f)
+
+
+@jit
+def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    N = b.total
+    for i in range(N):
+        b.x[i, lane] = f.x[i]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                b.P[i, j, lane] = f.P[i, j]
+
+
+@jit
+def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load the tick of the next capture."""
+    first = np.inf
+    for s in range(N_SLOW):
+        if f.period[s] > 0:
+            first = min(first, float(f.next[s]))
+    b.next[lane] = first
+
+
+@jit
+def _store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Store the state of a lane in its filter's record."""
+    _store_states(b, lane, f)
+    for k in range(b.inputs):
+        f.u[k] = b.u[k, lane]
+    for i in range(b.fasts):
+        f.y[i] = b.y[i, lane]
+    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
+    f.tick, f.at = b.tick[lane], b.at[lane]
+
+
+@jit
+def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    N = b.total
+    for i in range(N):
+        f.x[i] = b.x[i, lane]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
+
+
+@jit
+def _store_lane_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Store by its record what a lane's filter captured at its last tick; before the next one."""
+    _store_states(b, lane, f)
+    f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
+    store_due_captures(f, b.tick[lane])
+    _load_states(b, lane, f)
+    _load_clock(b, lane, f)
+
+
+@jit
+def _store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Store a lane's prediction of this tick, before its fast measurements."""
+    slot = b.tick[lane] % WINDOW
+    f.past_road_turn[slot] = b.road_turn[lane]
+    for i in range(b.n):
+        f.predicted[slot, i] = b.x[i, lane]
+
+
+@jit
+def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Matrix, j: int, rows: int) -> None:
     """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
     last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
@@ -176,15 +215,15 @@ def _read_signals(b: LaneBlock) -> Any:
 
 
 @jit
-def _gather_gains(b: LaneBlock, first: int, pool: Vector, places: Any) -> None:
+def _gather_gains(b: LaneBlock, first: int, bank: FilterBank) -> None:
     """Gather the periodic gains of this tick in b.K."""
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
-            place = places[first + lane]
+            place = bank.places[first + lane]
             row = b.cell[lane] * place[2] + 1 + b.at[lane] * maximum(b.fasts, 1)
             for k in range(b.fasts):
                 for j in range(b.total):
-                    b.K[k, j, lane] = pool[place[0] + (row + k) * place[3] + j]
+                    b.K[k, j, lane] = bank.pool[place[0] + (row + k) * place[3] + j]
 
 
 @jit
@@ -202,7 +241,7 @@ def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
             store_element(b.wild, select(is_invalid, 1.0, 0.0))
             for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
-                    store_lane(b, lane, filters[first + lane, 0])
+                    _store_lane(b, lane, filters[first + lane, 0])
         if b.periodic == 1:
             for j in range(b.total):
                 store_element(b.x, load_element(b.x, j) + load_element(b.K, i, j) * residual, j)
@@ -212,7 +251,7 @@ def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
         if has_invalid:
             for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
-                    load_lane(b, lane, filters[first + lane, 0])
+                    _load_lane(b, lane, filters[first + lane, 0])
 
 
 @jit
@@ -222,13 +261,11 @@ def _store_captures(b: LaneBlock, first: int, filters: Matrix) -> None:
         for lane in range(count_lanes()):
             is_due = b.now[lane] > b.next[lane]
             if is_due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:
-                store_captures(b, lane, filters[first + lane, 0])
+                _store_lane_captures(b, lane, filters[first + lane, 0])
 
 
 @jit
-def _step_lanes(
-    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, speed: Any
-) -> None:
+def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> None:
     """Step all lanes by one tick."""
     store_element(b.speed_before, load_element(b.model_speed))
     store_element(b.speed, speed)
@@ -246,10 +283,10 @@ def _step_lanes(
     if b.store_predictions == 1:
         for lane in range(count_lanes()):
             if b.here[lane] == 1.0 and b.apart[lane] == 0.0:
-                store_prediction(b, lane, filters[first + lane, 0])
+                _store_prediction(b, lane, bank.filters[first + lane, 0])
     if b.periodic == 1:
-        _gather_gains(b, first, pool, places)
-    _correct(b, first, filters)
+        _gather_gains(b, first, bank)
+    _correct(b, first, bank.filters)
 
 
 @jit
@@ -258,22 +295,20 @@ def _average_wheel_speed(row: Vector) -> Scalar:
 
 
 @jit
-def _store_outliers(
-    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, fast: Matrix, j: int
-) -> bool:
+def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> bool:
     """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
     if b.periodic == 1:
         for lane in range(count_lanes()):
             if b.apart[lane] == 1.0:
                 i = first + lane
-                f = filters[i, 0]
+                f, place = bank.filters[i, 0], bank.places[i]
                 f.speed = b.speed[lane]
                 cell = find_next_cell(f, _average_wheel_speed(fast[i, j]))
-                if pool[places[i, 0] + cell * places[i, 2] * places[i, 3]] == 0.0:
+                if bank.pool[place[0] + cell * place[2] * place[3]] == 0.0:
                     return False
     for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
-            store_lane(b, lane, filters[first + lane, 0])
+            _store_lane(b, lane, bank.filters[first + lane, 0])
     return True
 
 
@@ -285,15 +320,13 @@ def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
 
 
 @jit
-def _step_outliers(
-    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, fast: Matrix, j: int
-) -> None:
+def _step_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> None:
     """Step the lanes that stand apart by their records, which the lanes take over."""
     for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
             i = first + lane
-            _step_filter(filters[i, 0], get_gains(pool, places[i]), fast[i, j])
-            load_lane(b, lane, filters[i, 0])
+            _step_filter(bank.filters[i, 0], get_gains(bank, i), fast[i, j])
+            _load_lane(b, lane, bank.filters[i, 0])
 
 
 @jit
@@ -312,12 +345,12 @@ def _process_packets(
 ) -> None:
     """Process the packets of a lane's filter that are here now, by its record."""
     k = b.cursor[lane]
-    store_lane(b, lane, f)
+    _store_lane(b, lane, f)
     while k < count and not (f.tick < packets[k, PACKET.arrived] <= b.last[lane]):
         process_packet(f, gains, packets[k])
         k += 1
     b.cursor[lane] = k
-    load_lane(b, lane, f)
+    _load_lane(b, lane, f)
     _set_next_due(b, lane, packets, count)
 
 
@@ -325,9 +358,7 @@ def _process_packets(
 def advance_block(
     b: LaneBlock,
     first: int,
-    filters: Matrix,
-    pool: Vector,
-    places: Any,
+    bank: FilterBank,
     fast: Matrix,
     rows: int,
     packets: Matrix,
@@ -338,9 +369,7 @@ def advance_block(
     Args:
         b: Block of lanes.
         first: Index of the filter in the first lane.
-        filters: Memories, dtype `FILTER`, shape (N, layers).
-        pool: Gains of all filters in one array, shape (total,).
-        places: Place of each filter's gains in the pool, shape (N, 4).
+        bank: Filters and gains.
         fast: Fast rows, shape (N, k, FAST_WIDTH).
         rows: Number of fast rows, equal for these filters.
         packets: Packets, shape (N, capacity, PACKET_WIDTH).
@@ -349,11 +378,12 @@ def advance_block(
     Returns:
         Number of rows done by all alike: fewer than `rows` where one of them has no gains.
     """
+    filters = bank.filters
     store_element(b.due, np.inf)
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             i = first + lane
-            load_lane(b, lane, filters[i, 0])
+            _load_lane(b, lane, filters[i, 0])
             b.cursor[lane], b.now[lane] = 0, float(b.tick[lane])
             b.last[lane] = b.tick[lane] + rows
             _set_next_due(b, lane, packets[i], counts[i])
@@ -363,22 +393,22 @@ def advance_block(
         speed, is_outlier = _read_signals(b)
         has_outlier = any_lane(is_outlier)
         store_element(b.apart, select(is_outlier, 1.0, 0.0))
-        if has_outlier and not _store_outliers(b, first, filters, pool, places, fast, j):
+        if has_outlier and not _store_outliers(b, first, bank, fast, j):
             rows = j
             break
         _store_captures(b, first, filters)
-        _step_lanes(b, first, filters, pool, places, speed)
+        _step_lanes(b, first, bank, speed)
         if has_outlier:
-            _step_outliers(b, first, filters, pool, places, fast, j)
+            _step_outliers(b, first, bank, fast, j)
         if any_lane(load_element(b.now) >= load_element(b.due)):
             for lane in range(count_lanes()):
                 if b.here[lane] == 1.0 and b.now[lane] >= b.due[lane]:
                     i = first + lane
-                    lane_args = filters[i, 0], get_gains(pool, places[i]), packets[i]
-                    _process_packets(b, lane, *lane_args, counts[i])
+                    lane_args = filters[i, 0], get_gains(bank, i), packets[i], counts[i]
+                    _process_packets(b, lane, *lane_args)
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             f = filters[first + lane, 0]
-            store_lane(b, lane, f)
+            _store_lane(b, lane, f)
             f.cursor = b.cursor[lane]
     return rows

@@ -1,4 +1,4 @@
-"""Filters of one shape in SIMD lanes: what their ticks read and write, side by side.
+"""The batch's part of an observation, compiled: filters of one shape in SIMD lanes, others alone.
 
 A block has a record's fields of the same names, whose numbers are lanes, so the equations of `core`
 are compiled for it unchanged. Filter i of a batch has lane i mod LANES of block i // LANES. Its
@@ -7,62 +7,58 @@ every call. In all functions b is a block, lane an index in it, and f the record
 filter.
 """
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import Scalar
+from ...envs.numerics.jit import jit, jit_nrt
+from ...envs.numerics.packed import count_lanes
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
-from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
+from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.innovation import BUFFER, LARSEN, store_due_captures
+from ..core.innovation import BUFFER, LARSEN
 from ..core.model import KINEMATIC, VELOCITY_ROLL
-from ..core.record import N_CORE, N_FAST, N_INPUTS, N_SLOW, WINDOW, FilterRecord
+from ..core.record import (
+    FILTER,
+    N_CORE,
+    N_FAST,
+    N_INPUTS,
+    N_SMALL,
+    N_TOTAL,
+    X_OFFSET,
+    FilterRecord,
+)
 from ..core.update import NONE
+from ..estimator import compile_call
+from ..wrappers.kernel import observe
+from .lane_ticks import FilterBank, LaneBlock, advance_block, get_gains
 
-LaneBlock = Any
-"""One record of the dtype `BLOCK`; `b` in compiled code."""
-
+_MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 _MAX_STATES = 16  # states and clones
 _ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
-_FLOATS = {
-    "x": (_ROW_LENGTH,),
-    "P": (_MAX_STATES, _ROW_LENGTH),  # on and above the diagonal
-    "G": (N_CORE, _ROW_LENGTH),
-    "GT": (N_CORE, _ROW_LENGTH),
-    "HT": (N_INPUTS, _ROW_LENGTH),
-    "Q": (N_CORE, _ROW_LENGTH),  # on and above the diagonal
-    "keep": (_ROW_LENGTH,),
-    "decay": (_ROW_LENGTH,),
-    "drift": (_ROW_LENGTH,),
-    "PC": (_ROW_LENGTH,),
-    "gain": (_ROW_LENGTH,),
-    "K": (N_FAST, _ROW_LENGTH),  # periodic gains of this tick
-    "C_fast": (N_FAST, _ROW_LENGTH),
-    "D_fast": (N_FAST, N_INPUTS),
-    "rest_fast": (N_FAST,),
-    "r_fast": (N_FAST,),
-    "u_factor": (N_INPUTS, 2),
-    "y_factor": (N_FAST, 2),
-    "u": (N_INPUTS,),
-    "u_new": (N_INPUTS,),
-    "y": (N_FAST,),
-    "row": (FAST_WIDTH,),  # of this tick
-    "speed": (),
-    "speed_before": (),
-    "model_speed": (),  # 0: no model was loaded
-    "smoothing": (),
-    "step": (),
-    "road_turn": (),
-    "now": (),  # tick
-    "last": (),  # tick of the last row
-    "due": (),  # tick at which the next packet is taken
-    "next": (),  # tick of the next capture
-    "here": (),  # 1: its filter has a row now; else what the lane holds is of no use
-    "apart": (),  # 1: the tick is computed by the record
-    "wild": (),  # 1: its residual is none
-}
+_FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
+    ((_ROW_LENGTH,), ("x", "keep", "decay", "drift", "PC", "gain")),
+    ((_MAX_STATES, _ROW_LENGTH), ("P",)),  # on and above the diagonal, as Q
+    ((N_CORE, _ROW_LENGTH), ("G", "GT", "Q")),
+    ((N_INPUTS, _ROW_LENGTH), ("HT",)),
+    ((N_FAST, _ROW_LENGTH), ("K", "C_fast")),  # K: periodic gains of this tick
+    ((N_FAST, N_INPUTS), ("D_fast",)),
+    ((N_FAST,), ("rest_fast", "r_fast", "y")),
+    ((N_INPUTS, 2), ("u_factor",)),
+    ((N_FAST, 2), ("y_factor",)),
+    ((N_INPUTS,), ("u", "u_new")),
+    ((FAST_WIDTH,), ("row",)),  # of this tick
+)
+# of a lane: ticks are those of now, of the last row, of the next packet to take and capture;
+# model_speed, 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds
+# is of no use; apart, 1: the tick is computed by the record; wild, 1: its residual is none
+_SCALARS = (
+    *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
+    *("now", "last", "due", "next", "here", "apart", "wild"),
+)
 # of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
 # within the cycle, table of gains, packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
@@ -71,7 +67,11 @@ _SHAPE = (
     *("store_predictions", "tyres", "robust"),
 )
 _FIELDS = (
-    [(name, np.float64, (*shape, LANES)) for name, shape in _FLOATS.items()]
+    [
+        (name, np.float64, (*shape, LANES))
+        for shape, names in (*_FLOATS, ((), _SCALARS))
+        for name in names
+    ]
     + [(name, np.int64, (LANES,)) for name in _INTS]
     + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
     + [("u_column", np.int64, (N_INPUTS, 2)), ("y_column", np.int64, (N_FAST, 2))]
@@ -93,7 +93,7 @@ def make_blocks(count: int) -> Any:
 
 
 @jit
-def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
+def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
     """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
 
     Lanes compute models that change by speed alone, of which every tick predicts and corrects.
@@ -154,105 +154,91 @@ def _add_column(b: LaneBlock, column: int) -> None:
 
 
 @jit
-def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load what a filter's ticks read and do not write."""
-    n, dense = f.n, f.dense
-    for i in range(n):
-        b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
-        for j in range(n):
-            b.GT[i, j, lane] = f.GT[i, j]
-        for j in range(i, n):
-            b.Q[i, j, lane] = f.Q[i, j]
-    for i in range(dense):
-        for j in range(n):
-            b.G[i, j, lane] = f.G[i, j]
-    for i in range(n, f.total):
-        b.keep[i, lane] = f.keep[i]
-    for k in range(f.inputs):
-        b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
-        for j in range(dense):
-            b.HT[k, j, lane] = f.HT[k, j]
-    for i in range(f.fasts):
-        b.y_factor[i, 0, lane], b.y_factor[i, 1, lane] = f.y_factor[i, 0], f.y_factor[i, 1]
-        b.rest_fast[i, lane], b.r_fast[i, lane] = f.rest_fast[i], f.r_fast[i]
-        for j in range(n):
-            b.C_fast[i, j, lane] = f.C_fast[i, j]
-        for k in range(f.inputs):
-            b.D_fast[i, k, lane] = f.D_fast[i, k]
-    b.model_speed[lane], b.smoothing[lane], b.step[lane] = f.model_speed, f.smoothing, f.step
+def _fetch(f: FilterRecord, template: FilterRecord) -> None:
+    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
+    for i in range(0, X_OFFSET + template.total, 8):
+        prefetch(f.padding, i)
+    for i in range(0, N_SMALL, 8):
+        prefetch(f.P, N_TOTAL, i)
+    for j in range(0, template.total, 8):
+        for i in range(template.total):
+            prefetch(f.P, i, j)
+    for j in range(0, template.n, 8):
+        for i in range(template.n):
+            prefetch(f.Q, i, j)
+            prefetch(f.G, i, j)
+            prefetch(f.GT, i, j)
 
 
 @jit
-def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load a filter's model, where its speed changed, and its state into its lane."""
-    if b.model_speed[lane] != f.model_speed:
-        _load_model(b, lane, f)
-    _load_states(b, lane, f)
-    for k in range(b.inputs):
-        b.u[k, lane] = f.u[k]
-    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
-    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
-    _load_clock(b, lane, f)
+def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
+    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
+    n_rows, count = 0, 0
+    for lane in range(count_lanes()):
+        i = first + lane
+        b.here[lane] = 0.0
+        if i < len(filters) and done[i] == -1 and rows[i] > 0:
+            is_same = count == 0 or rows[i] == n_rows
+            if is_same and len(filters[i]) == 1 and _is_lane_compatible(b, lane, filters[i, 0]):
+                b.here[lane], n_rows = 1.0, rows[i]
+                count += 1
+    return n_rows if count >= _MIN_LANES else 0
 
 
-@jit
-def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    N = b.total
-    for i in range(N):
-        b.x[i, lane] = f.x[i]
-    if b.periodic == 0:
-        for i in range(N):
-            for j in range(i, N):
-                b.P[i, j, lane] = f.P[i, j]
+@jit_nrt
+def _observe_batch(
+    bank: FilterBank, done: Vector, lanes: Vector, record: Any, observed: Any
+) -> int:
+    """Call `observe` for every filter that has rows to do; return how many still have."""
+    # record, observed: arguments of `observe` with N filters as first axis, but for inner, plan and
+    # limits; done: rows done, -1 where a filter has not started, updated; filters of one shape go
+    # in lanes
+    fast, rows, packets, counts = record
+    obs, inner, plan, limits, beta, gamma, out, summary = observed
+    filters, n_waiting = bank.filters, 0
+    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
+        b = lanes[first // LANES]
+        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
+        if n_rows > 0:
+            n_done = advance_block(b, first, bank, fast, n_rows, packets, counts)
+        for lane in range(minimum(count_lanes(), len(filters) - first)):
+            i = first + lane
+            if done[i] < rows[i]:
+                f, gains = filters[i], get_gains(bank, i)
+                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
+                outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+                if n_done == 0 and i + 1 < len(filters):
+                    for layer in range(len(f)):
+                        _fetch(filters[i + 1, layer], f[layer])
+                done[i] = observe(
+                    f, gains, fast[i], rows[i], packets[i], counts[i], start, *outputs
+                )
+                n_waiting += 1 if done[i] < rows[i] else 0
+    return n_waiting
 
 
-@jit
-def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load the tick of the next capture."""
-    first = np.inf
-    for s in range(N_SLOW):
-        if f.period[s] > 0:
-            first = min(first, float(f.next[s]))
-    b.next[lane] = first
+def make_empty_outputs(count: int) -> tuple[Any, ...]:
+    """Make the arguments of `observe` from `obs` on, for N filters whose outputs are not read.
+
+    Args:
+        count: Number of filters N.
+
+    Returns:
+        The arguments in their order.
+    """
+    empty, plan = np.zeros((count, 0), np.float32), np.zeros((0, 3), np.int64)
+    truth = np.zeros(count)
+    return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
 
 
-@jit
-def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store the state of a lane in its filter's record."""
-    _store_states(b, lane, f)
-    for k in range(b.inputs):
-        f.u[k] = b.u[k, lane]
-    for i in range(b.fasts):
-        f.y[i] = b.y[i, lane]
-    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
-    f.tick, f.at = b.tick[lane], b.at[lane]
+_INTEGERS, _CUBE = np.zeros(1, np.int64), np.zeros((1, 1, 1))
+EXAMPLE_BANK = FilterBank(np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64))
+EXAMPLE_RECORD = _CUBE, _INTEGERS, _CUBE, _INTEGERS
+"""For `compile_call`: all banks and records have these types."""
 
 
-@jit
-def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    N = b.total
-    for i in range(N):
-        f.x[i] = b.x[i, lane]
-    if b.periodic == 0:
-        for i in range(N):
-            for j in range(i, N):
-                f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
-
-
-@jit
-def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one."""
-    _store_states(b, lane, f)
-    f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
-    store_due_captures(f, b.tick[lane])
-    _load_states(b, lane, f)
-    _load_clock(b, lane, f)
-
-
-@jit
-def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements."""
-    slot = b.tick[lane] % WINDOW
-    f.past_road_turn[slot] = b.road_turn[lane]
-    for i in range(b.n):
-        f.predicted[slot, i] = b.x[i, lane]
+@cache
+def compile_observe_batch() -> Callable[..., int]:
+    """Return `_observe_batch` as a plain call."""
+    memory = EXAMPLE_BANK, _INTEGERS, make_blocks(1)
+    return compile_call(_observe_batch, *memory, EXAMPLE_RECORD, make_empty_outputs(1))

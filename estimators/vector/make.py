@@ -12,27 +12,20 @@ from ...envs.numerics.jit import jit_nrt
 from ...envs.numerics.primitives import Vector
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import COMS, Vehicle, VehicleSource, make_vehicle
-from ..core.record import FILTER
 from ..estimator import compile_call
 from ..filters import FILTERS
 from ..learned.correction import EXAMPLE, MASS, LearnedEstimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import EstimatorSpec, build_estimator
 from ..wrappers.kernel import observe_corrected
-from .batch import BatchEstimator, ForeignBatch, Sensors
-from .kernel import make_empty_outputs
-from .lane_ticks import Build, get_gains
+from .batch import BatchEstimator, Build, ForeignBatch, Sensors
+from .lane_ticks import FilterBank, get_gains
+from .lanes import EXAMPLE_BANK, EXAMPLE_RECORD, make_empty_outputs
 
 
 @jit_nrt
 def _correct_batch(
-    filters: Vector,
-    pool: Vector,
-    places: Any,
-    chosen: Vector,
-    record: Any,
-    observed: Any,
-    corrections: Any,
+    bank: FilterBank, chosen: Vector, record: Any, observed: Any, corrections: Any
 ) -> None:
     """Call `observe_corrected` for the filters of the indices `chosen`."""
     fast, rows, packets, counts = record
@@ -40,9 +33,10 @@ def _correct_batch(
     memory, net = corrections
     for k in range(len(chosen)):
         i = chosen[k]
-        row_record, gains = (fast[i], rows[i], packets[i], counts[i]), get_gains(pool, places[i])
+        row_record = fast[i], rows[i], packets[i], counts[i]
         outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
-        observe_corrected(filters[i], gains, row_record, memory[i], net, outputs)
+        layers = bank.filters[i], get_gains(bank, i)
+        observe_corrected(*layers, row_record, memory[i], net, outputs)
 
 
 def _build_base(build: Build, spec: EstimatorSpec) -> Any:
@@ -74,9 +68,8 @@ class _LearnedBatch(BatchEstimator):
     def take(self, mask: Any, *arguments: Any) -> None:
         """Process rows and packets as `BatchEstimator.take` does."""
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
-        layers = self.filters, self._designs.pool, self._places, chosen
         correction = self.memory, self.first.net
-        _compile_correct_batch()(*layers, arguments[:4], arguments[4:], correction)
+        _compile_correct_batch()(self._bank, chosen, arguments[:4], arguments[4:], correction)
 
     def get_state(self) -> Any:
         """Return copies of the filters and of their corrections."""
@@ -90,10 +83,9 @@ class _LearnedBatch(BatchEstimator):
 @functools.cache
 def _compile_correct_batch() -> Any:
     """Return `_correct_batch` as a plain call."""
-    integers, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
-    layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), integers
-    record, corrections = (cube, integers, cube, integers), (np.zeros((1, 1)), EXAMPLE)
-    return compile_call(_correct_batch, *layers, record, make_empty_outputs(1), corrections)
+    memory, corrections = (EXAMPLE_BANK, np.zeros(1, np.int64)), (np.zeros((1, 1)), EXAMPLE)
+    observed = make_empty_outputs(1)
+    return compile_call(_correct_batch, *memory, EXAMPLE_RECORD, observed, corrections)
 
 
 def build_batch(

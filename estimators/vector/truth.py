@@ -13,8 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ...envs.task import make_space
 from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_states
 from ..wrappers.truth import TruthObservation as Single
-from .estimate import make_vector_spec
-from .records import get_env_state, get_true_vehicles
+from .records import get_env_state, get_true_vehicles, make_vector_spec
 
 _Observations = npt.NDArray[np.float32]
 
@@ -70,7 +69,15 @@ class TruthObservation(
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[_Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and read their cars."""
+        """Reset the rows (those of options["reset_mask"]) and read their cars.
+
+        Args:
+            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
+            options: Options of the env.
+
+        Returns:
+            Observations and infos.
+        """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         obs, infos = self.env.reset(seed=seed, options=options)
@@ -81,19 +88,31 @@ class TruthObservation(
     def _append_truth(self, obs: _Observations) -> _Observations:
         parts = [obs, self._values]
         if self._states:
-            parts.append(read_states(_get_true_states(self.unwrapped), self._states))
+            base: Any = self.unwrapped
+            if isinstance(base, SyncVectorEnv):
+                true_states = np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
+            elif hasattr(base, "true_state"):
+                true_states = np.asarray(base.true_state)
+            else:
+                raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+            parts.append(read_states(true_states, self._states))
         return np.hstack(parts)
 
     def step(self, actions: Any) -> tuple[_Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows; `final_obs` gets the parameters of the old cars."""
+        """Step all rows; `final_obs` gets the parameters of the old cars.
+
+        Args:
+            actions: Actions of all rows.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos.
+        """
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = np.logical_or(terminated, truncated)
         if self._same_step:
             for i in np.flatnonzero(ended):
                 infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
-            self._read_cars(ended)
-        else:
-            self._read_cars(self._ended)
+        self._read_cars(ended if self._same_step else self._ended)
         self._ended = ended
         return self._append_truth(obs), rewards, terminated, truncated, infos
 
@@ -103,7 +122,11 @@ class TruthObservation(
         return arrays | {"env": get_env_state(self.env)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()
@@ -113,12 +136,3 @@ class TruthObservation(
         cars = get_true_vehicles(self.unwrapped, rows.tolist())
         for i, car in zip(rows, cars, strict=True):
             self._values[i] = [getattr(car, name) for name in self._parameters]
-
-
-def _get_true_states(base: Any) -> npt.NDArray[np.float64]:
-    """Return the present `TrueState` of every row of a bare vector env, (N, len(TrueState))."""
-    if isinstance(base, SyncVectorEnv):
-        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
-    if not hasattr(base, "true_state"):
-        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
-    return np.asarray(base.true_state)

@@ -79,7 +79,7 @@ def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any
     for width in (10, 37, 1990):
         stepped(filter_, log.record, width)
         assert (filter_.x == end.x[-1]).all() and filter_.tick == 1989
-        assert filter_.invalid == filter_.unknown == 1
+        assert filter_.counts["invalid"] == filter_.counts["unknown"] == 1
     for first in range(0, 1990, 500):
         arrived = log.record.packets[:, PACKET.arrived]
         new = log.record.packets[(arrived >= first) & (arrived < first + 500)]
@@ -110,7 +110,7 @@ def test_a_single_packet_counts_at_once() -> None:
     before, packet = filter_.P, log.record.packets[~came][0]
     packet[PACKET.arrived] = 699.0
     filter_.update(packet)
-    assert filter_.P[0, 0] < before[0, 0] and filter_.future == 0
+    assert filter_.P[0, 0] < before[0, 0] and filter_.counts["future"] == 0
 
 
 def test_without_a_latency_it_is_the_filter_that_it_was() -> None:

@@ -105,4 +105,4 @@ def test_names_are_those_of_one_registry() -> None:
     assert sideslip.register_estimator is register_estimator
     assert sideslip.register_agent is register_agent
     own = Registry("thing", {})
-    assert len(own) == 0 and list(own) == []
+    assert list(own) == []

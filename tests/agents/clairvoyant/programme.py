@@ -14,14 +14,14 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from sideslip.agents.clairvoyant.plant import (
-    advance,
-    compute_node_cost,
-    compute_node_errors,
-    get_state_scales,
-    list_active_states,
-)
 from sideslip.agents.clairvoyant.preview import Forecast, PlanParams, PlanState, PreviewStep
+from sideslip.agents.clairvoyant.sweep import (
+    _advance,
+    _compute_node_cost,
+    _compute_node_errors,
+    _get_state_scales,
+    _list_active_states,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -64,8 +64,8 @@ def _expansion(fixed: PlanParams, steps: int, v_x: float) -> tuple[Any, Any]:
     They return (next state, its slope, cost, its gradient, its Hessian) at zero, and (cost,
     gradient, Hessian).
     """
-    names = tuple(name for name in list_active_states(fixed) if name not in ("v_x", "integral"))
-    scale, size = get_state_scales(fixed, names), len(names)
+    names = tuple(name for name in _list_active_states(fixed) if name not in ("v_x", "integral"))
+    scale, size = _get_state_scales(fixed, names), len(names)
     w = ca.SX.sym("w", size + fixed.width)
     known = ca.SX.sym("known", len(PreviewStep._fields), steps)
     rest = PlanState(*(0.0,) * len(PlanState._fields))._replace(v_x=v_x)
@@ -73,16 +73,16 @@ def _expansion(fixed: PlanParams, steps: int, v_x: float) -> tuple[Any, Any]:
     first, cost = x, ca.SX(0.0)
     for j in range(steps):
         here = PreviewStep(*ca.vertsplit(known[:, j]))
-        step = advance(fixed, x, ca.vertsplit(w[size:]), here)
-        cost += compute_node_cost(fixed, compute_node_errors(fixed, x, here), here) + step.effort
-        x = rest._replace(**{name: getattr(step.state, name) for name in names})
+        state, effort = _advance(fixed, x, ca.vertsplit(w[size:]), here)
+        cost += _compute_node_cost(fixed, _compute_node_errors(fixed, x, here), here) + effort
+        x = rest._replace(**{name: getattr(state, name) for name in names})
     after = ca.vertcat(*(getattr(x, name) for name in names)) / scale
     H, g = ca.hessian(cost, w)
     zero = ca.DM.zeros(w.shape)
     slope = ca.jacobian(after, w)
     inside = ca.Function("inside", [w, known], [after, slope, cost, g, H])
     here = PreviewStep(*ca.vertsplit(known[:, 0]))
-    last = compute_node_cost(fixed, compute_node_errors(fixed, first, here), here)
+    last = _compute_node_cost(fixed, _compute_node_errors(fixed, first, here), here)
     H, g = ca.hessian(last, w)
     end = ca.Function("end", [w, known], [last, g, H])
 
@@ -97,7 +97,7 @@ def programme_of(forecast: Forecast, steps: int) -> Programme:
     fixed, start = forecast.fixed, forecast.start
     if fixed.ticks != 1:
         raise ValueError(f"the linear plan is made of ticks, got steps of {fixed.ticks}")
-    names = tuple(name for name in list_active_states(fixed) if name not in ("v_x", "integral"))
+    names = tuple(name for name in _list_active_states(fixed) if name not in ("v_x", "integral"))
     size, K = len(names), fixed.periods // steps
     inside, end = _expansion(fixed, steps, start.v_x)
     known = forecast.known[:, :-1].reshape(len(PreviewStep._fields), K, steps)
@@ -112,7 +112,7 @@ def programme_of(forecast: Forecast, steps: int) -> Programme:
     q[K * n :], constant = g.ravel()[:size], constant + cost.item()
     blocks = [sparse.csc_matrix(H)] * K
     P = sparse.block_diag([*blocks, H_end[:size, :size]], format="csc")
-    x_0 = np.array([getattr(start, name) for name in names]) / get_state_scales(fixed, names)
+    x_0 = np.array([getattr(start, name) for name in names]) / _get_state_scales(fixed, names)
     ahead = sparse.kron(sparse.eye(K, K), slope, format="csc")
     forward = sparse.hstack([ahead, sparse.csc_matrix((K * size, size))])
     pick_x = sparse.hstack([sparse.eye(size), sparse.csc_matrix((size, fixed.width))])

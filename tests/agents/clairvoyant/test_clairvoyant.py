@@ -18,14 +18,13 @@ pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
 from sideslip.agents.clairvoyant.plan import (  # noqa: E402
+    _simulate_run,
+    _solve_ilqr,
     compute_clairvoyant,
-    evaluate_actions,
     record_actions,
-    simulate_run,
-    solve_ilqr,
 )
-from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
 from sideslip.agents.clairvoyant.preview import PlanState, PreviewStep, make_forecast  # noqa: E402
+from sideslip.agents.clairvoyant.sweep import _advance  # noqa: E402
 from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__
@@ -40,68 +39,44 @@ def make(
     return gymnasium.make(ID, scenario=scenario, control_period=period)
 
 
-@pytest.mark.parametrize("lags", [False, True])
-@pytest.mark.parametrize("small_angle", [False, True])
-@pytest.mark.parametrize("scenario", ["lane-change", "gust"])
-def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: bool) -> None:
-    """From each state of a hard run in the env, one step of the plan's plant, by a rule of one
-    order more, is the env's tick."""
-    changes: dict[str, Any] = {
-        "small_angle": small_angle,
-        "lags": lags,
-        "onset": 0.0,
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
+HARD = {
+    f"{name}, {small_angle=}, {lags=}": {
+        **{"base": name, "small_angle": small_angle, "lags": lags, "onset": 0.0},
         "wind_start": 0.05,
     }
-    env = make(scenario, 0.2, 1, **changes)
-    env.reset(seed=2)
-    forecast = make_forecast(env.unwrapped)
-    w = ca.SX.sym("w", len(PlanState._fields))
-    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(PreviewStep._fields))
-    step = advance(
-        forecast.fixed, PlanState(*ca.vertsplit(w)), [u], PreviewStep(*ca.vertsplit(known))
-    )
-    tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
-    run = simulate_run(env, 2, actions).trajectory
-    for k in range(200):
-        after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
-        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
+    for name in ("lane-change", "gust")
+    for small_angle in (False, True)
+    for lags in (False, True)
+}
+ACTING: dict[str, dict[str, Any]] = {
+    "changing tyres": {"base": "stiffness-step", "tyre_change_time": 0.1},
+    "split friction": {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
+    "driver": {"base": "double-lane-change", "onset": 0.05},
+    "Dugoff tyres": {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
+    "motor power, load transfer": {
+        **{"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4}
+    },
+    "a road that winds and leans": {
+        **{"base": "coms-slalom", "onset": 0.02, "amplitude": 0.1, "bank": 0.03, "grade": 0.02}
+    },
+}
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"base": "stiffness-step", "tyre_change_time": 0.1},
-        {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
-        {"base": "double-lane-change", "onset": 0.05},
-        {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
-        {"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4},
-        {"base": "coms-slalom", "onset": 0.02, "amplitude": 0.1, "bank": 0.03, "grade": 0.02},
-    ],
-    ids=[
-        "changing tyres",
-        "split friction",
-        "driver",
-        "Dugoff tyres",
-        "motor power, load transfer",
-        "a road that winds and leans",
-    ],
-)
-def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
-    changes: dict[str, Any],
-) -> None:
-    """The driver steers as in the run of the actions, so that is the run that is compared."""
-    env = gymnasium.make(ID, scenario=changes | {"duration": 0.2}, control_period=1)
+@pytest.mark.parametrize("case", [*HARD, *ACTING])
+def test_a_symbolic_tick_is_the_envs(case: str) -> None:
+    """From each state of a hard run in the env, one step of the plan's plant, by a rule of one
+    order more, is the env's tick. A driver steers as in the run of the actions."""
+    changes = HARD | ACTING
+    env = gymnasium.make(ID, scenario=changes[case] | {"duration": 0.2}, control_period=1)
     env.reset(seed=2)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
-    forecast = make_forecast(env.unwrapped, actions)
+    forecast = make_forecast(env.unwrapped, ACTIONS if case in ACTING else None)
     w = ca.SX.sym("w", len(PlanState._fields))
     u, known = ca.SX.sym("u"), ca.SX.sym("known", len(PreviewStep._fields))
-    step = advance(
-        forecast.fixed, PlanState(*ca.vertsplit(w)), [u], PreviewStep(*ca.vertsplit(known))
-    )
-    tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
-    run = simulate_run(env, 2, actions).trajectory
+    inputs = [u], PreviewStep(*ca.vertsplit(known))
+    state, _ = _advance(forecast.fixed, PlanState(*ca.vertsplit(w)), *inputs)
+    tick = ca.Function("tick", [w, u, known], [ca.vertcat(*state)])
+    run = _simulate_run(env, 2, ACTIONS)
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
@@ -151,13 +126,13 @@ def test_no_run_is_better(scenario: str) -> None:
     for seed in range(2):
         best = compute_clairvoyant(env, seed, {"two-dof": record_actions(sensed, agent, seed)})
         assert best.winner.startswith("from ")
-        assert best.cost == evaluate_actions(env, seed, best.actions)
+        assert best.cost == _simulate_run(env, seed, best.actions).cost
         assert best.cost <= min(best.costs["none"], best.costs["two-dof"])
         for size in (0.01, 0.05):
             for _ in range(4):
                 held = np.repeat(rng.normal(0.0, size, (30, 1)), 10, axis=0)
                 other = np.clip(best.actions + held, -1.0, 1.0)
-                assert evaluate_actions(env, seed, other) > (1.0 - 1e-3) * best.cost
+                assert _simulate_run(env, seed, other).cost > (1.0 - 1e-3) * best.cost
 
 
 @pytest.mark.long
@@ -165,23 +140,23 @@ def test_a_car_that_is_lost_is_saved() -> None:
     """The uncontrolled car leaves the lane; the plan that starts from that run does not."""
     env = make("lane-change", 6.0)
     none = np.zeros((600, 1))
-    lost = simulate_run(env, 2, none)
-    found = solve_ilqr(env, 2)
+    lost = _simulate_run(env, 2, none)
+    found, _ = _solve_ilqr(env, 2)
     assert found.cost < 0.3 * lost.cost
-    assert found.cost == evaluate_actions(env, 2, found.actions)
+    assert found.cost == _simulate_run(env, 2, found.actions).cost
 
 
 @pytest.mark.long
 def test_steering_too() -> None:
     """Two actions do better than one, and the steering that is found was within its rate."""
-    alone = solve_ilqr(make("lane-change"), 0)
+    alone, _ = _solve_ilqr(make("lane-change"), 0)
     env = gymnasium.make(
         "sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0}
     )
-    both = solve_ilqr(env, 0)
+    both, _ = _solve_ilqr(env, 0)
     assert both.actions.shape == (200, 2)
     assert both.cost < 0.5 * alone.cost
-    run = simulate_run(env, 0, both.actions.astype(np.float64)).trajectory
+    run = _simulate_run(env, 0, both.actions)
     stands = run.states[:, PlanState._fields.index("slewing")] / 0.1  # rad of full scale
     assert np.abs(np.diff(stands)).max() == pytest.approx(0.08)  # 0.8 rad/s, 10 ms: it binds
     beyond = np.abs(both.actions[:, 1] - stands[1:]) > 1e-6
@@ -197,14 +172,14 @@ def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     assert found.statuses == {"other": "stopped"}
     assert found.cost == min(found.costs.values()) == found.costs[found.winner]
     monkeypatch.setattr(clairvoyant, "STEP_LENGTHS", (0.0,))  # steps that go nowhere
-    stuck = solve_ilqr(env, 0)
-    assert stuck.status == "stuck" and stuck.cost == evaluate_actions(env, 0, np.zeros((100, 1)))
+    stuck, status = _solve_ilqr(env, 0)
+    assert status == "stuck" and stuck.cost == _simulate_run(env, 0, np.zeros((100, 1))).cost
 
 
 def test_bad_input() -> None:
     env = make("sine", 0.2)
     with pytest.raises(ValueError, match=r"shape \(20, 1\), got \(3, 1\)"):
-        solve_ilqr(env, 0, np.zeros((3, 1)))
+        _solve_ilqr(env, 0, np.zeros((3, 1)))
     env.step(np.zeros(1, np.float32))
     with pytest.raises(ValueError, match="call reset"):
         make_forecast(env.unwrapped)

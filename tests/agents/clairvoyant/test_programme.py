@@ -10,7 +10,7 @@ import sideslip
 
 pytest.importorskip("casadi")
 pytest.importorskip("osqp")
-from sideslip.agents.clairvoyant.plan import evaluate_actions, solve_ilqr
+from sideslip.agents.clairvoyant.plan import _simulate_run, _solve_ilqr
 from sideslip.agents.clairvoyant.preview import make_forecast
 from tests.agents.clairvoyant.programme import Array, solve_linear
 
@@ -47,11 +47,11 @@ def test_iterative_lqr_comes_to_the_programmes_optimum(reference: str) -> None:
     env = make(reference, duration=2.0, disturbance_moment=300.0, noise={"wheel": 0.0})
     exact, _ = optimum(env, 3)
     start = np.random.default_rng(0).uniform(-1.0, 1.0, exact.shape)
-    found = solve_ilqr(env, 3, start)
-    assert found.status == "settled"
+    found, status = _solve_ilqr(env, 3, start)
+    assert status == "settled"
     assert (np.abs(exact) > 1.0 - 1e-6).any()
-    assert found.cost == pytest.approx(evaluate_actions(env, 3, exact), rel=2e-4)
-    assert found.cost < 0.05 * evaluate_actions(env, 3, start)
+    assert found.cost == pytest.approx(_simulate_run(env, 3, exact).cost, rel=2e-4)
+    assert found.cost < 0.05 * _simulate_run(env, 3, start).cost
 
 
 @pytest.mark.parametrize("lags", [False, True])
@@ -59,11 +59,11 @@ def test_the_programmes_cost_is_that_in_the_env(lags: bool) -> None:
     """The programme has the env's own ticks; only the actions' float32 is between the two."""
     env = make(lags=lags, duration=2.0)
     actions, least = optimum(env, 3)
-    assert evaluate_actions(env, 3, actions) == pytest.approx(least, rel=1e-6)
-    found = solve_ilqr(env, 3)
+    assert _simulate_run(env, 3, actions).cost == pytest.approx(least, rel=1e-6)
+    found, _ = _solve_ilqr(env, 3)
     assert found.cost == pytest.approx(least, rel=2e-4)
-    assert found.cost == evaluate_actions(env, 3, found.actions)
-    assert found.cost < 0.2 * evaluate_actions(env, 3, np.zeros_like(found.actions))
+    assert found.cost == _simulate_run(env, 3, found.actions).cost
+    assert found.cost < 0.2 * _simulate_run(env, 3, np.zeros_like(found.actions)).cost
 
 
 def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost() -> None:
@@ -72,14 +72,14 @@ def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost
     env = make(duration=0.1, lags=True, disturbance_moment=600.0, amplitude=(0.04, 0.04))
     K, step = 10, 0.25
     units = step * np.eye(K)[:, :, None]
-    none = evaluate_actions(env, 1, np.zeros((K, 1)))
-    ahead = np.array([evaluate_actions(env, 1, unit) for unit in units])
-    back = np.array([evaluate_actions(env, 1, -unit) for unit in units])
+    none = _simulate_run(env, 1, np.zeros((K, 1))).cost
+    ahead = np.array([_simulate_run(env, 1, unit).cost for unit in units])
+    back = np.array([_simulate_run(env, 1, -unit).cost for unit in units])
     g = (ahead - back) / (2.0 * step)
     H = np.empty((K, K))
     for i in range(K):
         for j in range(K):
-            pair = evaluate_actions(env, 1, units[i] + units[j])
+            pair = _simulate_run(env, 1, units[i] + units[j]).cost
             H[i, j] = (pair - ahead[i] - ahead[j] + none) / step**2
     found = optimum(env, 1)[0][:, 0]
     slope = (g + H @ found) / np.abs(g).max()
@@ -92,4 +92,4 @@ def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost
 def test_the_measured_speed_of_a_reference_is_all_that_the_plan_does_not_know() -> None:
     silent = make("model", duration=2.0, noise={"wheel": 0.0})
     actions, least = optimum(silent, 3)
-    assert evaluate_actions(silent, 3, actions) == pytest.approx(least, rel=1e-6)
+    assert _simulate_run(silent, 3, actions).cost == pytest.approx(least, rel=1e-6)

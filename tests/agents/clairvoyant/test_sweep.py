@@ -9,8 +9,8 @@ pytest.importorskip("casadi")
 from sideslip.agents.clairvoyant.sweep import (
     Limits,
     Linearisation,
+    _solve_input_qp,
     run_backward_pass,
-    solve_input_qp,
 )
 
 
@@ -20,7 +20,7 @@ def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:
     for _ in range(300):
         root, target = rng.normal(size=(2, 2)), rng.normal(size=2)
         low, high = -rng.uniform(0.0, 2.0, 2), rng.uniform(0.0, 2.0, 2)
-        found = solve_input_qp(root.T @ root, -root.T @ target, low, high)
+        found = _solve_input_qp(root.T @ root, -root.T @ target, low, high)
         best = lsq_linear(root, target, (low - 1e-12, high + 1e-12), tol=1e-14).x
         cost = [np.sum((root @ each - target) ** 2) for each in (found[:2], best)]
         assert cost[0] <= cost[1] + 1e-9

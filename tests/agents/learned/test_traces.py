@@ -30,11 +30,9 @@ TIMES = (1.5, 30.0)
 
 def traces(wide: int = WIDE, **change: Any) -> MovingAverages:
     rng = np.random.default_rng(1)
-    numbers: dict[str, Any] = {
-        "weight_in": rng.normal(size=(5, wide)),
-        "bias_in": rng.normal(size=5),
-    }
-    return MovingAverages(**numbers | {"n_silu": 2, "times": TIMES} | change)
+    numbers: dict[str, Any] = {"weight_in": rng.normal(size=(5, wide))}
+    numbers |= {"bias_in": rng.normal(size=5), "n_silu": 2, "times": TIMES}
+    return MovingAverages(**numbers | change)
 
 
 def network(cell: MovingAverages) -> Network:

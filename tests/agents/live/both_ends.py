@@ -19,7 +19,7 @@ from sideslip.agents.live.messages import (
     Tick,
     encode,
 )
-from sideslip.agents.live.simulate import WireAgent, simulate
+from sideslip.agents.live.simulate import _WireAgent, simulate
 from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation
 
@@ -42,7 +42,7 @@ def drive(
     watch: Callable[[Tick], None] | None = None,
     speed: float = 1.0,
     **options: Any,
-) -> tuple[Rollout, WireAgent, Loop]:
+) -> tuple[Rollout, _WireAgent, Loop]:
     """A drive over loopback, its wires and the loop at the car's end."""
     with Port() as car, Port() as other:
         loop = Loop(
@@ -62,10 +62,10 @@ def inertial(number: int, sequence: int | None = None, gyro: float = 0.0) -> Arr
     """The datagram of a fast row at 7 m/s."""
     values = [gyro, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
     sequence = number if sequence is None else sequence
-    return Arrival(0, encode(DatagramKind.INERTIAL, sequence, number * TICK_US, values), "car")
+    return Arrival(0, encode(DatagramKind.INERTIAL, sequence, number * TICK_US, values), ("car", 0))
 
 
 def camera(sequence: int, age: float = 0.03, psi: float = 0.0, stamp: int = 0) -> Arrival:
     """The datagram of a camera's sample."""
     values = [psi] + [0.0] * (len(FIELDS[DatagramKind.CAMERA]) - 3) + [age, 1.0]
-    return Arrival(0, encode(DatagramKind.CAMERA, sequence, stamp, values), "camera")
+    return Arrival(0, encode(DatagramKind.CAMERA, sequence, stamp, values), ("camera", 0))

@@ -19,10 +19,10 @@ pytest.importorskip("aiohttp")
 
 from sideslip.agents.live.loop import LOOPBACK, Port
 from sideslip.agents.live.messages import DatagramKind, LoopStatus, encode
-from sideslip.agents.live.viewer import Viewer, ViewerProtocol, make_event, make_table
+from sideslip.agents.live.viewer import Viewer, _make_event, _make_table, _ViewerProtocol
 
 NAMES = ("beta", "gamma", "F_d")
-STATUS = LoopStatus(ticks=1000.0, misses=3.0, held=2.0, bad=5.0, lost=1.0, jitter=40.0)
+STATUS = LoopStatus(ticks=1000.0, misses=3.0, held=2.0, bad=5.0, lost=1.0, deadlines=998.0)
 
 
 def send(port: Port, to: Any, samples: int = 50) -> None:
@@ -81,10 +81,10 @@ def test_another_page_gets_nothing(viewer: Viewer, path: str, header: str, value
 
 
 def test_markup_in_a_name_is_shown_as_it_is() -> None:
-    seen = ViewerProtocol()
+    seen = _ViewerProtocol()
     seen.datagram_received(encode(DatagramKind.ESTIMATE, 0, 0, (1.0, 0.1), ("[/red]",)), None)
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(make_table(seen, "[/bold]"))
+    console.print(_make_table(seen, "[/bold]"))
     text = console.export_text()
     assert "[/red]" in text and "[/bold]" in text
 
@@ -109,22 +109,22 @@ def test_a_port_in_use_is_an_error(viewer: Viewer) -> None:
 
 
 def test_the_table_has_estimates_and_counts() -> None:
-    seen, console = ViewerProtocol(), Console(width=80, record=True)
-    console.print(make_table(seen, "mine"))
+    seen, console = _ViewerProtocol(), Console(width=80, record=True)
+    console.print(_make_table(seen, "mine"))
     assert "no inertial data yet" in console.export_text()
     values = (0.1, 0.2, 30.0, 0.01, 0.02, 3.0)
     seen.datagram_received(b"garbage", None)
     seen.datagram_received(encode(DatagramKind.ESTIMATE, 0, 2_500_000, values, NAMES), None)
     seen.datagram_received(encode(DatagramKind.STATUS, 0, 0, STATUS), None)
-    console.print(make_table(seen, "mine"))
+    console.print(_make_table(seen, "mine"))
     text = console.export_text()
     assert "+5.730" in text and "deg/s" in text and "t 2.5 s" in text
-    assert "3 of 1000 deadlines missed" in text and "5 datagrams bad, 1 lost" in text
+    assert "3 of 998 deadlines missed" in text and "5 datagrams bad, 1 lost" in text
 
 
 def test_nothing_of_a_name_ends_the_pages_script() -> None:
-    seen = ViewerProtocol()
+    seen = _ViewerProtocol()
     name = "</script><script>alert(1)"
     seen.datagram_received(encode(DatagramKind.ESTIMATE, 0, 0, (1.0, 2.0), (name,)), None)
-    text, count = make_event(seen, 0)
+    text, count = _make_event(seen, 0)
     assert count == 1 and name in json.loads(text)["names"][0]

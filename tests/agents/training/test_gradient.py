@@ -31,7 +31,7 @@ def cars_of(count: int, **options: Any) -> Any:
     return make_device_env(VISION, count, **how)
 
 
-def policy_of(cars: Any) -> Any:
+def policy_of(cars: Any, **options: Any) -> Any:
     """A policy of a few cells in double precision, which acts and reads in size."""
     torch.manual_seed(0)
     k = len(cars.layout)
@@ -43,6 +43,7 @@ def policy_of(cars: Any) -> Any:
         cells=5,
         net_arch=[4],
         features_extractor_kwargs=scaling,
+        **options,
     )
     with torch.no_grad():
         policy.layers[-1].weight *= 10.0
@@ -53,6 +54,16 @@ def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     obs, _ = cars.reset(seed=list(range(cars.num_envs)))
     rates = RewardScale([[each] for each in weights.tolist()])
     return _unroll_window(policy, cars, obs, policy._begin(cars.num_envs).double(), rates, steps)
+
+
+@pytest.mark.parametrize("normalize_images", [True, False])
+def test_a_policys_own_file_is_loaded(tmp_path: Any, normalize_images: bool) -> None:
+    policy = policy_of(cars_of(1), normalize_images=normalize_images)
+    policy.save(tmp_path / "policy.pth")
+    loaded: Any = GruPolicy.load(tmp_path / "policy.pth", "cpu")
+    assert loaded.normalize_images is normalize_images
+    before, after = policy.state_dict(), loaded.state_dict()
+    assert all(torch.equal(before[name].float(), after[name]) for name in before | after)
 
 
 def test_the_slope_is_that_of_the_cost() -> None:

@@ -10,8 +10,6 @@ import pytest
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device import make_device_env
-from sideslip.envs.record import FAST
-from sideslip.envs.scenarios.manoeuvres import read_trace
 
 from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved

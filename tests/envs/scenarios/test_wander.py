@@ -9,7 +9,6 @@ import pytest
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv
 from sideslip.envs.device import make_device_env
-from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike
 from .commands import commands

@@ -96,7 +96,7 @@ def test_a_filter_counts_it_and_is_where_it_would_be_without(delay: str) -> None
     for packets in (record.packets, good):
         found = filter_.run(Record(record.fast, packets))
         ends.append((found.x[-1].copy(), filter_.P.copy()))
-        assert filter_.poor == len(packets) - len(good)
+        assert filter_.counts["poor"] == len(packets) - len(good)
     for one, other in zip(*ends, strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -49,14 +49,14 @@ def test_nis_is_of_the_last_packet_and_unknown_where_it_was_not_used(log: Any) -
     estimates = filter_.run(Record(record.fast[:500], record.packets[:8]))
     assert filter_.nis == estimates.nis[7] and len(estimates.nis) == 8
     filter_.update(record.packets[7])
-    assert math.isnan(filter_.nis) and filter_.duplicates == 1
+    assert math.isnan(filter_.nis) and filter_.counts["duplicates"] == 1
 
 
 def test_the_gate_refuses_as_many_good_samples_as_it_says(log: Any) -> None:
     filter_ = told_the_truth(gate=0.99)
     filter_.run(log)
     count = len(log.record.packets)
-    assert abs(filter_.gated - 0.01 * count) < 3.0 * math.sqrt(0.01 * count)
+    assert abs(filter_.counts["gated"] - 0.01 * count) < 3.0 * math.sqrt(0.01 * count)
 
 
 @pytest.mark.parametrize("delay", ["clone", "buffer"])
@@ -73,18 +73,18 @@ def test_an_outlier_leaves_the_filter_as_if_it_had_never_come(
     packets = record.packets.copy()
     packets[chosen, PACKET.value] += 3.0
     found = filter_.run(Record(record.fast, packets))
-    assert filter_.gated == len(chosen)
+    assert filter_.counts["gated"] == len(chosen)
     limit = chi2.ppf(0.9999, 2 - sensor)
     assert (found.nis[chosen] > limit).all()
     covariance = filter_.P
     without = filter_.run(Record(record.fast, np.delete(packets, chosen, 0)))
-    assert filter_.gated == 0
+    assert filter_.counts["gated"] == 0
     np.testing.assert_array_equal(found.x, without.x)
     np.testing.assert_array_equal(found.std, without.std)
     np.testing.assert_array_equal(covariance, filter_.P)
     np.testing.assert_array_equal(np.delete(found.nis, chosen), without.nis)
     again = filter_.run(Record(record.fast, np.repeat(packets, 2, 0)))
-    assert filter_.duplicates == len(packets)
+    assert filter_.counts["duplicates"] == len(packets)
     np.testing.assert_array_equal(again.x, without.x)
 
 
@@ -96,7 +96,7 @@ def test_the_first_course_that_is_refused_is_not_the_first() -> None:
     log.record.packets[1:, PACKET.value] += 2.0
     filter_ = make_estimator("exact-kf", sensors=sensors, speed=7.0, gate=0.999)
     found = filter_.run(log)
-    assert filter_.gated == 1
+    assert filter_.counts["gated"] == 1
     assert found["psi"][-1] == pytest.approx(2.0 + log.truth["psi"][-1], abs=0.05)
 
 

@@ -154,7 +154,7 @@ def test_a_first_course_that_is_turned_is_found_out(delay: str, members: int) ->
     packets[:3, VALUE] += np.pi
     filter_ = built(base, log, delay=delay, members=members)
     run = filter_.run(with_packets(log, packets))
-    assert filter_.gated == 9
+    assert filter_.counts["gated"] == 9
     assert abs(run["psi"][-1] - log.truth["psi"][-1]) < 0.05
     errors = (run["beta"] - log.truth["beta"])[4000:] / run.std[4000:, 0]
     assert np.mean(errors**2) < 2.0
@@ -200,4 +200,4 @@ def test_a_receiver_whose_rounded_course_repeats_is_not_stuck() -> None:
     ):
         packets[:, columns] = value
         filter_.run(with_packets(log, packets))
-        assert filter_.stuck == stuck
+        assert filter_.counts["stuck"] == stuck

@@ -45,7 +45,7 @@ def test_a_gps_in_the_cameras_place_gives_the_same_bits(
     options["Q"] = [1e-4] * 5  # tunings are found by the sensor's name
     ours = make_estimator("exact-kf", sensors={"gps": LATE}, **options)
     expected = ours.run(log.record)
-    assert expected["psi"][-1] > 1.5 and ours.poor > 0
+    assert expected["psi"][-1] > 1.5 and ours.counts["poor"] > 0
     monkeypatch.setitem(MEASUREMENTS, "camera", MEASUREMENTS["gps"])
     monkeypatch.setattr(models, "SLOW", SLOW[::-1])
     log.record.packets[:, PACKET.sensor] = CAMERA

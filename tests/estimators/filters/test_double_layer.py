@@ -165,7 +165,7 @@ def test_a_fix_of_three_satellites_is_refused() -> None:
     filter_, default = estimator(log), ((1.0, 1.0), (20.0, 20.0))
     wanted = literal(log, True, default)
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-9)
-    assert filter_.poor == 1
+    assert filter_.counts["poor"] == 1
     assert np.abs(wanted - literal(log_of(1, 12.0, gps, few), True, default)).max() > 1e-6
 
 

@@ -13,6 +13,7 @@ from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
+from tests.envs import batches
 from tests.envs.helpers import bits
 
 VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
@@ -68,11 +69,18 @@ def pair(
     return alone, wrap(fleet(env_id, count, mode, **kwargs), EstimateObservation)
 
 
-def actions(count: int, step: int) -> Any:
+def native(mode: str, count: int = 3, **arguments: Any) -> Any:
+    """The vector env, whose bad actions end episodes."""
+    told = {"scenario": batches.SHORT, "on_bad_action": "fail", "autoreset_mode": mode}
+    return gym.make_vec(VISION, num_envs=count, **(told | arguments))
+
+
+def actions(env: Any, step: int) -> Any:
     """Any action, now and then a bad one, which ends a row's episode at once."""
-    drawn = np.random.default_rng(step).uniform(-1.0, 1.0, (count, 1)).astype(np.float32)
+    shape = env.action_space.shape
+    drawn = np.random.default_rng(step).uniform(-1.0, 1.0, shape).astype(np.float32)
     if step % 7 == 6:
-        drawn[step % count] = BAD
+        drawn[step % len(drawn)] = BAD
     return drawn
 
 
@@ -92,11 +100,13 @@ def same_bits(one: Any, other: Any) -> None:
         assert bits(first[key]) == bits(second[key]), key
 
 
-def drive_both(alone: Any, together: Any, steps: int, start: int = 0) -> int:
-    """Step both and compare everything; returns the episodes that ended."""
+def drive_both(alone: Any, together: Any, steps: int, start: int = 0, seed: Any = None) -> int:
+    """Step both, after a reset with a seed, and compare everything; the episodes that ended."""
     ended = 0
+    if seed is not None:
+        same_bits(alone.reset(seed=seed), together.reset(seed=seed))
     for step in range(start, start + steps):
-        told = actions(alone.num_envs, step)
+        told = actions(alone, step)
         one, other = alone.step(told), together.step(told)
         same_bits(one, other)
         ended += int(np.logical_or(one[2], one[3]).sum())

@@ -15,8 +15,7 @@ from sideslip.envs.numerics.simd8 import pad_to_cache_line
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
-from sideslip.estimators.vector import kernel
-from sideslip.estimators.vector.lanes import BLOCK, make_blocks
+from sideslip.estimators.vector.lanes import _MIN_LANES, BLOCK, make_blocks
 from sideslip.estimators.vector.make import make_batch
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
@@ -151,9 +150,9 @@ def test_which_filters_are_in_lanes() -> None:
         assert (batch._lanes["shaped"][0] == 1).sum() == there
         assert (batch._lanes["here"][0] == 1.0).sum() == there
     few = make_batch(
-        "exact-kf", kernel._MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
+        "exact-kf", _MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
     )
-    feed(few, logs[: kernel._MIN_LANES - 1], 10)
+    feed(few, logs[: _MIN_LANES - 1], 10)
     assert (few._lanes["model_speed"] == 0.0).all()
 
 

@@ -38,8 +38,7 @@ def test_every_row_is_the_environment_wrapped_alone(name: Any, mode: Any) -> Non
     env_id, sensor = home(name)
     layer = {"estimator": name, "outputs": outputs(name)}
     alone, together = pair(env_id, 3, mode, [layer], **{sensor: {"phase": None, "loss": 0.2}})
-    same_bits(alone.reset(seed=[11, 5, 7]), together.reset(seed=[11, 5, 7]))
-    assert drive_both(alone, together, 40) > 6
+    assert drive_both(alone, together, 40, seed=[11, 5, 7]) > 6
 
 
 @pytest.mark.smoke
@@ -49,20 +48,16 @@ def test_own_covariance_where_arrivals_differ(count: Any, mode: Any) -> None:
     """Delays with jitter, an int as seed, other outputs."""
     layer = {"estimator": "exact-kf", "outputs": ["y_l", "gamma"], "replace": True}
     alone, together = pair(UNEVEN, count, mode, [layer], camera={"phase": None})
-    same_bits(alone.reset(seed=3), together.reset(seed=3))
-    assert drive_both(alone, together, 40) > 0
-    if count > 1:
-        assert len({P.tobytes() for P in together.estimator.P}) > 4
+    assert drive_both(alone, together, 40, seed=3) > 0
+    assert count == 1 or len({P.tobytes() for P in together.estimator.P}) > 4
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("control_period", [1, 33])
-def test_other_control_periods(control_period: Any, mode: Any) -> None:
-    alone, together = pair(
-        VISION, 2, mode, [{"estimator": "multirate-kf"}], control_period=control_period
-    )
-    same_bits(alone.reset(seed=3), together.reset(seed=3))
-    assert drive_both(alone, together, 130 if control_period == 1 else 15) > 1
+@pytest.mark.parametrize(("control_period", "steps"), [(1, 130), (33, 15)])
+def test_other_control_periods(control_period: int, steps: int, mode: Any) -> None:
+    layers = [{"estimator": "multirate-kf"}]
+    both = pair(VISION, 2, mode, layers, control_period=control_period)
+    assert drive_both(*both, steps, seed=3) > 1
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -74,8 +69,7 @@ def test_rows_may_be_different_cars(mode: Any) -> None:
         {"scenario": {"base": "uneven-delay-fig5", "duration": 0.1}},
     ]
     alone, together = pair(VISION, 4, mode, [{"estimator": "multirate-kf"}], changes=changes)
-    same_bits(alone.reset(seed=3), together.reset(seed=3))
-    assert drive_both(alone, together, 30) > 3
+    assert drive_both(alone, together, 30, seed=3) > 3
     tables = [each.gains for each in together.estimator]
     assert np.shares_memory(tables[0], tables[3]) and not np.shares_memory(tables[0], tables[1])
 
@@ -83,13 +77,11 @@ def test_rows_may_be_different_cars(mode: Any) -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_a_reset_to_another_scenario_tells_the_filters(mode: Any) -> None:
     alone, together = pair(VISION, 2, mode, [{"estimator": "multirate-kf"}])
-    same_bits(alone.reset(seed=1), together.reset(seed=1))
-    drive_both(alone, together, 5)
+    drive_both(alone, together, 5, seed=1)
     for scenario in ("uneven-delay-fig5", "tie-vision-fig7", "sine"):
         options = {"scenario": scenario, "duration": 0.05}
-        same_bits(
-            alone.reset(seed=2, options=dict(options)), together.reset(seed=2, options=options)
-        )
+        one = alone.reset(seed=2, options=dict(options))
+        same_bits(one, together.reset(seed=2, options=options))
         drive_both(alone, together, 12)
 
 
@@ -114,11 +106,10 @@ def test_several_estimators_stand_side_by_side(mode: Any) -> None:
     ]
     alone, together = pair(VISION, 2, mode, layers)
     assert together.layout == alone.envs[0].layout
-    same_bits(alone.reset(seed=1), together.reset(seed=1))
-    assert drive_both(alone, together, 30) > 3
+    assert drive_both(alone, together, 30, seed=1) > 3
     drawn = [each.unwrapped.annotations for each in alone.envs]
     assert [each.unwrapped.annotations for each in together.unwrapped.envs] == drawn
-    infos = together.step(actions(2, 0))[-1]
+    infos = together.step(actions(together, 0))[-1]
     assert "plain_nees" in infos and "last_beta_hat" in infos and "last_nees" not in infos
     with pytest.raises(ValueError, match=r"last_psi_hat.* would stand twice; give"):
         EstimateObservation(together, "exact-kf", outputs=["psi"], name="last")
@@ -164,7 +155,7 @@ def test_copies_continue_bit_for_bit() -> None:
     _, env = pair(UNEVEN, 3, "SameStep", [{"estimator": "exact-kf"}])
     env.reset(seed=2)
     for step in range(8):
-        env.step(actions(3, step))
+        env.step(actions(env, step))
     twin = copy.deepcopy(env)
     assert drive_both(env, twin, 12, 8) > 2
 
@@ -202,5 +193,4 @@ def test_an_env_that_offers_its_records_as_arrays(mode: Any) -> None:
     alone, _ = pair(UNEVEN, 3, mode, [layer], camera={"phase": None})
     native = Native(fleet(UNEVEN, 3, mode, camera={"phase": None}))
     together = EstimateObservation(native, **layer)
-    same_bits(alone.reset(seed=6), together.reset(seed=6))
-    assert drive_both(alone, together, 30) > 3
+    assert drive_both(alone, together, 30, seed=6) > 3

@@ -12,7 +12,7 @@ from sideslip.estimators.vector.truth import TruthObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS
-from tests.estimators.vector.fleets import BAD, VISION, home, outputs, same_bits
+from tests.estimators.vector.fleets import BAD, VISION, drive_both, home, outputs, same_bits
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -20,19 +20,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.Unobservabl
 def wrapped(env_id: str, count: int, mode: str, layer: dict[str, Any], **kwargs: Any) -> Any:
     """Around SyncVectorEnv, and around the vector env."""
     return [EstimateObservation(env, **layer) for env in pair(env_id, count, mode, **kwargs)]
-
-
-def drive(alone: Any, together: Any, steps: int) -> int:
-    ended = 0
-    for step in range(steps):
-        shape = alone.action_space.shape
-        told = np.random.default_rng(step).uniform(-1.0, 1.0, shape).astype(np.float32)
-        if step % 7 == 6:
-            told[step % len(told)] = BAD
-        one = alone.step(told)
-        same_bits(one, together.step(told))
-        ended += int(np.logical_or(one[2], one[3]).sum())
-    return ended
 
 
 QUICK = ("exact-kf", "course-kf")
@@ -47,16 +34,14 @@ def test_every_filter_says_the_same(name: Any, mode: str) -> None:
     clocks: dict[str, Any] = {sensor: {"phase": None, "loss": 0.2}}
     alone, together = wrapped(env_id, 3, mode, layer, **clocks)
     assert together.layout == alone.layout
-    same_bits(alone.reset(seed=[11, 5, 7]), together.reset(seed=[11, 5, 7]))
-    assert drive(alone, together, 60) > 6
+    assert drive_both(alone, together, 60, seed=[11, 5, 7]) > 6
 
 
 def test_members_that_interact_have_the_same_bits() -> None:
     """Over several steps of their chain."""
     layer = {"estimator": "joint", "options": {"sudden": True}}
     alone, together = wrapped(home("joint")[0], 3, MODES[0], layer)
-    same_bits(alone.reset(seed=[1, 2, 3]), together.reset(seed=[1, 2, 3]))
-    drive(alone, together, 60)
+    drive_both(alone, together, 60, seed=[1, 2, 3])
 
 
 @pytest.mark.long
@@ -65,8 +50,7 @@ def test_members_that_interact_have_the_same_bits() -> None:
 def test_so_it_does_over_a_hundred_thousand_steps(env_id: str, mode: str) -> None:
     name = "course-kf" if env_id == "sideslip/YawGps-v0" else "multirate-kf"
     alone, together = wrapped(env_id, 5, mode, {"estimator": name})
-    same_bits(alone.reset(seed=1), together.reset(seed=1))
-    assert drive(alone, together, 20_000) > 200
+    assert drive_both(alone, together, 20_000, seed=1) > 200
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -74,12 +58,12 @@ def test_masks_and_other_scenarios_tell_the_filters(mode: str) -> None:
     alone, together = wrapped(VISION, 3, mode, {"estimator": "multirate-kf"})
     same_bits(alone.reset(seed=1), together.reset(seed=1))
     for k, scenario in enumerate(("uneven-delay-fig5", "tie-vision-fig7", "sine")):
-        drive(alone, together, 12)
+        drive_both(alone, together, 12)
         mask = np.array([True, k == 1, False])
         options = {"reset_mask": mask, "scenario": scenario, "duration": 0.08}
         one = alone.reset(seed=k, options=dict(options))
         same_bits(one, together.reset(seed=k, options=dict(options)))
-    assert drive(alone, together, 30) > 3
+    assert drive_both(alone, together, 30) > 3
 
 
 @pytest.mark.parametrize(
@@ -175,7 +159,6 @@ def test_the_spec_tells_of_the_truth_too() -> None:
     again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
     assert again.single_observation_space == together.single_observation_space
     assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
-    same_bits(again.reset(seed=4), together.reset(seed=4))
-    assert drive(again, together, 8) == 1
+    assert drive_both(again, together, 8, seed=4) == 1
     env.spec = None
     assert together.spec is None

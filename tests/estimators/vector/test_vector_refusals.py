@@ -1,5 +1,7 @@
-"""What the vector EstimateObservation refuses, and what it says then."""
+"""What the vector EstimateObservation and batches refuse, and what they say then."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -9,57 +11,100 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import SyncVectorEnv
 
+from sideslip.envs import COMS
+from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
+from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
-from tests.estimators.vector.fleets import BAD, VISION, fleet
+from sideslip.estimators.vector.make import make_batch
+from tests.estimators.simulation import CAMERA, GPS
+from tests.estimators.vector.fleets import BAD, VISION, actions, fleet, native
+from tests.estimators.vector.test_batch import SPEED, drives
+from tests.estimators.wrappers.constant import Constant
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+STILL = np.zeros((2, 1), np.float32)
+FAST, PACKETS = np.zeros((2, 5, FAST_WIDTH)), np.zeros((2, 3, PACKET_WIDTH))
+FIG7: Any = {"scenario": "tie-vision-fig7"}
 
 
-def test_a_native_env_refuses_all_rows_and_the_estimators_go_on() -> None:
-    native = gym.make_vec(VISION, num_envs=2), gym.make_vec(VISION, num_envs=2)
-    env, twin = (EstimateObservation(each, "multirate-kf") for each in native)
-    for each in (env, twin):
-        each.reset(seed=0)
-    still = np.zeros((2, 1), np.float32)
-    for bad in (np.array([[0.0], [BAD]], np.float32), still[:1]):
-        with pytest.raises(ValueError, match="nothing was stepped"):
-            env.step(bad)
-        assert env.step(still)[0].tobytes() == twin.step(still)[0].tobytes()
+FLEET = functools.partial(fleet, VISION, 2, "NextStep")
 
 
-def test_a_failed_step_or_none_asks_for_a_reset() -> None:
-    """Some rows were stepped, others not: no estimator may go on as if nothing had happened."""
-    env: Any = EstimateObservation(
-        fleet(VISION, 2, "NextStep", on_bad_action="raise"), "multirate-kf"
-    )
-    still = np.zeros((2, 1), np.float32)
-    with pytest.raises(ResetNeeded, match="before the first step"):
-        env.step(still)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="not finite"):
-        env.step(np.array([[0.0], [BAD]], np.float32))
-    with pytest.raises(ResetNeeded, match="after one that failed"):
-        env.step(still)
-    with pytest.raises(ResetNeeded, match="reset all rows"):
-        env.reset(options={"reset_mask": np.array([True, False])})
-    env.reset(seed=0)
-    env.step(still)
+def wrap(env: Any = None, estimator: Any = "multirate-kf", **options: Any) -> Any:
+    return EstimateObservation(FLEET() if env is None else env, estimator, **options)
 
 
-def test_it_is_the_innermost_wrapper_or_an_error() -> None:
-    wrapped = gym.wrappers.vector.RecordEpisodeStatistics(fleet(VISION, 2, "NextStep"))
-    with pytest.raises(TypeError, match=r"innermost wrapper.*RecordEpisodeStatistics"):
-        EstimateObservation(wrapped, "multirate-kf")
-    clipped = fleet(VISION, 2, "NextStep", gym.wrappers.ClipAction)
-    with pytest.raises(TypeError, match=r"innermost wrapper.*ClipAction"):
-        EstimateObservation(clipped, "multirate-kf")
-    with pytest.raises(TypeError, match="CartPoleEnv has no rows"):
-        EstimateObservation(SyncVectorEnv([CartPoleEnv]), "multirate-kf")
-    with pytest.raises(TypeError, match="CartPoleVectorEnv has no rows"):
-        EstimateObservation(gym.make_vec("CartPole-v1", num_envs=2), "multirate-kf")
-    single: Any = gym.make(VISION)
-    with pytest.raises(TypeError, match=r"no vector env.*sideslip\.estimators\.EstimateObs"):
-        EstimateObservation(single, "multirate-kf")
+def reset(estimator: Any, told: Any = None, **arguments: Any) -> Any:
+    return wrap(native("NextStep"), estimator, **arguments).reset(seed=0, options=told)
+
+
+def batch(**changes: Any) -> Any:
+    told: dict[str, Any] = {"count": 2, "sensors": {"camera": CAMERA}} | changes
+    return make_batch("multirate-kf", **told)
+
+
+def step(*arguments: Any) -> None:
+    made = batch(speed=SPEED)
+    try:
+        made.step(*arguments)
+    finally:  # nothing was stepped
+        assert [each.tick for each in made] == [-1, -1]
+
+
+def changing(speed: float | None, **_: Any) -> Constant:
+    own = Constant()
+    own.names = ("mu", "gamma", "beta") if speed is None else ("mu", "gamma", "psi")
+    return own
+
+
+def wavering(speed: float | None, **more: Any) -> Any:
+    return make_estimator("exact-kf", speed=speed, **more) if speed is None else Constant()
+
+
+STATISTICS = gym.wrappers.vector.RecordEpisodeStatistics
+REFUSALS: dict[type[Exception], dict[str, Callable[[], Any]]] = {
+    TypeError: {
+        r"innermost wrapper.*RecordEpisodeStatistics": lambda: wrap(STATISTICS(FLEET())),
+        r"innermost wrapper.*ClipAction": lambda: wrap(FLEET(gym.wrappers.ClipAction)),
+        "CartPoleEnv has no rows": lambda: wrap(SyncVectorEnv([CartPoleEnv])),
+        "CartPoleVectorEnv has no rows": lambda: wrap(gym.make_vec("CartPole-v1", num_envs=2)),
+        r"no vector env.*sideslip\.estimators\.EstimateObs": lambda: wrap(gym.make(VISION)),
+        "unknown option 'q'": lambda: wrap(options={"q": 1}),
+        "one Constant cannot estimate 3 rows: pass its class": lambda: wrap(
+            native("NextStep"), Constant()
+        ),
+        "of filters of ours or of none": lambda: reset(wavering, FIG7),
+        "SyncVectorEnv makes no snapshots; the vector env that": lambda: wrap().get_state(),
+        "multirate-kf: unknown option 'p'": lambda: batch(p=1.0),
+    },
+    ValueError: {
+        r"must reset rows itself.*DISABLED": lambda: wrap(fleet(VISION, 2, "Disabled")),
+        "dakf needs the slow sensor gps; there is: camera": lambda: wrap(estimator="dakf"),
+        "no state 'psi'": lambda: wrap(estimator="bicycle-kf", outputs=["psi"]),
+        r"x has shape \(3,\)": lambda: reset(Constant, options={"value": (1.0, 2.0)}),
+        "filters of a batch have the same states, row 0 has": lambda: reset(changing, FIG7),
+        "at least one filter, got 0": lambda: batch(count=0),
+        "vehicle: one or a list of 2, got 1": lambda: batch(vehicle=[COMS]),
+        "sensors: one or a list of 2, got 3": lambda: batch(sensors=[{"camera": CAMERA}] * 3),
+        "speed: one or a list of 2, got 1": lambda: batch(speed=[1.0]),
+        "needs the slow sensor camera": lambda: batch(sensors={"gps": GPS}, slow="camera"),
+        "same states, row 0 .*row 1": lambda: batch(sensors=[{"camera": CAMERA}, {"gps": GPS}]),
+        r"fast rows have shape \(2, k, \d+\), got \(5, \d+\)": lambda: step(FAST[0], PACKETS),
+        r"packets have shape \(2, k, \d+\), got \(1, 3, \d+\)": lambda: step(FAST, PACKETS[:1]),
+        "counts are 0 to 3, got 0 to 4": lambda: step(FAST, PACKETS, [0, 4]),
+        "rows are 0 to 5, got -1 to 5": lambda: step(FAST, PACKETS, [0, 0], [-1, 5]),
+        r"mask has shape \(2,\) and dtype bool, got \(3,\)": lambda: batch().reset([True] * 3),
+        "2 filters, got 1 records": lambda: batch().run(drives(1, "camera", CAMERA, 0.05)),
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("error", "message"), [(error, message) for error in REFUSALS for message in REFUSALS[error]]
+)
+def test_what_is_wrong_is_refused_and_said(error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        REFUSALS[error][message]()
 
 
 def test_worker_processes_are_out_of_reach() -> None:
@@ -71,19 +116,49 @@ def test_worker_processes_are_out_of_reach() -> None:
         env.close()
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"estimator": "dakf"}, ValueError, "dakf needs the slow sensor gps; there is: camera"),
-        ({"estimator": "bicycle-kf", "outputs": ["psi"]}, ValueError, "no state 'psi'"),
-        ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "unknown option 'q'"),
-    ],
-)
-def test_wrong_arguments(options: Any, error: Any, message: Any) -> None:
-    with pytest.raises(error, match=message):
-        EstimateObservation(fleet(VISION, 2, "NextStep"), **options)
+def test_a_native_env_refuses_all_rows_and_the_estimators_go_on() -> None:
+    env, twin = (wrap(gym.make_vec(VISION, num_envs=2)) for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=0)
+    for bad in (np.array([[0.0], [BAD]], np.float32), STILL[:1]):
+        with pytest.raises(ValueError, match="nothing was stepped"):
+            env.step(bad)
+        assert env.step(STILL)[0].tobytes() == twin.step(STILL)[0].tobytes()
 
 
-def test_no_autoreset_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"must reset rows itself.*DISABLED"):
-        EstimateObservation(fleet(VISION, 2, "Disabled"), "multirate-kf")
+def test_a_failed_step_or_none_asks_for_a_reset() -> None:
+    """Some rows were stepped, others not: no estimator may go on as if nothing had happened."""
+    env = wrap(fleet(VISION, 2, "NextStep", on_bad_action="raise"))
+    with pytest.raises(ResetNeeded, match="before the first step"):
+        env.step(STILL)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="not finite"):
+        env.step(np.array([[0.0], [BAD]], np.float32))
+    with pytest.raises(ResetNeeded, match="after one that failed"):
+        env.step(STILL)
+    with pytest.raises(ResetNeeded, match="reset all rows"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=0)
+    env.step(STILL)
+
+
+def test_an_estimator_that_raises_asks_for_a_reset() -> None:
+    """Some rows took the step, others did not."""
+    env = wrap(native("NextStep", 2), Constant)
+    env.reset(seed=0)
+    env.estimator[1].inner.value = "lost"
+    with pytest.raises(TypeError, match="x is no array of numbers"):
+        env.step(STILL)
+    with pytest.raises(ResetNeeded, match="after one that failed"):
+        env.step(STILL)
+
+
+def test_a_snapshot_that_does_not_fit_or_is_of_no_episode() -> None:
+    env = wrap(native("NextStep"), "bicycle-kf")
+    snapshot = env.get_state()  # before the first reset
+    env.reset(seed=0)
+    env.set_state(snapshot)
+    with pytest.raises(ResetNeeded):
+        env.step(actions(env, 0))
+    with pytest.raises(ValueError, match="the snapshot has 3 rows"):
+        wrap(native("NextStep", 2), "bicycle-kf").set_state(snapshot)
