@@ -8,7 +8,7 @@ the env computes, failures included. It is a local optimum, sought from several 
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +30,6 @@ from .sweep import (
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
-    from .. import Agent
 
 Actions = npt.NDArray[np.float32]
 
@@ -179,7 +178,7 @@ def compute_clairvoyant(
     return ClairvoyantResult(actions, cost, winner, costs, statuses, seconds)
 
 
-def record_actions(env: gym.Env[Actions, Actions], agent: "Agent", seed: int) -> Actions:
+def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Actions:
     """Record an agent's actions in an episode.
 
     Args:

@@ -6,7 +6,7 @@ the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -23,16 +23,13 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # iso
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # isort: skip
 from torch import nn  # isort: skip
 
-if TYPE_CHECKING:
-    from ...envs.device.torch_env import DeviceVectorEnv
-
 _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
 class TrainingSource(NamedTuple):
     """The cars of a training."""
 
-    cars: "DeviceVectorEnv"  # with gradients, which resets itself in the same step
+    cars: Any  # `DeviceVectorEnv` with gradients, which resets itself in the same step
     seeds: list[int]  # seeds of the cars
     reward_scale: RewardScale  # factor of each car's reward
 
@@ -148,6 +145,14 @@ class GruPolicy(BasePolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
         return self(observation, self._begin(len(observation)))[0]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
+        parameters: dict[str, Any] = super()._get_constructor_parameters()
+        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
+        for name in ("features_extractor_class", "features_extractor_kwargs"):
+            parameters[name] = getattr(self, name)
+        return parameters | {"lr_schedule": self._dummy_schedule}
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
@@ -284,7 +289,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
 def _unroll_window(
     policy: GruPolicy,
-    cars: "DeviceVectorEnv",
+    cars: Any,
     obs: torch.Tensor,
     state: torch.Tensor,
     reward_scale: RewardScale,

@@ -21,11 +21,9 @@ from .names import check_env
 from .options import parse_options
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from ...agents import Agent
+    from ...agents.env_info import CarEnv
     from ...agents.rollout import Rollout
-    from ...envs.record import Array
 
 _SUFFIXES = {
     "correction": (".safetensors",),
@@ -184,7 +182,7 @@ def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[gym.Env[Array, Array], Agent]":
+def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[CarEnv, Agent]":
     """Make an env with its estimator, and the agent; without an env the first that fits.
 
     Args:
@@ -207,9 +205,7 @@ def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[gym.Env[Array, 
         raise
 
 
-def _make_driver(
-    setup: Mapping[str, Any], env_id: str, trust: bool
-) -> "tuple[gym.Env[Array, Array], Agent]":
+def _make_driver(setup: Mapping[str, Any], env_id: str, trust: bool) -> "tuple[CarEnv, Agent]":
     """Make them in one env."""
     from ...agents import make_agent
     from ...agents.env_info import make_env

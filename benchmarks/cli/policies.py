@@ -211,7 +211,7 @@ class _Distill:
         names = ("rounds", "epochs", "cells", "noise", "seed", "batch", "told", "traces")
         sizes = tuple(self.hidden or (64, 64))
         config = DistillConfig(hidden=sizes, **{name: getattr(self, name) for name in names})
-        about = {"class": self.kind, "teacher": self.teacher}
+        about: dict[str, object] = {"class": self.kind, "teacher": self.teacher}
         about |= {"cars": self.cars, "varied": self.varied} | config.describe()
         options = {"algorithm": "distill", "algorithm_options": about}
         options |= {"seeds": {"training": self.seed}, "command": get_command_line()}

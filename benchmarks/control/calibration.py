@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
+from ...agents.env_info import CarEnv
 from ...envs.io import from_json
 from ...envs.numerics import require_extra
 from ...envs.record import Array
@@ -112,7 +113,7 @@ def solve(case: CalibrationCase) -> ClairvoyantEpisode:
     for name, oracle in ((NOMINAL, NOMINAL), (STATE, find_oracle(task))):
         driver = make_oracle(oracle, task.env_id, **task.env_options)
         starts[name] = record_actions(*driver, case.seed)
-    env: gym.Env[Array, Array] = gym.make(task.env_id, **task.env_options)
+    env: CarEnv = gym.make(task.env_id, **task.env_options)
     result = compute_clairvoyant(env, case.seed, starts)
     plan = (result.cost, result.winner, result.costs, result.statuses, round(result.seconds, 1))
     episode = ClairvoyantEpisode(case.seed, *plan)

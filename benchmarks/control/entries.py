@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ...agents import AGENTS, Agent, make_agent
 from ...agents.baselines import (
@@ -24,6 +23,7 @@ from ...agents.baselines import (
     make_noise_options,
     make_oracle,
 )
+from ...agents.env_info import CarVectorEnv
 from ...agents.learned.policy import is_policy, load_policy
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
@@ -336,7 +336,7 @@ class CheckedAgent:
         return result
 
 
-def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Array, Array, Array], Any]:
+def make_cars(entry: ControlEntry, cars: int) -> tuple[CarVectorEnv, Any]:
     """Make the vector env with the entry's estimator, and its agent, both tuned.
 
     Args:

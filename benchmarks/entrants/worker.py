@@ -24,9 +24,8 @@ from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import VectorEnv
 
-from ...agents.env_info import EnvView
+from ...agents.env_info import CarVectorEnv, EnvView
 from ...agents.learned.policy import ZIP
 from ...envs.numerics.kernel_cache import LAYERS, find_kernel_folder
 from ...envs.record import Array
@@ -170,7 +169,7 @@ class _RemoteAgent:
     def __init__(self, child: _ChildProcess, source: str, trust: bool) -> None:
         self._child, self._source, self._trust = child, source, trust
 
-    def __call__(self, env: VectorEnv[Array, Array, Array], **options: object) -> "_RemotePolicy":
+    def __call__(self, env: CarVectorEnv, **options: object) -> "_RemotePolicy":
         """Let the child build its agent from the view of an env."""
         view = EnvView.from_env(env)
         self._child.call("agent", self._source, view, {"trust": self._trust, **options})

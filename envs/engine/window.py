@@ -3,7 +3,7 @@
 Its columns are the ticks of the step. A block of vehicles has a third axis, their lanes.
 """
 
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from ..task import compute_cost_rate
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import PARAMS_WIDTH, P, TaskParams, Z
-
-if TYPE_CHECKING:
-    from .tick import StepParams, StepVariant
 
 
 class CostInputs(NamedTuple):
@@ -211,7 +208,7 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
 @inline
 def compute_tick_cost(
     motion: Motion, cost_inputs: CostInputs, task: TaskParams, path: TrackPath,
-    variant: "StepVariant",
+    variant: Any,
 ) -> _TickCost:  # fmt: skip
     """Compute cost and failures of a tick from the motion at its end.
 
@@ -243,7 +240,7 @@ def compute_tick_cost(
 
 @jit
 def evaluate_cost(
-    window: Matrix, n: int, cost: Scalar, params: "StepParams", variant: "StepVariant"
+    window: Matrix, n: int, cost: Scalar, params: Any, variant: Any
 ) -> tuple[Scalar, int, bool]:
     """Evaluate a step's ticks up to a failure.
 

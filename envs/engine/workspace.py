@@ -1,6 +1,6 @@
 """Arrays of an episode; its workspace, one vector that holds them."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,9 +11,6 @@ from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REPORT
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
 from .window import WINDOW_HEIGHT, count_columns
-
-if TYPE_CHECKING:
-    from .config import EnvConfig
 
 
 class EpisodeArrays(NamedTuple):
@@ -99,7 +96,7 @@ class WorkspaceMixin:
     `rows` and `packets` are the newest record's; `delivered` of the latter are there.
     """
 
-    config: "EnvConfig"
+    config: Any  # `EnvConfig`
     control_period: int
     _workspace: Array | None = None
 

@@ -5,20 +5,15 @@ in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.mo
 once more, with slopes; a test holds both equal.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from ..numerics.functions import atan, sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, sqrt
 from .parameters import GRAVITY
 
-if TYPE_CHECKING:
-    from typing import TypeAlias
-
-    from .dynamics import CarParams as Car
-    from .dynamics import Motion, Velocity
-
-    State: TypeAlias = Motion | Velocity
+Car: TypeAlias = Any  # `CarParams` of `dynamics`, which imports this file
+State: TypeAlias = Any  # its `Motion` or `Velocity`
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
 """The laws by the names that `Scenario.tyres` takes; a law's code is its place."""
@@ -78,7 +73,7 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 @inline
 def _compute_axle_shift(
-    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: "Car"
+    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: Car
 ) -> Scalar:
     """Load F_x h_x / (2 l) (N) that drive moves from each front wheel to the rear one behind it."""
     # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
@@ -187,7 +182,7 @@ def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_a
 
 @jit
 def _compute_slip_ratios(
-    motion: "State", load: TyreLoad, car: "Car", small_angle: int
+    motion: State, load: TyreLoad, car: Car, small_angle: int
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Numerator and denominator (m/s) of the tangents of the front and the rear slip angle."""
     front = motion.v_y + car.l_f * motion.gamma
@@ -203,7 +198,7 @@ def _compute_slip_ratios(
 
 @jit
 def compute_slips(
-    motion: "State", load: TyreLoad, car: "Car", small_angle: int
+    motion: State, load: TyreLoad, car: Car, small_angle: int
 ) -> tuple[Scalar, Scalar]:
     """Compute the tangents of the front and rear slip angle.
 
@@ -221,7 +216,7 @@ def compute_slips(
 
 
 @inline
-def _compute_load_transfer(motion: "State", car: "Car", g_y: Scalar) -> tuple[Scalar, Scalar]:
+def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar, Scalar]:
     """Fractions (-0.9 to 0.9) of its load that the front and the rear left wheel give to the right.
 
     The suspension transmits K_x phi + C_x phi_dot; the moment of the rest of the car's height,
@@ -238,7 +233,7 @@ def _compute_load_transfer(motion: "State", car: "Car", g_y: Scalar) -> tuple[Sc
 
 @inline
 def compute_tyre_forces(
-    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar, small_angle: int, law: int, roll: int
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar, small_angle: int, law: int, roll: int
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Compute the forces of the axles and the moment of the motors.
 
@@ -261,7 +256,7 @@ def compute_tyre_forces(
 
 @inline
 def compute_tyres(
-    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar, small_angle: int, law: int, roll: int
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar, small_angle: int, law: int, roll: int
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
@@ -288,7 +283,7 @@ def compute_tyres(
 
 @inline
 def _compute_shifted_tyres(
-    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """`compute_tyres` where roll moves load from side to side; all quotients come from one."""
     across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
