@@ -88,8 +88,7 @@ def evaluate_policy(
         ValueError: The policy cannot drive the env.
     """
     loaded = load_policy(policy)
-    card = loaded.card
-    home = env_id or card.env_id
+    card, home = loaded.card, env_id or loaded.card.env_id
     options = dict(card.env_options) if env_id in (None, card.env_id) else {}
     options |= {} if scenario is None else {"scenario": scenario}
     base: Any = gym.make(home, **options).unwrapped
@@ -106,9 +105,8 @@ def evaluate_policy(
     chunks = [Chunk(entry, tuple(seeds), keep=True) for entry in entries.values()]
     results = dict(zip(entries, run_cases(run_chunk, chunks, loaded.name, jobs=1), strict=True))
     errors = {name: outcome.error for name, outcome in results.items() if outcome.error}
-    for needed in (loaded.name, "none"):
-        if needed in errors:
-            raise ValueError(f"{needed} cannot drive {home}: {errors[needed]}")
+    if failed := [name for name in (loaded.name, "none") if name in errors]:
+        raise ValueError(f"{failed[0]} cannot drive {home}: {errors[failed[0]]}")
     drives = {name: outcome for name, outcome in results.items() if name not in errors}
     return PolicyEvaluation(loaded, salt, seeds, base.reference, entries, drives, errors)
 
@@ -167,7 +165,7 @@ def make_suite(result: PolicyEvaluation) -> Suite:
     _add_rows(suite, result)
     from ..control.report import make_time_explorer
 
-    driven = {(label,): outcome.series for label, outcome in result.drives.items()}
+    driven = {(label,): drive.series for label, drive in result.drives.items()}
     series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
     suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
     suite.verdict = _compose_verdict(result)
@@ -177,12 +175,12 @@ def make_suite(result: PolicyEvaluation) -> Suite:
 def _compose_verdict(result: PolicyEvaluation) -> str:
     """Costs of the policy over the others', and how often it fails."""
     name = result.policy.name
-    others = [label for label in result.drives if label != name]
     fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
-    lines = []
-    for other in others:
-        ratio = _format_cost_ratio(result, other)
-        lines.append(f"{name} costs {ratio} of {other}, seed by seed.")
+    lines = [
+        f"{name} costs {_format_cost_ratio(result, other)} of {other}, seed by seed."
+        for other in result.drives
+        if other != name
+    ]
     limits = f"Not said: other cars, scenarios and seeds than these {len(result.seeds)}."
     return format_verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
 
@@ -197,10 +195,8 @@ def _make_table(result: PolicyEvaluation) -> ResultTable:
     first = result.policy.name
     costs, cells = result.drives[first].costs, []
     for name, outcome in result.drives.items():
-        ratio = better = ""
-        if name != first:
-            ratio = _format_cost_ratio(result, name)
-            better = f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %"
+        ratio = _format_cost_ratio(result, name) if name != first else ""
+        better = f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %" if ratio else ""
         slip, step = 1e3 * outcome["rms_slip"].mean(), outcome["largest_step"].mean()
         fails = 100.0 * np.mean(outcome["failure"] != 0.0)
         cells.append([name, ratio, better, f"{slip:.2f}", f"{step:.0f}", f"{fails:.1f} %"])
@@ -446,9 +442,8 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     }
     policy_costs, rivals = results["policy"].costs, (NOMINAL, _RIVAL)
     beaten = {name: compute_win_rate(policy_costs, results[name].costs) for name in rivals}
-    fails = float((results["policy"]["failure"] != 0.0).mean())
     better = {f"better than {name}": _list_rounded(result, 1.0) for name, result in beaten.items()}
-    return shown | better | {"fails": fails}
+    return shown | better | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
 
 
 def _list_rounded(numbers: Estimate, unit: float) -> Sequence[float]:
