@@ -58,11 +58,3 @@ def test_without_highway_env_the_suite_has_no_rows(monkeypatch: pytest.MonkeyPat
     suite = traffic.run(1, 1, 1)
     assert not suite.rows and "sideslip[highway]" in suite.verdict
     assert importlib.util.find_spec("highway_env") is not None
-
-
-@pytest.mark.long
-def test_the_suite_has_its_tables_and_rows() -> None:
-    suite = traffic.run(2, 1, 1)
-    assert len(suite.tables) == 2
-    assert [cells[0] for cells in suite.tables[0].cells] == list(traffic.CONTROLLERS)
-    assert {row.metric for row in suite.rows} >= {"success_rate", "collision_rate", "offset"}

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.metrics import METRICS
-from sideslip.benchmarks.harness.results import VERDICTS
-from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers import theory
 from sideslip.benchmarks.papers.ledger import (
     Bound,
@@ -134,14 +132,3 @@ def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:
     for seed in range(3):
         for (label, _), value in _compute_residuals(seed)[0].items():
             assert value > 0.01 if label.endswith("printed") else value < 1e-12, label
-
-
-@pytest.mark.long
-def test_every_threshold_is_met() -> None:
-    """The whole ledger, quickly: thresholds of docs/PAPERS.md section 3, by the median."""
-    suite = papers.run(papers.QUICK_SEEDS)
-    table = next(table for table in suite.tables if "verdict" in table.header)
-    assert len(table.cells) == len(CLAIMS)
-    numbers = [row for each in suite.tables if each.header[0] == "number" for row in each.cells]
-    assert [row[0] for row in numbers if "MISSED" in row[-1]] == []
-    assert {row.verdict for row in suite.rows} <= set(VERDICTS[1:])

@@ -252,12 +252,3 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
     taken, seconds, absent = held
     assert list(taken) == [part.__name__ for part in (env_steps, plant, learning)]
     assert list(absent) == [*taken, first_use.__name__] and list(seconds) == [first_use.__name__]
-
-
-@pytest.mark.long
-def test_the_quick_form_gives_all_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suite, "QUICK", SHORT)
-    found = suite.run(quick=True)
-    assert [table.title for table in found.tables][::5] == ["Targets", "Cost of the first use"]
-    names = [(row.scenario, row.estimator, row.metric) for row in found.rows]
-    assert len(names) == len(set(names))
