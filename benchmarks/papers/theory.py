@@ -71,7 +71,7 @@ Matrix = list[list[Fraction]]
 def _rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
     """Compute the rank of a matrix of fractions by elimination.
 
-    >>> rank([[1, 2], [2, 4]]), rank([[Fraction(1, 3), 0], [0, 1]])
+    >>> _rank([[1, 2], [2, 4]]), _rank([[Fraction(1, 3), 0], [0, 1]])
     (1, 2)
     """
     rows = [[Fraction(entry) for entry in row] for row in matrix]

@@ -114,7 +114,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
 
     monkeypatch.setattr(controllers, "_compute_objective", fake)
     monkeypatch.setattr(
-        controllers, "run_contestant", lambda *_: DriveResult(np.zeros((1, 1)), 0.0)
+        controllers, "_run_contestant", lambda *_: DriveResult(np.zeros((1, 1)), 0.0)
     )
     slow = task(SearchNumber("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(make_tuning_seeds(16)))
     first = slow.seeds[0]

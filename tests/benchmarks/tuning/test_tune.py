@@ -132,7 +132,7 @@ def test_a_stopped_search_goes_on(
     assert len(finished) == 16 and finished[:8] == kept
     assert len({tuple(params.values()) for params in finished}) == 16  # nothing is tried twice
     monkeypatch.setattr(
-        tune_study, "evaluate_trial", lambda *_: pytest.fail("there is nothing to do")
+        tune_study, "_evaluate_trial", lambda *_: pytest.fail("there is nothing to do")
     )
     tune_study._search(tune_study.create_study(task, url), task, drives, 16, 1)
 
