@@ -40,12 +40,12 @@ class CameraSimulator:
     """Renders the pictures of one car and finds the lane in them; needs the extra `vision`.
 
     Args:
-        delay: "fitted", "measured" or "link", as in `StabilityEnv`.
+        delay: "fitted" or "measured", of the lane finder, or "link", the camera's own delay.
         appearance: Fields of `Appearance` that replace the defaults.
 
     Attributes:
-        picture: Newest picture.
-        lane: Newest lane.
+        picture: Picture that was rendered last; None before the first.
+        lane: Lane that was found in `picture`; None before the first.
     """
 
     def __init__(self, delay: str, appearance: Mapping[str, object] | None) -> None:
@@ -74,9 +74,9 @@ class CameraSimulator:
         Args:
             before: Packed state before the step.
             row: Arrays of the episode.
-            done: Ticks of the step.
+            done: Number of ticks that the step took.
             bounds: Bounds of the observation, shape (2, n).
-            window: Rows of the step's window.
+            window: Window of the step, whose columns are its ticks.
         """
         z = row.z
         z[_SLOW_STATE] = before[_SLOW_STATE]
@@ -97,8 +97,8 @@ class CameraSimulator:
         Args:
             p: Packed parameters.
             z: Packed state, whose queue has the packets.
-            motion: `Motion` of the car.
-            tick: The tick.
+            motion: `Motion` of the car at the capture.
+            tick: Tick of the capture.
         """
         queue = z[Z.queue :][: int(z[Z.under_way]) * PACKET_WIDTH].reshape(-1, PACKET_WIDTH)
         is_captured = (queue[:, PACKET.sensor] == CAMERA) & (queue[:, PACKET.captured] == tick)
@@ -120,6 +120,7 @@ class CameraSimulator:
             if self.delay == "fitted":
                 share = _uniforms(*key, tick, BLOCKS[CAMERA].link)[0]
                 seconds = load_detector().compute_delay(share)
+            # the first copy arrives after the delay, a duplicate as long behind it as before
             arrivals = queue[is_captured, PACKET.arrived]
             arrivals += tick + count_delay_ticks(seconds) - arrivals.min()
             queue[is_captured, PACKET.arrived] = arrivals

@@ -217,7 +217,7 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
     """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
 
     Args:
-        kind: The dataclass.
+        kind: Dataclass of the instance.
         entry: The parsed JSON value.
         where: Place of the value, for messages.
 
@@ -247,7 +247,7 @@ def check_types(kind: "type[DataclassInstance]", values: Mapping[str, object], w
     """Check that values have the types of a dataclass's fields.
 
     Args:
-        kind: The dataclass.
+        kind: Dataclass whose fields have the types.
         values: Values by the names of fields.
         where: Place of the values, for messages.
 

@@ -48,7 +48,7 @@ def join_names(names: Iterable[str]) -> str:
     """Format names for a message, the first of them where they are many.
 
     Args:
-        names: The names.
+        names: Names in the order of the text.
 
     Returns:
         The text.
@@ -74,7 +74,7 @@ def check_number(name: str, value: object) -> float:
 
     Args:
         name: Name of the number, for messages.
-        value: The value.
+        value: Value that should be a finite number.
 
     Returns:
         The number.
@@ -89,7 +89,7 @@ def check_mapping(name: str, value: object) -> Mapping[str, Any]:
 
     Args:
         name: Name of the mapping, for messages.
-        value: The value.
+        value: Value that should be a mapping.
 
     Returns:
         The mapping.
@@ -121,7 +121,7 @@ def check_choice(what: str, value: object, known: Iterable[str]) -> None:
 
     Args:
         what: What the value names.
-        value: The value.
+        value: Value that should be a known name.
         known: Known names.
     """
     if not isinstance(value, str) or value not in known:
@@ -133,7 +133,7 @@ def check_options(what: str, function: Callable[..., object], options: Iterable[
 
     Args:
         what: What has the options, for messages.
-        function: The function.
+        function: Function whose parameters are the known options.
         options: Names of options.
     """
     parameters = list(inspect.signature(function).parameters.values())[1:]
@@ -151,7 +151,7 @@ def check_int(
 
     Args:
         name: Name of the number, for messages.
-        value: The value.
+        value: Value that should be an integer.
         what: What is counted.
         minimum: Smallest number.
         maximum: Largest number; None for no limit.
@@ -280,7 +280,7 @@ def parse_action(action: object, width: int, fail: bool) -> Actions:
     """Parse an action to float32.
 
     Args:
-        action: The action.
+        action: Numbers of one row, shape (width,).
         width: Numbers of an action.
         fail: Whether a bad one becomes NaN instead of raising ValueError.
 
@@ -302,7 +302,7 @@ def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
     """Parse actions of several rows to float32.
 
     Args:
-        actions: The actions.
+        actions: Numbers of all rows, shape (count, width).
         count: Number of rows.
         width: Numbers of a row.
         fail: Whether rows of a wrong shape or without numbers become NaN.
@@ -340,7 +340,7 @@ def warn_once(env: object, actions: Actions) -> None:
     """Warn, once per env, of actions far outside of -1 to 1.
 
     Args:
-        env: The environment.
+        env: Environment that remembers the warning.
         actions: Actions, of any shape, one of them far outside.
     """
     attributes = vars(env)

@@ -52,15 +52,15 @@ class StabilityVectorEnv(
     environment resets itself start without options.
 
     ## Actions
-    (N, 1), or (N, 2) with `steering`. With `on_bad_action="raise"` a wrong number of actions, one
-    that is not finite or one that is no numbers raises ValueError, names the rows and steps
-    nothing; with "fail" it ends these rows' episodes as failures. Of rows that this step resets
-    the values are not read.
+    (N, 1), or (N, 2) with `steering`. With `on_bad_action="raise"` a wrong number of actions, or
+    one that is not finite or not numeric, raises ValueError, names the rows and steps nothing;
+    with "fail" it ends these rows' episodes as failures. Of rows that this step resets the values
+    are not read.
 
     ## Records
-    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are filled, `packets` (N, most,
-    PACKET_WIDTH) of which `delivered` (N,) are; `final_...` are those before a row's newest reset.
-    `record[i]` is a row's `Record`.
+    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are filled, `packets` (N, k,
+    PACKET_WIDTH), k the most of a step, of which `delivered` (N,) are; `final_...` are those
+    before a row's newest reset. `record[i]` is a row's `Record`.
 
     `vehicle`, `nominal`, `held_speed`, `slow_sensors`, `scenario` and `record` are sequences of N
     whose items are made on access; `motion` is (N, len(Motion)).
@@ -285,7 +285,7 @@ class StabilityVectorEnv(
 def _make_row_configs(
     arguments: Mapping[str, Any], count: int
 ) -> tuple[StabilityEnv, list[EnvConfig]]:
-    """The first row's env, and the config of each row; rows with the same values share one."""
+    """Make the first row's env, and each row's config; rows with the same objects share both."""
     if arguments.get("vision") == "image":
         mode = "make_vec(..., vectorization_mode='sync')"
         raise ValueError(f"vision='image' sees for one car at a time: {mode}")

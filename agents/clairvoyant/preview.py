@@ -29,15 +29,15 @@ from ...envs.vehicle.dynamics import CarParams, RoadParams
 
 
 class PreviewStep(NamedTuple):
-    """Inputs and parameters of one step of the plan, which actions change hardly or not at all."""
+    """Inputs and parameters of one step of the plan, which actions hardly affect."""
 
     steer_start: Scalar  # rad, front steering angle without the added one, at the step's start
     steer_middle: Scalar  # rad, at the step's middle
     steer_end: Scalar  # rad, at its end
-    command: Scalar  # rad, the driver's at the start
-    F_d: Scalar  # N, mean over the step, with the wind's
-    N_d: Scalar  # N m
-    N_x: Scalar  # N m
+    command: Scalar  # rad, the driver's steering command at the step's start
+    F_d: Scalar  # N, lateral force of disturbance and wind, mean over the step
+    N_d: Scalar  # N m, yaw moment of both, mean over the step
+    N_x: Scalar  # N m, roll moment of the wind, mean over the step
     C_f: Scalar  # N/rad, of a front tyre
     C_r: Scalar  # N/rad, of a rear tyre
     mu: Scalar  # under the left wheels
@@ -74,9 +74,9 @@ class PlanState(NamedTuple):
 class PlanParams(NamedTuple):
     """Parameters that are constant within an episode; hashable, as the key of a solver."""
 
-    car: CarParams  # with zeros for the fields of `PreviewStep`
+    car: CarParams  # C_f, C_r, mu and mu_r are 0: `PreviewStep` has them
     road: RoadParams
-    speed_profile: SpeedProfile  # with zeros for the fields of `PreviewStep`
+    speed_profile: SpeedProfile  # speed, acceleration, start, surge are 0: see `PreviewStep`
     motor: Lag  # lag of the motors over a step
     steering: Lag  # lag of the steering over a step
     motor_tick: Lag  # lag of the motors over a tick
@@ -85,13 +85,13 @@ class PlanParams(NamedTuple):
     task: TaskParams
     kind: StepVariant  # of the plant
     width: int  # entries of an action
-    ticks: int  # ticks of a step, the control period
+    ticks: int  # ticks of a step: the control period
     periods: int  # steps of the episode
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """An episode as a plan has it."""
+    """Parameters, preview and start of an episode, from which a plan is computed."""
 
     fixed: PlanParams
     known: Array  # columns of `PreviewStep` (its fields, periods + 1); the last: the episode's end
@@ -119,14 +119,14 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
         raise ValueError("a forecast starts at an episode's start: call reset() first")
     start = read_plan_state(z)
     fixed = _make_plan_params(base, p, snapshot["config"].start.switches, n)
-    ticks = fixed.periods * n
+    last = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
     # disturbances, and a steering profile's front wheels, do not depend on the actions
     drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
     command = driver
     if not fixed.kind.has_driver and base.scenario.steering != "wander":
-        command = np.array([compute_profile_angle(p, float(k)) for k in range(ticks + 1)])
+        command = np.array([compute_profile_angle(p, float(k)) for k in range(last + 1)])
     known = _compute_preview(p, fixed, drive, command, refs)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 
@@ -145,8 +145,8 @@ def read_plan_state(z: Array) -> PlanState:
     return PlanState(*motion, *actuators)
 
 
-def _make_plan_params(base: Any, p: Array, switches: Array, ticks: int) -> PlanParams:
-    """Make the parameters of an episode in steps of some ticks."""
+def _make_plan_params(base: Any, p: Array, switches: Array, n: int) -> PlanParams:
+    """Make the parameters of an episode in steps of n ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task, speed_profile = read(p, P.task), read(p, P.speed_profile)._replace(end=FOREVER)
@@ -155,16 +155,16 @@ def _make_plan_params(base: Any, p: Array, switches: Array, ticks: int) -> PlanP
         read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
         read(p, P.road),
         speed_profile,
-        make_lag(motor, ticks * TICK),
-        make_lag(steering, ticks * TICK),
+        make_lag(motor, n * TICK),
+        make_lag(steering, n * TICK),
         make_lag(motor, TICK),
         make_lag(steering, TICK),
         read(p, P.target),
         task,
         as_python(make_step_variant)(p, switches),
         base.action_space.shape[0],
-        ticks,
-        -int(-task.duration // ticks),
+        n,
+        -int(-task.duration // n),
     )
 
 
@@ -178,10 +178,10 @@ def _simulate_actions(
     obs, report = np.empty(len(base.layout), np.float32), np.zeros(len(REPORT))
     row = EpisodeArrays(p, z, switches, obs, snapshot["rows"], snapshot["packets"], report)
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
-    ticks = n * len(actions)
-    drive, driver = np.empty((ticks + 1, len(ActuatorState._fields))), np.empty(ticks + 1)
-    refs = np.empty((ticks + 1, 2))
-    for tick in range(ticks + 1):
+    last = n * len(actions)
+    drive, driver = np.empty((last + 1, len(ActuatorState._fields))), np.empty(last + 1)
+    refs = np.empty((last + 1, 2))
+    for tick in range(last + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
         step_vehicle(row, held_actions[tick], 1, bounds, window)
@@ -193,8 +193,8 @@ def _compute_preview(
     p: Array, fixed: PlanParams, drive: Array, command: Array, refs: Array
 ) -> Array:
     """Compute the columns of `PreviewStep`, shape (len(PreviewStep), periods + 1)."""
-    q, last = fixed.ticks, len(command) - 1
-    nodes = np.arange(0, last, q)
+    n, last = fixed.ticks, len(command) - 1
+    nodes = np.arange(0, last, n)
     names = ActuatorState._fields
     angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
@@ -202,12 +202,12 @@ def _compute_preview(
         """Compute the front wheels' angle without the added one, after a tick's lag."""
         return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
 
-    lag, middle = fixed.steering_tick, nodes + q // 2
+    lag, middle = fixed.steering_tick, nodes + n // 2
     wind = read(p, P.wind)
     wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
     F_d, N_d = (drive[:last, names.index(name)] for name in ("F_d", "N_d"))
     forces = np.column_stack([F_d, N_d, np.zeros(last)])
-    mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
+    mean_forces = (forces + wind_forces).reshape(-1, n, 3).mean(axis=1)
     profile = read(p, P.speed_profile)
     set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])
     car, change = read(p, P.car), read(p, P.tyre_change)
@@ -216,21 +216,21 @@ def _compute_preview(
         np.where(is_changed, factor * stiffness, stiffness)
         for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
     ]
-    # Weights (s) of the cost rates at every q-th tick, by the trapezoid rule: q / 2 ticks at either
+    # Weights (s) of the cost rates at every n-th tick, by the trapezoid rule: n / 2 ticks at either
     # end. J sums ticks 1 to the last: the start, which does not count, has half a tick less, and
-    # the last one, which counts whole, half a tick more. Exact for q = 1.
-    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
-    weights[0] = 0.5 * (q - 1) * TICK
+    # the last one, which counts whole, half a tick more. This is exact for n = 1.
+    weights = np.where(nodes < fixed.task.duration, n * TICK, 0.0)
+    weights[0] = 0.5 * (n - 1) * TICK
     table = (
         compute_wheel_angle(nodes, lag.start),
-        compute_wheel_angle(middle, lag.middle if q % 2 else lag.start),
-        compute_wheel_angle(nodes + q - 1, lag.end),
+        compute_wheel_angle(middle, lag.middle if n % 2 else lag.start),
+        compute_wheel_angle(nodes + n - 1, lag.end),
         command[nodes],
         *mean_forces.T,
         *tyres,
         *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
         *set_points.T,
-        _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
+        _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, n).mean(axis=1),
         weights,
         *refs[nodes].T,
     )
@@ -239,7 +239,7 @@ def _compute_preview(
     end[PreviewStep._fields.index("command")] = command[last]
     end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
     is_complete = last == fixed.task.duration
-    end[PreviewStep._fields.index("weight")] = 0.5 * (q + 1) * TICK if is_complete else 0.0
+    end[PreviewStep._fields.index("weight")] = 0.5 * (n + 1) * TICK if is_complete else 0.0
     return np.hstack([known, end])
 
 
@@ -258,7 +258,7 @@ def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
-    # at v_x = 0 the command is the feedforward with k_p = 0, and with k_p = 1 /s the speed more
+    # at v_x = 0, k_p = 0 leaves the feedforward alone, and k_p = 1 /s adds the speed to it
     profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
     feedforward = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
     profile = profile._replace(k_p=1.0)

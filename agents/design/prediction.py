@@ -49,8 +49,8 @@ class PredictionModel(NamedTuple):
     kind: StepVariant
     motor: Lag  # lag of the motors over a step
     steering: Lag  # lag of the steering over a step
-    motor_rest: tuple[float, float]  # of the motors, `_compute_lag_moments`
-    steering_rest: tuple[float, float]  # of the steering, likewise
+    motor_rest: tuple[float, float]  # mean and std of the motors' remaining fraction in a step
+    steering_rest: tuple[float, float]  # mean and std of the steering's remaining fraction
     step: float  # s
     full_scale: float  # N m
     authority: float  # rad
@@ -58,7 +58,7 @@ class PredictionModel(NamedTuple):
     stop: float  # rad
     yaw_first: float  # 1: the yaw moment comes before the drive torque
     decay: float  # fraction of the disturbances that a step leaves
-    ref_rest: float  # fraction of a lagged reference's deviation that a step leaves
+    ref_decay: float  # fraction of a lagged reference's deviation that a step leaves
     per_beta: float  # square root of the cost's weight of beta (1/rad)
     per_gamma: float  # of gamma (s/rad)
     per_share: float  # of the yaw moment's fraction
@@ -83,14 +83,14 @@ class PredictionStart(NamedTuple):
 
 
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Compute mean and standard deviation, over a step's ticks, of the rest that a lag leaves.
+    """Compute mean and standard deviation, over a step's ticks, of a lag's remaining fraction.
 
-    The rest rho is a fraction of the deviation from a command. The mean square of
+    This rho is what a lag leaves of the deviation from a command. The mean square of
     command + deviation rho is (command + deviation mean)^2 + (deviation std)^2.
     """
     tick = make_lag(time_constant, TICK)
-    rest = tick.mean * tick.end ** np.arange(ticks)
-    return float(rest.mean()), float(rest.std())
+    rho = tick.mean * tick.end ** np.arange(ticks)
+    return float(rho.mean()), float(rho.std())
 
 
 def make_prediction_model(
@@ -99,7 +99,7 @@ def make_prediction_model(
     ticks: int,
     lags: bool,
     disturbance_time: float,
-    ref_rest: float,
+    ref_tick_decay: float,
     steer_weight: float,
     full_scale: float,
     authority: float,
@@ -113,7 +113,7 @@ def make_prediction_model(
         ticks: Ticks of a step.
         lags: Whether the actuators lag.
         disturbance_time: Time in which disturbances decay (s).
-        ref_rest: Fraction of a lagged reference's deviation that a tick leaves.
+        ref_tick_decay: Fraction of a lagged reference's deviation that a tick leaves.
         steer_weight: Factor on the cost of added steering.
         full_scale: Yaw moment at an action of 1 (N m).
         authority: Added steering at an action of 1 (rad).
@@ -139,7 +139,7 @@ def make_prediction_model(
         vehicle.steering_stop,
         float(yaw_first),
         math.exp(-step / disturbance_time),
-        ref_rest**ticks,
+        ref_tick_decay**ticks,
         1.0 / BETA_SCALE,
         0.0 if kind.reference == ZERO_SLIP else 1.0 / GAMMA_SCALE,
         math.sqrt(EFFORT_WEIGHT),
@@ -223,10 +223,10 @@ def _multiply_row(
 ) -> Scalar:
     """Multiply a row of M, K or T of shape (rows, 9), by the nine states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
-    lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
-    held = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
-    pushed = M[row, 6] * state.gamma_ref + M[row, 7] * state.F_d + M[row, 8] * state.N_d
-    return lateral + held + pushed
+    first = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
+    middle = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
+    last = M[row, 6] * state.gamma_ref + M[row, 7] * state.F_d + M[row, 8] * state.N_d
+    return first + middle + last
 
 
 @inline
@@ -309,8 +309,8 @@ def _predict_step(
         apply_lag(T_r, state.T_r, motor.end),
         apply_lag(steer, state.delta_f, steering.end),
         added_command,
-        apply_lag(start.steady[0], state.beta_ref, model.ref_rest),
-        apply_lag(start.steady[1], state.gamma_ref, model.ref_rest),
+        apply_lag(start.steady[0], state.beta_ref, model.ref_decay),
+        apply_lag(start.steady[1], state.gamma_ref, model.ref_decay),
         model.decay * state.F_d,
         model.decay * state.N_d,
     )
@@ -330,10 +330,10 @@ def simulate_plans(
     limits: Matrix,
     first: Vector,
 ) -> None:
-    """Simulate plans: fill their residuals, whose squares sum to J, and their first commands.
+    """Simulate plans: fill their residuals and first commands.
 
-    The variables of a plan are, for every block, the fraction of the yaw moment and, where the car
-    steers, that of the authority.
+    The squares of the residuals sum to J and the terminal cost. The variables of a plan are, for
+    every block, the fraction of the yaw moment and, where the car steers, that of the authority.
 
     Args:
         model: Numbers that all predictions share.

@@ -4,8 +4,8 @@ The checkpoint is one file: tensors as safetensors, the rest as JSON beside them
 no code, and a save that is stopped leaves the older file as it was.
 
 The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
-weighted by 1 over the uncontrolled car's cost. Where a training starts from a policy, each drive is
-weighted by 1 over that policy's cost in the same drive.
+weighted by 1 over the uncontrolled car's cost, but at least 5 % of its mean over the scenarios.
+Where a training starts from a policy, each drive is weighted by 1 over that policy's cost in it.
 """
 
 import json
@@ -69,7 +69,7 @@ class Evaluation(NamedTuple):
     steps: int  # of the training so far
     cpu_seconds: float  # of the training so far, without evaluations
     cost: float  # mean cost J; of a mixture `of_none` times the scenarios' mean uncontrolled cost
-    of_none: float  # as a fraction of the uncontrolled car's on these seeds
+    of_none: float  # cost relative to the uncontrolled car's on these seeds
     of_start: float | None = None  # geometric mean of costs over the initial policy's, if any
 
     @property
@@ -176,10 +176,10 @@ class EvalCallback(BaseCallback):
         self.since = time.process_time()
 
     def build(self, trained_agent: str | Path | None = None, trust: bool = False) -> BaseAlgorithm:
-        """Build the model, new or of the checkpoint, a zip or a policy, with its environments.
+        """Build the model, new or from a checkpoint, a zip or a policy, with its environments.
 
         Args:
-            trained_agent: Zip to start from, None for none.
+            trained_agent: Zip of a model to start from, None for none.
             trust: Whether a pickle of VecNormalize beside the zip may be read.
 
         Returns:
@@ -395,7 +395,7 @@ def _load_parameters(path: Path, model: BaseAlgorithm) -> None:
 
 
 def _compute_equal_weights(costs: Array) -> Array:
-    """Compute weights (k,) that make scenarios' mean costs (k,) equal: none outweighs others."""
+    """Compute weights (k,) by 1 over scenarios' mean costs (k,), or over 5 % of their mean."""
     return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
 
 

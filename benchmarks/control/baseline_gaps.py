@@ -61,7 +61,7 @@ def make_score_scales(
 
     Args:
         results: Episodes of the entries.
-        tasks: Tasks.
+        tasks: Tasks to make scales for.
 
     Returns:
         Scales by task.
@@ -260,7 +260,7 @@ def measure_delay_cost(
     """Drive every contestant at each of DELAYS, all on the same seeds.
 
     Args:
-        seeds: Seeds.
+        seeds: Seeds of the episodes, the same for each delay.
         jobs: Processes, None for all processors.
         console: Where progress is shown.
         keep: Folder in which finished cases stay.

@@ -83,7 +83,7 @@ def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     """Derive the seeds of a task's calibration; more of them begin with the same ones.
 
     Args:
-        task: Task.
+        task: Task whose `seed_text` enters the seeds.
         count: Number of seeds.
 
     Returns:
@@ -143,7 +143,7 @@ def calibrate(
     """Calibrate each task; a stopped run goes on from the folder of finished cases.
 
     Args:
-        tasks: Tasks.
+        tasks: Tasks to calibrate.
         folder: Folder of finished cases.
         seeds: Seeds of a task.
         command: Command line, for the records.
@@ -176,7 +176,7 @@ def make_cases(tasks: Sequence[ControlTask], folder: Path, seeds: int) -> list[C
     """Make the case of every episode, task by task.
 
     Args:
-        tasks: Tasks.
+        tasks: Tasks to calibrate.
         folder: Folder of finished cases.
         seeds: Seeds of a task.
 

@@ -110,7 +110,7 @@ def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
     """Select `_QUICK_TASKS` of each tier, from its first to its last.
 
     Args:
-        tasks: Tasks.
+        tasks: Tasks of all tiers, a tier's together.
 
     Returns:
         Selected tasks.
@@ -203,7 +203,7 @@ def make_entries(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[
     All estimators drive in the tasks with the first of their tier's ids.
 
     Args:
-        tasks: Tasks.
+        tasks: Tasks that are driven.
         quick: Whether slow contestants are left out.
 
     Yields:
@@ -262,7 +262,7 @@ def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
     """Make options of `EstimateObservation`; a policy gets the estimate it was trained on.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller.
 
     Returns:
         Options by name.
@@ -295,7 +295,7 @@ class CheckedAgent:
     """A user's agent, whose `predict` is to return actions and a state; NaN is the env's to judge.
 
     Args:
-        agent: The agent.
+        agent: Agent with `predict` as stable-baselines3 has it.
         rows: Number of cars.
         width: Length of an action.
 
@@ -340,7 +340,7 @@ def make_cars(entry: ControlEntry, cars: int) -> tuple[CarVectorEnv, Any]:
     """Make the vector env with the entry's estimator, and its agent, both tuned.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller.
         cars: Number of rows.
 
     Returns:
@@ -366,7 +366,7 @@ def make_agent_options(entry: ControlEntry) -> dict[str, Any]:
     """Make the options of `make_agent` for an entry.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller.
 
     Returns:
         Options by name.
@@ -400,7 +400,7 @@ def measure_decision_time(entry: ControlEntry) -> float:
     Medians over _STEPS steps of an episode, the bare env stepped side by side.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller.
 
     Returns:
         Wall time (us).

@@ -1,8 +1,8 @@
 """The verdict of the control benchmark, and its figures, tracks and side-by-side views.
 
 `_Gains` are log(J_nominal / J) of an entry's episodes, shape (n,), by task (r in `score`);
-`foresight` everywhere is log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,)
-each.
+`foresight` everywhere is the log of oracle-state's cost over clairvoyant's in each calibrated task,
+shape (n,).
 """
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
@@ -56,11 +56,11 @@ def compose_verdict(
 
     Args:
         by_tier: Entries by tier, the best first.
-        prices: Cost of delay.
-        foresight: log(J_oracle-state / J_clairvoyant) by task, None without a calibration.
+        prices: Relative costs of entries at each delay of camera and GPS.
+        foresight: Log of oracle-state's cost over clairvoyant's by task, None without calibration.
 
     Returns:
-        Verdict.
+        Text of the verdict, a statement a line.
     """
     filters, controllers = _group_estimators(by_tier), _group_controllers(by_tier)
     complete, none = select_complete(controllers), controllers.get("none", {})
@@ -89,14 +89,14 @@ def _compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict
 
 
 def is_default_filter(controller: str, estimator: str) -> bool:
-    """Whether a controller is compared on it: the reference, none, or its own filter.
+    """Whether an estimator is a controller's default: none, the reference or its own filter.
 
     Args:
         controller: Name of the controller.
         estimator: Name of the estimator.
 
     Returns:
-        Whether it is.
+        Whether controllers are compared on this pair.
     """
     follows = ADAPTIVE.get(estimator) == controller
     return estimator in ("", REFERENCE_FILTER) or follows or (estimator, controller) in _POLICIES
@@ -127,7 +127,7 @@ def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _G
 
 
 def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
-    """Collect the `_Gains` of each controller on its own filter, the baselines left out."""
+    """Collect the `_Gains` of each controller on its default filters, the oracles left out."""
     return _collect_gains(by_tier, "controller", lambda entry: (
         entry.controller not in ORACLE_NAMES and is_default_filter(entry.controller,
                                                                    entry.estimator)))  # fmt: skip
@@ -151,14 +151,14 @@ def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
 
 
 def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate]]:
-    """Rank the cost ratios over rivals by name; the best, with fewest cheaper rivals, is first."""
+    """Rank entries by fewest cheaper rivals; each name has its cost ratios over rivals."""
     ratios = {
         name: {rival: _compute_cost_ratio(x, by_name[rival]) for rival in by_name if rival != name}
         for name, x in by_name.items()
     }
-    beaten = {name: sum(ratio.value > 1.0 for ratio in ratios[name].values()) for name in by_name}
+    losses = {name: sum(ratio.value > 1.0 for ratio in ratios[name].values()) for name in by_name}
     gained = {name: np.mean([r.mean() for r in gains.values()]) for name, gains in by_name.items()}
-    order = sorted(by_name, key=lambda name: (beaten[name], -gained[name]))
+    order = sorted(by_name, key=lambda name: (losses[name], -gained[name]))
     return {
         name: dict(sorted(
             ((other, ratio) for other, ratio in ratios[name].items() if np.isfinite(ratio.value)),
@@ -198,10 +198,10 @@ def _describe_reasons(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> str:
-    """Describe what the baselines save by their knowledge, and the cost of delay."""
+    """Describe what the oracles save by their knowledge, and the cost of delay."""
     all_standings = [standing for standings in by_tier.values() for standing in standings]
-    knowing = [item for item in all_standings if item.entry.controller == PARAMETERS]
-    parameter_pairs = [pair for item in knowing for pair in item.pairs.values()]
+    oracles = [item for item in all_standings if item.entry.controller == PARAMETERS]
+    parameter_pairs = [pair for item in oracles for pair in item.pairs.values()]
     steps = (
         ("the true car and road", [r for r, _ in parameter_pairs]),
         ("its exact motion", [oracle_gain - r for r, oracle_gain in parameter_pairs]),
@@ -242,11 +242,11 @@ def add_figures(
     """Add the figures to a suite that has its verdict; without plotly only the tracks.
 
     Args:
-        suite: Suite, to which they are added.
+        suite: Suite, to which the figures are added.
         by_tier: Entries by tier, the best first.
         results: Episodes by entry.
-        prices: Cost of delay.
-        foresight: log(J_oracle-state / J_clairvoyant) by task.
+        prices: Relative costs of entries at each delay of camera and GPS.
+        foresight: Log of oracle-state's cost over clairvoyant's by task.
     """
     outcomes = results.outcomes.items()
     series = {entry: drive.series for entry, drive in outcomes if drive.series is not None}
@@ -308,7 +308,7 @@ def _controller(entry: ControlEntry) -> str:
 def _group_oracles(
     by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    """Group the baselines' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
+    """Group the oracles' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
     names = ORACLE_NAMES
     groups = _group_costs(by_tier, lambda x: x.controller if x.controller in names else "")
     for tier in by_tier:
@@ -412,11 +412,11 @@ def run_entry(entry: ControlEntry, seed: int) -> Rollout:
     """Run one episode of an entry in a single env.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller with their options.
         seed: Seed of the episode.
 
     Returns:
-        Episode.
+        Rollout of the episode.
     """
     return rollout(*make_env_and_agent(entry), seed)
 
@@ -425,10 +425,10 @@ def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
     """Make a single env with its filter, and the agent that drives it.
 
     Args:
-        entry: Entry.
+        entry: Task, estimator and controller with their options.
 
     Returns:
-        Env and agent.
+        Env of one car, and the agent that drives it.
     """
     estimate = make_estimate_options(entry) if entry.estimator else None
     name = get_filter_name(entry.estimator)

@@ -163,7 +163,7 @@ def get_control_period(entry: ControlEntry) -> float:
     """Return the time between two decisions of an entry.
 
     Args:
-        entry: Entry.
+        entry: Entry whose options may name the period.
 
     Returns:
         Period (s).
@@ -186,7 +186,7 @@ class Results:
         """Return one entry's episodes.
 
         Args:
-            task: Task.
+            task: Task that was driven.
             controller: Name of the controller.
             estimator: Name of the estimator.
 

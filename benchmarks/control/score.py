@@ -311,7 +311,7 @@ def make_spec(entry: ControlEntry) -> str:
     """Make the JSON of the env from which `gym.make` builds it again.
 
     Args:
-        entry: Entry.
+        entry: Entry whose task and options make the env.
 
     Returns:
         JSON.

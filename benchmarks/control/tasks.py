@@ -93,7 +93,7 @@ def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any
     and filters know nothing.
 
     Args:
-        task: Task.
+        task: Task whose scenario is varied.
         change: Fields of `Scenario`.
 
     Returns:
@@ -210,11 +210,11 @@ def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
 
 
 def find_oracle(task: ControlTask, name: str = STATE) -> str:
-    """Find the better of the candidates for a baseline in a task; LQR where none was measured.
+    """Find the better of the candidates for an oracle in a task; LQR where none was measured.
 
     Args:
-        task: Task.
-        name: Name of the baseline, in `ORACLES`.
+        task: Task of the candidates.
+        name: Name of the oracle, in `ORACLES`.
 
     Returns:
         Name of the candidate.

@@ -1,7 +1,7 @@
 """Independent cases side by side, in processes or on a Ray cluster, with a progress bar.
 
-Every engine and every number of workers give the same results. A user's error is one line; every
-other error keeps its traceback.
+Every engine and every number of workers give the same results. Of a user's error only the
+message is shown; every other error keeps its traceback.
 """
 
 import io
@@ -42,7 +42,7 @@ def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
 
     Args:
         name: Name, `PROCESSES` or "ray".
-        address: Existing Ray cluster, "host:port", "" for this machine's; it has this version.
+        address: Existing Ray cluster, "host:port", "" for this machine's; it must run this version.
 
     Raises:
         ValueError: The name is unknown, an address without Ray, or there is no such cluster.
@@ -76,12 +76,15 @@ def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
 def execute_cases(
     function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """Execute cases, and yield the index and result of each when it is done.
+    """Execute cases in processes or on the cluster, and yield each one's index and result.
 
     Args:
         function: Function of a case, importable by workers.
-        cases: Cases.
+        cases: Arguments of the function, one for each call.
         jobs: Number of processes, None for one a processor at most; a cluster has its own.
+
+    Yields:
+        Index and result of a case: processes in order of the cases, a cluster in order of ends.
     """
     ray = _CLUSTER.get()
     if ray is None:
@@ -106,14 +109,14 @@ _EVERY = 15.0  # s between two lines
 
 
 def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
-    """Split the seeds 0 .. seeds-1 into consecutive ones.
+    """Split the seeds 0 .. seeds-1 into runs of consecutive seeds.
 
     Args:
         seeds: Number of seeds.
-        size: Maximum of seeds in a part.
+        size: Maximum of seeds in a run.
 
     Returns:
-        Parts.
+        Seeds of each run.
     """
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
@@ -216,7 +219,7 @@ def run_cases(
 
     Args:
         function: Function of a case, importable by workers.
-        cases: Cases.
+        cases: Arguments of the function, one for each call.
         title: Title of the progress bar.
         jobs: Number of processes, None for one a processor, 1 for this process.
         console: Console of the progress bar outside of `use_shared_bar`; None: nothing is shown.
@@ -247,7 +250,7 @@ _MAX_LETTERS = 1000  # of a message
 def report_user_errors() -> Iterator[None]:
     """End the process with exit status 2 and the message of a user's error."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a result is not lost for a letter
+        if isinstance(stream, io.TextIOWrapper):  # unencodable characters do not raise
             stream.reconfigure(errors="backslashreplace")
     try:
         yield

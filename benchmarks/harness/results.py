@@ -176,7 +176,7 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
     Args:
         path: File.
-        rows: Rows.
+        rows: Rows of a run's suites.
     """
     plain = [
         {
@@ -233,7 +233,7 @@ def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
     Args:
         path: File.
-        rows: Rows.
+        rows: Rows of a run's suites.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -100,7 +100,7 @@ def format_percent(ratio: Estimate) -> str:
     """Format a ratio in percent with its interval, if it has one.
 
     Args:
-        ratio: Ratio.
+        ratio: Ratio and bounds of its interval.
 
     Returns:
         Text.
@@ -116,7 +116,7 @@ def summarise_names(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
     """Join names for a sentence; of many the later ones are counted.
 
     Args:
-        names: Names.
+        names: Names in the order of the sentence.
         limit: Number of names up to which none is counted.
 
     Returns:

@@ -165,7 +165,7 @@ def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
     """Measure every part of a claim; ValueError for a part without numbers.
 
     Args:
-        claim: Claim.
+        claim: Claim of a paper with its parts.
         results: Results of all simulations that its parts name.
 
     Returns:

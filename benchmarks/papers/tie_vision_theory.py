@@ -2,9 +2,9 @@
 
 The appendix is checked term by term on random time-varying systems with random gains, as printed
 and as docs/PAPERS.md corrects it. The one-step lines of cases 1 and 2 are no equations between
-vectors as printed (K times w, H u times w) and cannot be checked. The gain that (16), (21) use
-between samples is left open: tried are the Kalman gain of (13) at 1 ms, every row corrected at
-every step, and the shipped filter's, which spreads the multirate filter's gain over the frame.
+vectors as printed (K times w, H u times w) and cannot be checked. The paper leaves open which
+gain (16) and (21) use between samples. Two are tried: the Kalman gain of (13) at 1 ms, with every
+row corrected at every step, and the shipped filter's, the multirate gain spread over the frame.
 """
 
 import math
@@ -109,8 +109,8 @@ def _check_compensated(d: _RandomSystem) -> dict[str, float]:
     for i in range(1, n + 1):  # v stands for any pseudo-residual: the first form is an identity
         e = d.G[i - 1] @ e + d.w[i - 1] - d.K[i] @ d.v[i]
     sums = {}
-    for label, held in (("case 3 (a)", False), ("case 3 (a), printed", True)):
-        G = [d.G[1] if held else g for g in d.G]
+    for label, is_printed in (("case 3 (a)", False), ("case 3 (a), printed", True)):
+        G = [d.G[1] if is_printed else g for g in d.G]
         closed = _compute_product(d.G[:n]) @ d.e
         for p in range(n):
             closed = closed + _compute_product(G[p + 1 : n]) @ d.w[p]
@@ -122,17 +122,17 @@ def _check_compensated(d: _RandomSystem) -> dict[str, float]:
     for i in range(1, n + 1):
         e = M[i] @ d.G[i - 1] @ e + d.w[i - 1]  # with the exact residual C G e
     start = _compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
-    for label, factor in (("case 3 (b)", False), ("case 3 (b), printed", True)):
+    for label, is_printed in (("case 3 (b)", False), ("case 3 (b), printed", True)):
         closed = start
         for p in range(n):
             after = _compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
-            closed = closed + after @ (M[p + 1] @ d.w[p] if factor else d.w[p])
+            closed = closed + after @ (M[p + 1] @ d.w[p] if is_printed else d.w[p])
         sums[label] = _compute_residual(closed, e)
     return sums
 
 
 def _compute_residuals(seed: int) -> tuple[Numbers, None]:
-    """Compute every formula's residual on each seed's system."""
+    """Compute every formula's residual on the random system of a seed."""
     d = _draw_system(seed)
     by_case = _check_ideal(d) | _check_predicted(d) | _check_compensated(d)
     return {(label, "residual"): value for label, value in by_case.items()}, None
@@ -184,7 +184,7 @@ def _compute_spectral_radius(K: Array) -> float:
 def _measure_tunings(seed: int) -> tuple[Numbers, None]:
     """Measure the fraction of 20 random tunings with which the error grows.
 
-    Process noise of each state log-uniform over eight decades up to 1 (unit)^2/s.
+    The process noise of each state is log-uniform over eight decades up to 1 (unit)^2/s.
     """
     tunings = 10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, (20, 4))
     radii = {
@@ -208,8 +208,8 @@ def _compute_shipped_radius(Q: Array) -> float:
 def _measure_maps(seed: int) -> tuple[Numbers, Example]:
     """Compare the error dynamics with pseudo-residuals to those of a fast camera.
 
-    The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
-    example has the size of the maps of the appendix's three cases.
+    In the vision model at 1 ms every row is slow. The seed draws the process noise of the Kalman
+    gain. The example has the size of the maps of the appendix's three cases.
     """
     model = make_vision_model(COMS, SPEED)
     G, _ = model.discretise(1e-3)
@@ -278,6 +278,7 @@ if TYPE_CHECKING:
     Loop: TypeAlias = StateSpace | TransferFunction
 
 
+# Gain margins: how much the loops of the paper's Table II may grow until they reach -1.
 _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
 
 
@@ -333,7 +334,7 @@ def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
 
 
 def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-    """Compute the loop at the points z, (n,); python-control takes a state space point by point."""
+    """Compute a loop's response at points z, (n,); one solve takes all points of a state space."""
     if not hasattr(loop, "A"):
         return np.asarray(loop(z))
     shifted = z[:, None, None] * np.eye(len(loop.A)) - loop.A

@@ -1,1 +1,1 @@
-"""Recorded drives: estimators on a log, scored where it knows the truth, and the car behind it."""
+"""Recorded drives: estimators scored where a log has the truth, and fits of the car that drove."""

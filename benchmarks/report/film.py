@@ -64,7 +64,7 @@ def write_drive_film(
         driver: Agent and env of the drive.
         beside: Name of the ghost's agent, None for none.
         seed: Seed of the episode.
-        console: The screen.
+        console: Console to print to.
 
     Raises:
         ValueError: There is a ghost without a film, or as `write_film` and `make_agent`.

@@ -120,7 +120,7 @@ def inline(text: str) -> str:
     """Escape a text; what stands in backticks becomes code.
 
     Args:
-        text: Text.
+        text: Text with code in backticks.
 
     Returns:
         HTML.

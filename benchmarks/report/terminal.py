@@ -18,11 +18,11 @@ _FEW, _ROWS = 2, 20  # suites of a run whose tables are printed, and the rows of
 
 
 def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None:
-    """Print a run in about 60 lines: verdicts, a table each, and where the rest is.
+    """Print a run in about 60 lines: verdicts, up to two tables, and where the rest is.
 
     Args:
-        console: The screen.
-        suites: Results; of many one line of each verdict alone.
+        console: Console to print to.
+        suites: Results; of more than two only one line of each verdict is printed.
         reported: Whether a report has the rest.
     """
     is_short = len(suites) <= _FEW
@@ -33,7 +33,7 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
             lines = lines[1:2] or lines  # a verdict's second line is the answer
         console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
         shown = [table for table in suite.tables if not table.detail]
-        for table in shown[: int(is_short)]:
+        for table in shown[: int(is_short)]:  # the first table of a short run, else none
             max_rows = _ROWS // len(suites)
             left = len(table.cells) - max_rows
             cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
@@ -53,10 +53,10 @@ def _print_title(console: Console, suite: Suite) -> None:
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """Print title, verdict, text, and each table with its note, but for details.
+    """Print title, verdict, text, and each table with its note, without tables of details.
 
     Args:
-        console: The screen.
+        console: Console to print to.
         suite: Results.
     """
     _print_title(console, suite)
@@ -100,7 +100,7 @@ def _split_table(table: ResultTable, width: int) -> list[ResultTable]:
 
 
 def _choose_width(width: int) -> int:
-    """Choose the maximum of letters in the first column, on a screen of so many."""
+    """Choose the maximum of letters in the first column by the width of the screen (letters)."""
     return _NAME if width >= _NARROW else _MIN_WIDTH
 
 

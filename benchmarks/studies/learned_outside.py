@@ -45,23 +45,23 @@ OUTSIDE_ID = "sideslip/Outside-v0"
 KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
 """Classes whose car is about as large and as fast as the BMW."""
 MANOEUVRE = "any-friction-sine-with-dwell"
-"""The scenario of every class after which a car heads as before, along a straight road."""
+"""The scenario of every class that ends with the initial heading, as a straight road needs."""
 _RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
-"""Over whose costs everybody's are: where there is no gap, there is no share."""
+"""Controllers by whose costs all costs are divided: no gap between oracles scales scores here."""
 _TEXT = (
     "The passenger car's policies on CommonRoad's single-track, drift and multi-body models of a "
     "BMW 320i, beside controllers on the same late sensors that are designed for it. No training "
     "met it."
 )
-_NONE = " Left out: pip install 'sideslip[outside]'."
+_NOT_INSTALLED = " Left out: pip install 'sideslip[outside]'."
 
 
 @dataclass(frozen=True)
 class _OutsideTask(ControlTask):
-    """A class's task with a model of `OutsideEnv` on a straight road; like: id of the actuators."""
+    """A class's task with a model of `OutsideEnv` on a straight road."""
 
-    model: str = "drift"
-    like: str = STEERING
+    model: str = "drift"  # name of the outside plant
+    like: str = STEERING  # env id whose actuators the car has
 
     @property
     def kind(self) -> str:
@@ -70,7 +70,7 @@ class _OutsideTask(ControlTask):
 
     @property
     def seed_text(self) -> str:
-        """JSON of the seeds: a task's, with the model and the id whose actuators it has."""
+        """JSON from which the seeds are drawn: that of a task, with `model` and `like`."""
         return json.dumps(json.loads(super().seed_text) | {"model": self.model, "like": self.like})
 
     @property
@@ -131,7 +131,7 @@ def run(
     Args:
         episodes: Episodes of each model.
         jobs: Processes, None for all processors.
-        console: Where progress is shown.
+        console: Console of the progress bar, None for none.
         keep: Folder in which finished cases stay.
         quick: Whether to run the drift model alone.
         salt: Salt of the seeds, "" for `make_salt`'s.
@@ -144,7 +144,7 @@ def run(
     """
     suite = Suite(_NAME, "Learned policies in cars that are not ours", _TEXT)
     if find_spec("vehiclemodels") is None:
-        suite.text += _NONE
+        suite.text += _NOT_INSTALLED
         return suite
     models = ["drift"] if quick else list(OUTSIDE_PLANTS)
     entries = [
@@ -182,7 +182,7 @@ def _compose_verdict(transfers: Sequence[TransferResult]) -> str:
             costs = ", ".join(f"{ratio} % of {rival}'s" for rival, ratio in ratios.items())
             fails = 100.0 * share(transfer.select("failure", policy) != 0.0).value
             lines.append(f"{policy} costs {costs}; {fails:.0f} % fail.")
-    return format_verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
+    return format_verdict("On CommonRoad's BMW, known to all but the policies:", *lines)
 
 
 def _format_cost_ratio(

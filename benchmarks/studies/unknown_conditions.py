@@ -292,7 +292,7 @@ def measure_all(
     """Measure every condition on the same seeds.
 
     Args:
-        conditions: Conditions.
+        conditions: Conditions to measure.
         seeds: Number of seeds.
         title: Title of the progress bar.
         jobs: Processes, None for all processors.

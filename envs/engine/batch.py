@@ -54,7 +54,7 @@ class RecordArrays(NamedTuple):
 
 
 class _LaneBuffers(NamedTuple):
-    """Working arrays of a batch step; the last axis of a block's arrays is the lanes'."""
+    """Working arrays of a batch step. A block is the rows in the lanes, its arrays' last axis."""
 
     order: npt.NDArray[np.int64]  # (N,), all rows, those of one variant next to each other
     members: npt.NDArray[np.int64]  # (lanes,), the rows in the lanes now
@@ -77,7 +77,7 @@ def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
         entries: Entries of an observation.
 
     Returns:
-        The arrays.
+        Buffers, whose `order` is 0 .. count - 1.
     """
     return _LaneBuffers(
         np.arange(count), np.zeros(LANES, np.int64), np.zeros((PARAMS_WIDTH, LANES)),
@@ -162,8 +162,8 @@ def step_rows(
 ) -> int:  # fmt: skip
     """Step every row by one env-step, and count the episodes that ended.
 
-    Rows whose episode is `over` stand still with reward 0; then `over` is set for those that ended
-    in this step.
+    Rows whose episode is `over` stand still with reward 0. Afterwards `over` is true only for rows
+    that ended in this step: for those that stood still it is cleared before any reset.
 
     Args:
         batch: Arrays of the rows.
@@ -173,15 +173,15 @@ def step_rows(
         buffers: Working arrays.
 
     Returns:
-        The count, with WILD added for an action beyond its limit; REFUSED, and nothing is stepped,
-        where an action that does not fail its row is not finite.
+        The count, with WILD added for an action beyond its limit. REFUSED, with nothing stepped, if
+        an action is not finite in a row whose switch `fail_bad` is off.
     """
     n_ended, over = 0, batch.over
     rewards, terminated, truncated = results
     for i in range(len(over)):
         if batch.switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
-                if float(share) - float(share) != 0.0:
+                if float(share) - float(share) != 0.0:  # not finite
                     return REFUSED
         if not over[i]:
             n_ended |= check_action_range(actions[i])
@@ -227,7 +227,7 @@ def read_ends(report: Vector) -> tuple[float, bool, bool]:
     """Read how a step ended from its report.
 
     Args:
-        report: The report, shape (len(StepReport),).
+        report: Report of the step, shape (len(StepReport),).
 
     Returns:
         (reward, terminated, truncated).
@@ -263,10 +263,10 @@ def reset_rows(
     """Reset rows, whose records are first copied.
 
     Args:
-        chosen: The rows, shape (M,).
-        start_index: Index of each one's start, shape (M,).
-        starts: The starts.
-        keys: Key of each one, two words of 32 bits, shape (M, 2).
+        chosen: Indices of the rows, shape (M,).
+        start_index: Index in `starts` of each row's start, shape (M,).
+        starts: Packed starts of episodes, the first axis of each array.
+        keys: Key of each row's episode, two words of 32 bits, shape (M, 2).
         bounds: Bounds of the observation, shape (2, k).
         batch: Arrays of all rows.
         final: Records of all rows, into which those of the chosen are copied.

@@ -118,7 +118,7 @@ def make_measurement_context(
         motion: Motion of the car.
         small_angle: 1 for the small-angle plant.
         key: Lower and upper 32 bits of the episode's key.
-        tick: The tick.
+        tick: Tick of the measurement.
 
     Returns:
         The inputs.
@@ -137,7 +137,7 @@ def sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count:
     Args:
         row: Arrays of the episode.
         motion: Motion of the car.
-        tick: The tick.
+        tick: Tick of the samples.
         count: Number of packets of the step that were delivered before.
 
     Returns:
@@ -184,7 +184,7 @@ def observe_fast(
         refs: (beta_ref, gamma_ref) (rad, rad/s).
         bounds: Bounds of the observation, shape (2, k).
         switches: `Switches` of the episode.
-        obs: The observation.
+        obs: Output for the observation, shape (k,).
 
     Returns:
         Number of first entries.

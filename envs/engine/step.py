@@ -381,7 +381,7 @@ def step_workspace(workspace: Vector, action: Vector) -> int:
     """Step the vehicle of a workspace.
 
     Args:
-        workspace: The workspace.
+        workspace: Arrays of an episode in one vector, as `split_workspace` reads it.
         action: Fractions of full scale, shape (1,) or (2,).
 
     Returns:

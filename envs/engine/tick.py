@@ -133,7 +133,7 @@ def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) ->
 
     Args:
         car: Parameters of the car.
-        change: The change.
+        change: Factors on the stiffnesses, and the tick of the change.
         is_changed: Whether they are changed.
 
     Returns:
@@ -193,7 +193,7 @@ def compute_motor_torques(
 
     Args:
         N_z: Commanded yaw moment (N m).
-        tick: The tick.
+        tick: Tick of the commands.
         v_x: Speed (m/s).
         integral: Integral part of the driver's acceleration command (m/s2).
         profile: The driver's speed profile.

@@ -107,7 +107,7 @@ def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
 
     Args:
         p: Packed parameters.
-        tick: The tick.
+        tick: Tick of the angle.
 
     Returns:
         The angle (rad).
@@ -125,7 +125,7 @@ def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
         p: Packed parameters.
         z: Packed state.
         n: Number of ticks.
-        window: The window.
+        window: Window of the step, whose row `steer` is written.
     """
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
@@ -151,7 +151,7 @@ def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vec
         z: Packed state.
         n: Number of ticks.
         has_driver: Whether a driver reacts to the car, so that no profile steers.
-        window: The window.
+        window: Window of the step, which is written.
     """
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
@@ -196,7 +196,7 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
     """Read the random numbers of a tick.
 
     Args:
-        window: The window.
+        window: Window of the step.
         j: Number of the tick in the step.
 
     Returns:

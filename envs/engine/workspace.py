@@ -56,7 +56,7 @@ def split_workspace(workspace: Vector) -> tuple[EpisodeArrays, Matrix, Matrix]:
     """Split a workspace into its parts.
 
     Args:
-        workspace: The workspace.
+        workspace: Vector of `_make_workspace`.
 
     Returns:
         The episode's arrays, bounds of the observation, window.

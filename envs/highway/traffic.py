@@ -136,12 +136,12 @@ def locate_on_lane(lane: AbstractLane, X: float, Y: float, psi: float) -> LanePo
 
     Args:
         lane: Lane of highway-env.
-        X: Place on the ground in our axes (m).
-        Y: Place on the ground in our axes (m).
+        X: Coordinate along our first axis, which is highway-env's x (m).
+        Y: Coordinate to the left (m); highway-env's y is -Y, to the right.
         psi: Heading in our axes (rad), to whose turn the lane's direction is unwrapped.
 
     Returns:
-        The position.
+        Position of the point on the lane.
     """
     point = np.array([X, -Y])
     longitudinal, right = lane.local_coordinates(point)
@@ -179,14 +179,15 @@ _SHORTEST = 0.8  # s, in which no driver changes lanes faster
 class Hazard:
     """The vehicle ahead that brakes, and the driver who swerves around it late.
 
-    Each field is a range that the seed draws from; another value raises ValueError.
+    Each field is a number, or a range (low, high) that the seed draws from, of numbers from 0 on.
+    Other values raise ValueError.
 
     Attributes:
         headway: Time between the bumpers at equal speed (s).
         onset: Time at which the vehicle brakes (s).
         braking: Fraction of the road's grip that it brakes with.
         reaction: Time after which our driver swerves (s).
-        haste: Time of the lane change over the time that is left until the cars would meet.
+        haste: Time of the lane change over the time until the cars would meet: large is slow.
         stay: Time in the free lane, behind the standing vehicle, before the driver returns (s).
     """
 
@@ -213,7 +214,7 @@ def parse_hazard(source: Mapping[str, Range] | None) -> Hazard | None:
         source: Values by the names of `Hazard`'s fields, {} for the usual ones; None for no hazard.
 
     Returns:
-        The hazard, or None.
+        Hazard with these values, or None.
 
     Raises:
         TypeError: For an unknown field.
@@ -301,7 +302,7 @@ class Traffic:
         road: Name of the road, of `ROADS`.
         start: Drawn start of the episode.
         hazard: The vehicle that brakes; None for none.
-        others: Number of vehicles beside the braking one.
+        others: Number of vehicles besides the braking one.
         key: Key of the episode, from which all that is random is drawn.
     """
 
@@ -362,7 +363,7 @@ class Traffic:
         """Step the road by `PERIOD` ticks.
 
         Args:
-            motion: Our car's at the end.
+            motion: `Motion` of our car at the end of these ticks.
         """
         self.ego.set_motion(motion)
         self.road.act()
@@ -383,10 +384,10 @@ class Traffic:
         """Locate our car on the lanes that it follows.
 
         Args:
-            motion: Our car's.
+            motion: `Motion` of our car.
 
         Returns:
-            Its position.
+            Position on the present lane of its route.
         """
         while True:
             lane = self.course.route[self._lane]

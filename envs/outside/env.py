@@ -101,7 +101,7 @@ _select_failure = as_python(select_failure)
 
 
 class PlantEnv(StabilityEnv):
-    """`StabilityEnv` whose true motion is that of `plant`, in a Python loop."""
+    """`StabilityEnv` moved by `plant`, which subclasses set, and start at reset; a Python loop."""
 
     _has_tyre_forces = False
     plant: PlantProtocol
@@ -134,7 +134,7 @@ class PlantEnv(StabilityEnv):
             draws = read_draws(self._window, done)
             inputs = _compute_inputs(params, N_z, added, state, tick, draws)
             applied = inputs.applied
-            # a quotient, not the product of `command`: its last bit is that of all drives so far
+            # not the product of `compute_inputs`: all drives so far have a quotient's rounding
             applied = applied._replace(effort=applied.moment / task.yaw_scale)
             forces = (applied.steer, applied.T_l, applied.T_r, *inputs.disturbance)
             plant.step(OutsideInputs(*forces), TICK)
@@ -173,8 +173,8 @@ class OutsideEnv(PlantEnv):
     There is no argument `vehicle`: the true one is the model's. The scenario's friction is the
     tyre's peak lateral friction, that of `vehicle`; on the single track, whose tyres are linear, it
     has no effect, and there is no reset option "friction". One tyre serves both axles, so its
-    stiffness is scaled by the mean of the scenario's two factors. Motors and steering act for a
-    tick with their mean in the record. The multi-body model always rolls, the others never do.
+    stiffness is scaled by the mean of the scenario's two factors. In every tick motors and steering
+    act with their mean of the tick, as in the record. Only the multi-body model rolls, always.
 
     Args:
         model: "single-track", "drift" or "multi-body".
@@ -185,10 +185,10 @@ class OutsideEnv(PlantEnv):
 
     Raises:
         TypeError: For the argument vehicle.
-        ValueError: For an unknown model, and for a scenario with a road or a plant that it has not
-            (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
-            tyre_change_time; wind_height but for the multi-body model), or that has the multi-body
-            model below 1 m/s or without roll.
+        ValueError: For an unknown model, and for a scenario with a road or a plant that it lacks:
+            curvature, bank, grade, small_angle, tyres, vehicle, friction_right, tyre_change_time.
+            For wind_height on other models than multi-body, and for that model below 1 m/s or
+            without roll.
     """
 
     plant: OutsidePlant

@@ -56,7 +56,7 @@ class Canvas:
         """Draw a filled box with round corners.
 
         Args:
-            box: The box.
+            box: Left, top, width and height (px).
             colour: Its colour.
             radius: Radius of the corners (px).
         """
@@ -158,7 +158,7 @@ class Canvas:
 
         Args:
             place: The place (px), shape (2,).
-            words: The words.
+            words: Text in one line.
             colour: Their colour.
             size: Size of the font (px).
             align: 0 begins at the place, 1 ends there.
@@ -184,7 +184,7 @@ def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     """Read the pixels of a picture.
 
     Args:
-        picture: The picture.
+        picture: Picture as a surface of pygame.
 
     Returns:
         Red, green and blue, shape (height, width, 3).
@@ -228,7 +228,7 @@ def show_picture(picture: pygame.Surface, rate: float) -> None:
     """Show a picture in the window, no sooner than 1 / rate seconds after the last one.
 
     Args:
-        picture: The picture.
+        picture: Picture as a surface of pygame.
         rate: Pictures a second.
     """
     screen = pygame.display.get_surface() or _make_screen(picture.get_size())

@@ -75,7 +75,7 @@ def find_base(name: str) -> str | None:
     ('two-dof', 'dakf')
 
     Args:
-        name: The label.
+        name: Label of a curve or of a car.
 
     Returns:
         The name.
@@ -90,7 +90,7 @@ def find_colour(name: str) -> str:
     """Find the colour of a label; an unknown one always gets the same.
 
     Args:
-        name: The label.
+        name: Label of a curve or of a car.
 
     Returns:
         "#RRGGBB".

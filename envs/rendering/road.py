@@ -1,7 +1,8 @@
 """The scene of a car and its road from above: lane or cones, trail, the camera's field of view.
 
 A scene is read from the packed numbers of an episode (`engine.layout`). The road's direction at the
-car is drawn to the right, its left is up; the car has its true proportions.
+car is drawn to the right, its left is up. A body has the car's width, and 1.62 wheelbases of
+length; the wheels are drawn at its sides.
 """
 
 import math
@@ -50,7 +51,7 @@ _step_nominal_car = as_python(step_nominal_car)
 _compute_curvature = as_python(compute_curvature, ARRAYS)
 _compute_path_offset = as_python(compute_path_offset, ARRAYS)
 
-_DRAWN_LENGTH = 45  # m of the road that are drawn
+_KNOWN_LENGTH = 45  # m of road in a scene before the car, and behind it; fewer are drawn
 _DEFAULT_HALF_ANGLE = 0.35  # rad to either side, where the scenario's camera sees at any heading
 
 
@@ -87,7 +88,7 @@ class CarScene(NamedTuple):
     field_of_view: _CameraOverlay | None  # None without a camera
     lanes: tuple[Section, ...]  # between cones
     path: Array  # the driver's, rows (s, y) in m; (0, 2) where it is the road's centre line
-    curvatures: Array  # 1/m, the road's curvature at each of the next _DRAWN_LENGTH metres
+    curvatures: Array  # 1/m, the road's curvature at each of the next _KNOWN_LENGTH metres
     half_width: float  # m
     failure: int
 
@@ -99,7 +100,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         shot: State of the car.
 
     Returns:
-        The scene.
+        Scene of the car now.
     """
     p, z, switches, _, config, _, has_tyre_forces, _ = shot
     params, variant = _make_step_params(p), _make_step_variant(p, switches)
@@ -123,7 +124,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
         wheels.append(Wheel(*place, *forces))
     lanes = _find_lanes(params.path, config)
-    s = np.arange(motion.s - _DRAWN_LENGTH, motion.s + _DRAWN_LENGTH, 0.5) if lanes else np.empty(0)
+    s = np.arange(motion.s - _KNOWN_LENGTH, motion.s + _KNOWN_LENGTH, 0.5) if lanes else np.empty(0)
     return CarScene(
         motion,
         config.vehicle,
@@ -166,7 +167,7 @@ def _sample_curvatures(params: StepParams, z: Array, motion: Motion, road: int) 
         nominal_motion, driver = read(z, Z.nominal_motion), float(z[Z.driver])
         turn_rate, _ = _step_nominal_car(nominal_motion, driver, motion.v_x, params.nominal_car)
         nominal_curvature = turn_rate / max(motion.v_x, 1.0)
-    distances = motion.s + np.arange(float(_DRAWN_LENGTH))
+    distances = motion.s + np.arange(float(_KNOWN_LENGTH))
     curvatures: Array = nominal_curvature + _compute_curvature(params.road, distances)
     return curvatures
 
@@ -176,14 +177,14 @@ ASPHALT, GRASS, PAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#6B7177"
 _TYRE = "#23272B"
 _CAR_LENGTH, _SCALES = 96.0, (22.0, 30.0)  # pixels of a car; of a metre, at least and at most
 _LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
-_OVERHANG = 1.62  # length of a car in wheelbases
+_LENGTH_RATIO = 1.62  # length of every car's body over its wheelbase
 
 
 class CarTrack(NamedTuple):
     """A car to draw: its scene, its past, the colour of its body, and a name beside it."""
 
     scene: CarScene
-    truth: Array  # rows of `TracePoint`
+    truth: Array  # trace of the true motion, rows of `TracePoint`
     colour: str
     name: str = ""
 
@@ -213,8 +214,8 @@ class _CentreLine:
         s, y, theta = truth[:, TRACE_POINT.s], truth[:, TRACE_POINT.y], truth[:, TRACE_POINT.theta]
         X = truth[:, TRACE_POINT.X] + y * np.sin(theta)
         Y = truth[:, TRACE_POINT.Y] - y * np.cos(theta)
-        backward = np.arange(-float(_DRAWN_LENGTH), 0.0)
-        forward = np.arange(1.0, _DRAWN_LENGTH + 1.0)
+        backward = np.arange(-float(_KNOWN_LENGTH), 0.0)
+        forward = np.arange(1.0, _KNOWN_LENGTH + 1.0)
         directions = theta[-1] + np.cumsum(scene.curvatures)
         middle = directions - 0.5 * scene.curvatures
         preview_xy = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
@@ -303,9 +304,9 @@ class _RoadPicture(NamedTuple):
                     canvas.draw_disc(cone, 1.4, PAINT)
 
     def draw_names(self, cars: list[CarTrack], poses: list[Array]) -> None:
-        """Draw the cars' names, each as near as it covers no car and no other name.
+        """Draw each name as near to its car as it covers neither a car nor another name.
 
-        A ghost's name is on its side of the last car, whose name is on the other.
+        A ghost's name is on the ghost's side of the last car, whose name is on the other side.
         """
         box, taken = self.box, []  # taken: middle, half width and half height
         for car, (x, y) in zip(cars, poses, strict=True):
@@ -333,9 +334,9 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     """Draw the road around the last of the cars, in a box; the others are ghosts beside it.
 
     Args:
-        canvas: The canvas.
-        box: The box.
-        cars: The cars, at least one.
+        canvas: Canvas of the picture.
+        box: Part of the canvas that the road fills (px).
+        cars: Cars with their traces, at least one.
     """
     scene, truth, *_ = cars[-1]
     motion, road = scene.motion, _CentreLine(scene, truth)
@@ -391,12 +392,12 @@ def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
     """Compute the extent of a car's body from its centre of gravity.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle with the axles' places and the width.
 
     Returns:
         Front, rear (negative) and half width (m).
     """
-    over = 0.5 * (_OVERHANG - 1.0) * vehicle.wheelbase
+    over = 0.5 * (_LENGTH_RATIO - 1.0) * vehicle.wheelbase
     return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
 
 
@@ -429,7 +430,7 @@ def make_wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Ar
         x: Place ahead of the centre of gravity (m).
         y: Place to its left (m).
         angle: Steering angle (rad).
-        vehicle: The vehicle.
+        vehicle: Vehicle with the wheels' radius.
 
     Returns:
         Points in car axes (m), shape (4, 2).

@@ -1,9 +1,12 @@
 """The filter itself, compiled: fast rows and packets in, states out.
 
-Order of a tick: what was captured at the last tick is held, prediction from the last tick to this
-one with the inputs of this row, the fast sensors, then the packets that arrive. A filter at the
-slow sensor's rate listens every `pace` ticks, to the packets that came meanwhile; it holds its
-states in between (`stride`) or predicts them.
+Layers are the records of an estimator: one filter, the two of double-layer-gps, or the mixture and
+the members of a bank.
+
+A tick first holds what was captured at the last tick, and predicts from there with the inputs of
+this row. Then the fast sensors correct the state, and after them the packets that arrive. A
+filter at the slow sensor's rate listens every `pace` ticks, to the packets that came meanwhile. It
+holds its states in between (`stride`) or predicts them.
 """
 
 import numpy as np
@@ -208,7 +211,7 @@ def _process_packet_members(layers: FilterRecords, gains: GainTables, packet: Ve
 
 @jit
 def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: Matrix) -> None:
-    """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
+    """Write states and deviations of all layers, or of a bank's mixture, in row j of X and S."""
     column = 0
     for layer in range(len(layers) if _first_member(layers) == 0 else 1):
         f = layers[layer]
@@ -220,7 +223,7 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
 
 @jit
 def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
-    """Write the states of all layers and their covariance.
+    """Write the states of all layers, or of a bank's mixture, and their covariance.
 
     Args:
         layers: Memory of the estimator, shape (layers,).
@@ -300,7 +303,7 @@ def advance(
                 _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            if layers[0].burst[0] > 0.0:
+            if layers[0].burst[0] > 0.0:  # only members that interact have gusts
                 run_imm_step(layers)
             else:
                 replace_least_likely(layers)
@@ -328,7 +331,7 @@ def step_all(
     Returns:
         Number of rows done.
     """
-    empty = fast[:0]
+    empty = fast[:0]  # its length is a 0 that is no literal, which would compile `advance` again
     return advance(
         layers, gains, fast, len(fast), packets, count, len(empty), empty, empty, empty.reshape(0)
     )

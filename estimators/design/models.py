@@ -1,8 +1,8 @@
 """Which states a filter has, what drives them and what its sensors measure.
 
 A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
-States stand in the order of `_ORDER`, as many of them as the model has. The first ones follow the
-physical model ("dense"), the disturbances behind them decay by themselves.
+A bicycle's states stand in the order of `_ORDER`, as many of them as its sensors need. The first
+states of a model follow its physics ("dense"), the disturbances behind them decay by themselves.
 """
 
 import math
@@ -26,7 +26,7 @@ class MeasurementRow(NamedTuple):
     noise: str  # its standard deviation is the option `<noise>_noise`
     sd: float  # default of that option, in the unit of the value
     angle: bool = False  # the innovation is wrapped
-    over_speed: bool = False  # the default holds at `COURSE_SPEED` and grows as 1/V; no option does
+    over_speed: bool = False  # the default, of `COURSE_SPEED`, grows as 1/V; an option is unscaled
     ground: bool = False  # a direction over the ground, where psi is relative to the road
 
 
@@ -136,9 +136,9 @@ TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 WANDER = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
-"""States that are constants: what a fast sensor measures on top, the road's bank, which no
-accelerometer feels, the error of the accelerometer's scale, and the tyres: factors of stiffness,
-and the reciprocal of friction."""
+"""States that nothing drives but noise, and the fast sensor that each needs, if any: biases of fast
+sensors, the road's bank, the error of the accelerometer's scale. The tyres' states count as biases
+too: factors of stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
 _WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 _WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)
@@ -202,7 +202,7 @@ def make_bicycle_model(
     fast: tuple[str, ...],
     disturbances: str,
     late: bool,
-    body: bool = False,
+    rolls: bool = False,
     biases: tuple[str, ...] = (),
 ) -> FilterModel:
     """Make the bicycle model with the states that slow sensors need.
@@ -210,9 +210,9 @@ def make_bicycle_model(
     Args:
         sensors: Names of the slow sensors.
         fast: Names of the fast sensors.
-        disturbances: Name of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's.
+        disturbances: Name of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" d_3 of psi too.
         late: Whether the camera measures states that lag (tie-vision (12)-(13)).
-        body: Whether it rolls.
+        rolls: Whether the body rolls.
         biases: Names of `BIASES`.
 
     Returns:
@@ -223,5 +223,5 @@ def make_bicycle_model(
     late_states = tuple(LATE[state] for state in states if lags and state in LATE)
     walking = tuple(pair for pair in walks.get(disturbances, ()) if pair[1] in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
-    forces, states = disturbances == "forces", states + _BODY * body
+    forces, states = disturbances == "forces", states + _BODY * rolls
     return FilterModel(LATERAL, states, inputs, fast, walking, forces, late_states, biases)

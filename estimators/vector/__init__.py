@@ -1,4 +1,4 @@
-"""The same for vector environments: all rows' estimators in one compiled call."""
+"""Observations of vector environments: all rows' estimates in one compiled call, or the truth."""
 
 from .estimate import EstimateObservation as EstimateObservation
 from .truth import TruthObservation as TruthObservation

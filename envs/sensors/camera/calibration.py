@@ -21,7 +21,7 @@ from .pinhole import WORKING_WIDTH, Pinhole, resample
 _MIN_BOARDS = 3
 _MAX_PAIRS, _MIN_POINTS = 4000, 20  # pairs of points, and points
 _TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
-_NEAR = 0.004  # of the focal length, from a line
+_LINE_TOLERANCE = 0.004  # distance of a point from its line, of the focal length
 _SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
 _TILTS, _HEIGHTS = (-0.14, 0.45), (0.8, 3.0)  # rad, m
 NEAR, FAR, HEADING = 6.0, 30.0, 0.12  # m, m, rad: beyond a bonnet, where markings are wide enough
@@ -51,15 +51,15 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
         lane_width: Distance from marking to marking (m).
 
     Returns:
-        The camera with both.
+        The camera with this tilt and height.
 
     Raises:
-        ValueError: If two markings are not found, or tilt and height are no car's.
+        ValueError: If two markings are not found, or fit no straight lane from a car's height.
     """
     points, weight = _find_ridges(camera, picture)
     pair = _find_pair(points, weight)
     if pair is None:
-        raise ValueError("no lane: no pair of markings was found: pass tilt and height")
+        raise ValueError("no lane: no pair of markings was found; pass the camera tilt and height")
     (a, b), (c, d) = pair  # across = a + b down, left and right
     down = (a - c) / (d - b)
     tilt = atan(-down)
@@ -71,7 +71,7 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
     straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
     if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
         what = f"for a camera {height:.2f} m high and tilted by {tilt:.3f} rad"
-        raise ValueError(f"no lane: the best markings are no straight one's {what}: pass both")
+        raise ValueError(f"no lane: the best markings fit no straight lane {what}; pass both")
     return mounted_camera
 
 
@@ -105,7 +105,7 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
     is_marking &= np.abs(down[j] - down[i]) > 0.05
     b = b[is_marking, None]
     a = across[i[is_marking], None] - b * down[i[is_marking], None]
-    support = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
+    support = (np.abs(across - a - b * down) < _LINE_TOLERANCE * (1.0 + np.abs(b))) @ weight
     a, b = a[:, 0], b[:, 0]
     left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
     if not (len(left) and len(right)):
@@ -120,7 +120,7 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
     for k in (left[best_left], right[best_right]):
         start, slope = a[k], b[k]
         for _ in range(3):
-            near = np.abs(across - start - slope * down) < _NEAR * (1.0 + abs(slope))
+            near = np.abs(across - start - slope * down) < _LINE_TOLERANCE * (1.0 + abs(slope))
             slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
         lines.append(np.array([start, slope]))
     return lines[0], lines[1]
