@@ -165,7 +165,7 @@ def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
     """Measure every part of a claim; ValueError for a part without numbers.
 
     Args:
-        claim: Claim.
+        claim: Claim of a paper.
         results: Results of all simulations that its parts name.
 
     Returns:
@@ -404,7 +404,7 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
 
     Args:
         filters: Filters of a simulation.
-        base: Unwrapped env.
+        base: Env without wrappers, in an episode.
 
     Returns:
         Estimators by label.

@@ -88,8 +88,8 @@ def write_vehicle(path: Path, car: Vehicle, wires: SignalCalibration) -> None:
 
     Args:
         path: Path of the TOML or JSON file.
-        car: The vehicle.
-        wires: The calibration.
+        car: Vehicle to write.
+        wires: Calibration to write.
     """
     values = car.to_dict()
     for axle in ("front", "rear"):

@@ -210,7 +210,7 @@ def collect_results(results: Results, task: ControlTask, condition: str) -> dict
 
     Args:
         results: Episodes by entry.
-        task: Task.
+        task: Task whose drives are collected.
         condition: Name of the condition, for the message.
 
     Returns:
@@ -264,7 +264,7 @@ def add_tables(
     """Add a class's rows and tables.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         transfer: Episodes of the class.
         title: Beginning of the tables' titles.
         env_id: Id of the env.
@@ -307,7 +307,7 @@ def add_figures(suite: Suite, transfers: Sequence[TransferResult]) -> None:
     """Add figures of what each costs, and how often how much; nothing without plotly.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         transfers: Episodes of each class.
     """
     if (figures := import_figures()) is None:

@@ -170,7 +170,7 @@ def step_rows(
         actions: Fractions of full scale, float32 of shape (N, 1) or (N, 2).
         bounds: Bounds of the observation, shape (2, k).
         results: Rewards, terminated and truncated, shape (N,) each, which are written.
-        buffers: Working arrays.
+        buffers: Working arrays of the blocks.
 
     Returns:
         The count, with WILD added for an action beyond its limit; REFUSED, and nothing is stepped,
@@ -265,7 +265,7 @@ def reset_rows(
     Args:
         chosen: The rows, shape (M,).
         start_index: Index of each one's start, shape (M,).
-        starts: The starts.
+        starts: Starts of the rows' episodes.
         keys: Key of each one, two words of 32 bits, shape (M, 2).
         bounds: Bounds of the observation, shape (2, k).
         batch: Arrays of all rows.

@@ -62,7 +62,7 @@ def make_car(vehicle: Vehicle) -> CarParams:
     """Make the plant's parameters of a vehicle.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the episode.
 
     Returns:
         The parameters.
@@ -83,7 +83,7 @@ def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> T
 
     Args:
         vehicle: The true vehicle.
-        scenario: The scenario.
+        scenario: Scenario of the episode.
         yaw_first: Whether the yaw moment comes before acceleration.
 
     Returns:

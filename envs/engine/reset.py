@@ -84,7 +84,7 @@ def compute_first_row(
     Args:
         motion: Motion of the car.
         steer: Steering angle (rad).
-        road: The road.
+        road: Curve, bank and grade of the road, `RoadParams`.
         d_f: Front track (m).
         noise: Noise of the sensors.
         draws: Random numbers of the tick.

@@ -106,8 +106,8 @@ def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
     """Compute the steering angle of a profile, or of the trace behind `EpisodeParams`.
 
     Args:
-        p: Packed parameters.
-        tick: The tick.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
+        tick: Tick since reset.
 
     Returns:
         The angle (rad).
@@ -122,10 +122,10 @@ def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
     """Write the angles of a trace, or of a wandering driver, over those of the profile.
 
     Args:
-        p: Packed parameters.
-        z: Packed state.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
+        z: Packed state, shape (STATE_WIDTH,).
         n: Number of ticks.
-        window: The window.
+        window: Window of a step, shape (WINDOW_HEIGHT, columns).
     """
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
@@ -147,11 +147,11 @@ def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vec
     """Write noise and steering of one vehicle's next ticks.
 
     Args:
-        p: Packed parameters.
-        z: Packed state.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
+        z: Packed state, shape (STATE_WIDTH,).
         n: Number of ticks.
         has_driver: Whether a driver reacts to the car, so that no profile steers.
-        window: The window.
+        window: Window of a step, shape (WINDOW_HEIGHT, columns).
     """
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
@@ -196,7 +196,7 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
     """Read the random numbers of a tick.
 
     Args:
-        window: The window.
+        window: Window of a step, shape (WINDOW_HEIGHT, columns).
         j: Number of the tick in the step.
 
     Returns:

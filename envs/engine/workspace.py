@@ -56,7 +56,7 @@ def split_workspace(workspace: Vector) -> tuple[EpisodeArrays, Matrix, Matrix]:
     """Split a workspace into its parts.
 
     Args:
-        workspace: The workspace.
+        workspace: Vector that `_make_workspace` made.
 
     Returns:
         The episode's arrays, bounds of the observation, window.

@@ -64,7 +64,7 @@ class RoadRenderer:
     """Renders a camera's pictures.
 
     Args:
-        camera: The camera.
+        camera: Pinhole camera of the picture.
         appearance: Looks of the road; None for the defaults.
         rows: First row that is painted and the row behind the last, the rest is black; None: all.
     """

@@ -208,7 +208,7 @@ class LaneFinder:
     """Finds the lane in a camera's pictures.
 
     Args:
-        camera: The camera.
+        camera: Pinhole camera of the picture.
         lane_width: Distance from marking to marking (m).
         near: Distance ahead of the car where the search begins (m).
         far: Distance ahead where it ends (m).
@@ -346,7 +346,7 @@ class LaneFinder:
         """Compute the lateral place of a marking in every row, at `rows_ahead`.
 
         Args:
-            lane_fit: The lane.
+            lane_fit: Lane that was fitted.
             side: 1 for the left marking, -1 for the right one.
 
         Returns:
