@@ -36,7 +36,7 @@ Inputs = namedtuple(
     "wheel_left wheel_right steer_command beta_ref gamma_ref beta_hat gamma_hat d1_hat d2_hat",
 )
 """Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
-Memory = namedtuple("Memory", "delta_f N_z driver known")
+Memory = namedtuple("Memory", "delta_f_sum N_z_sum driver known")
 """The integrals of steering (rad) and yaw moment (N m), the driver's last steering command (rad),
 and whether there was one."""
 
@@ -78,7 +78,9 @@ def _model_following_law(
 ) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state.
 
-    K: K_beta and K_gamma (rad/s), max_share: largest yaw moment as a fraction of full scale (N,).
+    max_share: largest yaw moment as a fraction of full scale (N,). design: nominal car, reference
+    parameters, index of the reference, K_beta and K_gamma (rad/s), 1 or 0 for (26), full scale
+    (N m), authority (rad), control period (s).
     """
     car, target, kind, K, rejection, full_scale, authority, dt = design
     for n in range(len(x)):
@@ -105,17 +107,17 @@ def _model_following_law(
             reference_rates[0] - drift_rates[0] + p_beta - rejection * x[n, IN.d1_hat],
             reference_rates[1] - drift_rates[1] + p_gamma - rejection * x[n, IN.d2_hat],
         )
-        delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
+        delta_f, N_z = delta_f + state[n, LAST.delta_f_sum], N_z + state[n, LAST.N_z_sum]  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)
         limit = max_share[n] * full_scale
         moment = min(max(N_z, -limit), limit)
         drift_rates = compute_drift(plant, p_beta, p_gamma)
         # I of (31), forward Euler
         steps = solve_inputs(plant, -drift_rates[0] * dt, -drift_rates[1] * dt)
-        state[n, LAST.delta_f] = integrate_antiwindup(
-            state[n, LAST.delta_f], steps[0], delta_f, steer
+        state[n, LAST.delta_f_sum] = integrate_antiwindup(
+            state[n, LAST.delta_f_sum], steps[0], delta_f, steer
         )
-        state[n, LAST.N_z] = integrate_antiwindup(state[n, LAST.N_z], steps[1], N_z, moment)
+        state[n, LAST.N_z_sum] = integrate_antiwindup(state[n, LAST.N_z_sum], steps[1], N_z, moment)
         state[n, LAST.driver], state[n, LAST.known] = driver, 1.0
         action[n, 0] = moment / full_scale
         action[n, 1] = (steer - driver) / authority
@@ -125,8 +127,8 @@ class ModelFollowing(Controller):
     """Steering and yaw moment by dakf-stability (33), for an env whose action has both.
 
     The yaw rate is gamma_hat where the observation has it, else the gyro's. The references are the
-    env's. Their derivatives are those of the driver's steering at the measured speed, whose noise
-    would drown a difference of references.
+    env's, but "zero-slip" takes the yaw rate that keeps beta_ref. Derivatives follow the steering
+    at one speed, as the speed's noise would drown a difference. "lagged" has those of its lag.
 
     Anti-windup is conditional integration of each input: an integral holds while its input is at
     the limit (yaw moment: full scale; steering: the authority around the driver's) and the error

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from .. import Agent
 
 MAGIC = b"SLIPSES1"
-MAX_BATCHES, _MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
+MAX_BATCHES, _FULL_BLOCK_BYTES = 100, 1 << 13  # a block ends with 0.1 s or beyond these bytes
 _LENGTH = struct.Struct("!I")
 _BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
 _ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
@@ -67,7 +67,7 @@ class OnboardController:
         std: Their standard deviations, shape (n,); likewise.
 
     Raises:
-        TypeError: The env is another one.
+        TypeError: The env is not an `EstimateObservation`.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class OnboardController:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Counts of packets that the estimator did not use, for one of this package."""
+        """Counts of packets that a compiled `Estimator` did not use, by reason; else empty."""
         return self.estimator.counts if self._is_native else {}
 
     def begin(self, first: int) -> None:
@@ -169,12 +169,12 @@ class OnboardController:
         observe(row, shown, len(packets), self._refs, self._bounds)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
         # the true beta and gamma (0.0) serve the summary of errors alone, which nobody reads here
-        last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
+        trailing = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
         if self._is_native:  # `take` has given it all: no rows and no packets here
             record = self._rows, 0, NO_PACKETS, 0, 0
-            compile_observe()(estimator.filters, estimator.gains, *record, obs, *last)
+            compile_observe()(estimator.filters, estimator.gains, *record, obs, *trailing)
         else:
-            write_outputs(estimator, obs, *last)
+            write_outputs(estimator, obs, *trailing)
         return out
 
 
@@ -209,7 +209,7 @@ class Recorder:
         for data in accepted:
             self._items += _ITEM.pack(self._batches, len(data)) + data
         self._batches += 1
-        if self._batches == MAX_BATCHES or len(self._items) > _MAX_BLOCK_BYTES:
+        if self._batches == MAX_BATCHES or len(self._items) > _FULL_BLOCK_BYTES:
             self._write()
 
     def _write(self) -> None:
@@ -311,8 +311,8 @@ def replay(path: Path | str, onboard: OnboardController, patience: int | None) -
 
     Args:
         path: File of the session.
-        onboard: On-board controller of the session's setup.
-        patience: Patience of the `StreamSynchroniser`.
+        onboard: On-board controller made from the session's setup.
+        patience: Batches without a fast row before the last row is held; None: no limit.
 
     Returns:
         Ticks, estimates and deviations, and whether they agree with the session's checksums.

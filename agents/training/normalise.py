@@ -1,8 +1,8 @@
 """Standardised observations as the input of a network, instead of SI units, and scaled rewards.
 
 Scales and mixing are measured once, before the training, and are part of the network, which reads
-plain observations. Differences that vary little while their parts vary much, such as course less
-heading, matter to a policy; mixing scales them up, as algorithms need that follow the gradient.
+plain observations. Some differences, such as course less heading, vary little while their parts
+vary much, and matter to a policy. Mixing scales them up, as gradient methods need.
 """
 
 import math
@@ -41,12 +41,12 @@ _CONSTANT = 1e-9  # standard deviation, in an entry's unit, up to which it is no
 
 
 class Standardised(FlattenExtractor):
-    """A network's first layer, which is not trained: clip((x - mean) scale, +-clip) mixing.
+    """A network's first layer, which is not trained: clip((x - mean) * scale, +-clip) @ mixing.
 
     Args:
         observation_space: Space of the observation, of k entries.
         mean: Mean of each entry.
-        scale: Factor of each entry; one of scale 0 is not read.
+        scale: Factor of each entry; 0: the network does not read the entry.
         clip: Limit in standard deviations, None for none.
         mixing: Mixing, shape (k, k), None for none.
     """
@@ -102,6 +102,9 @@ def read_normalisation(
 
     Returns:
         Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
+
+    Raises:
+        ValueError: The normaliser is of observations of another size.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None
@@ -123,11 +126,11 @@ def measure_scaling(
     """Measure the scaling of each entry under random actions.
 
     Args:
-        env: Vector env.
+        env: Vector env that the random actions drive.
         spread: Standard deviation of the actions.
-        seed: Seed of actions and episodes.
+        seed: Seed of actions and drives.
         reads: Entries that the network reads; empty: all.
-        mixed: Whether to whiten the entries under actions that are held for a while.
+        mixed: Whether to whiten the entries under actions that are correlated in time.
 
     Returns:
         Mean, factor (0: not read), clip and mixing (None: none).
@@ -135,7 +138,7 @@ def measure_scaling(
     Raises:
         ValueError: The observation lacks an entry of `reads`, or none of them varies.
     """
-    names = [entry.name for entry in get_layout(env)]  # rows may believe in other nominal cars
+    names = [entry.name for entry in get_layout(env)]  # nominal cars may differ
     base: Any = env.unwrapped
     period = base.control_period * base.dt
     unknown = [name for name in reads if name not in names]
@@ -153,8 +156,8 @@ def measure_scaling(
     mean, mixing = samples.mean(axis=0), None
     if mixed:
         decay = math.exp(-period / _CORRELATION_TIME)
-        held_samples = _collect_observations(env, spread, seed, period, decay)
-        standard = np.clip((held_samples - mean) * scale, -CLIP, CLIP)
+        correlated_samples = _collect_observations(env, spread, seed, period, decay)
+        standard = np.clip((correlated_samples - mean) * scale, -CLIP, CLIP)
         mixing = compute_whitening(standard, _MIN_VARIANCE).tolist()
     return mean.tolist(), scale.tolist(), CLIP, mixing
 
@@ -162,7 +165,7 @@ def measure_scaling(
 def _collect_observations(
     env: CarVectorEnv, spread: float, seed: int, period: float, decay: float
 ) -> Array:
-    """Collect observations (n, k) under noise that decays by `decay` in each step."""
+    """Collect observations (n, k) under AR(1) noise, times `decay` in each step."""
     rng, observations = np.random.default_rng(seed), []
     noise = np.zeros(env.action_space.shape or ())
     env.reset(seed=seed)
@@ -201,8 +204,8 @@ class RewardScale:
         self._drive[chosen] += 1
         self._update_scale(chosen)
 
-    def _update_scale(self, rows: Sequence[int]) -> None:
-        for i in rows:
+    def _update_scale(self, cars: Sequence[int]) -> None:
+        for i in cars:
             scales = self._drive_scales[i]
             self.now[i] = scales[min(self._drive[i], len(scales) - 1)]
 
@@ -211,13 +214,13 @@ def measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) -> 
     """Measure the factors with which an agent's mean reward is -1 in each drive.
 
     Args:
-        agent: Agent, as for `iterate_steps`.
+        agent: Agent whose costs count, as for `iterate_steps`.
         env: Env that resets itself, whose scenarios do not depend on the agent.
-        seed: Seed of row 0.
-        steps: Steps of each row.
+        seed: Seed of car 0.
+        steps: Steps of each car.
 
     Returns:
-        Factors of each row's drives, then their median for all further drives.
+        Factors of each car's drives, then their median for all further drives.
     """
     scales: list[list[float]] = [[] for _ in range(env.num_envs)]
     costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
@@ -232,8 +235,8 @@ def measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) -> 
             scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
             costs[i] = lengths[i] = 0.0
     open_scales = lengths / (costs + COST_FLOOR)
-    for row_scales, open_scale in zip(scales, open_scales, strict=True):
-        row_scales.append(float(np.median(row_scales or [open_scale])))
+    for car_scales, open_scale in zip(scales, open_scales, strict=True):
+        car_scales.append(float(np.median(car_scales or [open_scale])))
     return scales
 
 

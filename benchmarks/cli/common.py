@@ -85,8 +85,8 @@ def print_written(console: Console, path: Path) -> None:
     """Print that a file was written.
 
     Args:
-        console: The screen.
-        path: The file.
+        console: Console that prints.
+        path: File that was written.
     """
     console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
 
@@ -102,8 +102,8 @@ def show_episode(
     """Print an episode's score, and write its picture, signals and track.
 
     Args:
-        console: The screen.
-        drive: The episode.
+        console: Console that prints.
+        drive: Record of the episode.
         driver: Name of the track.
         plot: File of the picture, None for none.
         parquet: File of all signals, None for none.
@@ -136,8 +136,8 @@ def write_output(
     """Print suites, and write their report and rows to files.
 
     Args:
-        console: The screen.
-        suites: Results.
+        console: Console that prints.
+        suites: Results to print and write.
         files: Files of the report (html) and the rows (json, parquet), None for none.
         brief: Whether verdicts and a table are printed instead of all tables.
     """

@@ -28,17 +28,17 @@ def take(
     declare: Callable[..., Any] = typer.Option,
     **more: Any,
 ) -> Any:
-    """Make the field of an option.
+    """Make the dataclass field of a command's option.
 
     Args:
-        help: Text on it.
+        help: Help text of the option.
         default: Default value, `...` for a required one.
-        names: Names instead of the field's, such as "--jobs" and "-j".
-        declare: Typer's function that declares it.
-        more: Other arguments of that function.
+        names: Options that replace the field's name, such as "--jobs" and "-j".
+        declare: Typer's function that declares the option.
+        more: Other arguments of `declare`.
 
     Returns:
-        Field of a dataclass.
+        Field whose metadata hold typer's declaration.
     """
     declared = {"typer": declare(default, *names, help=help, **more)}
     return field(default=MISSING if default is ... else default, metadata=declared)
@@ -47,21 +47,21 @@ def take(
 take_argument = partial(take, declare=typer.Argument)
 _SHARED: dict[str, Callable[[], Any]] = {
     "address": partial(take, "HOST:PORT of the cluster; default: this machine's.", ""),
-    "control_period": partial(take, "Ticks of 1 ms.", 10),
+    "control_period": partial(take, "Control period in ticks of 1 ms.", 10),
     "engine_name": partial(
         take, "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
     ),
     "html": partial(take, "Write a self-contained report."),
-    "jobs": partial(take, "Processes.", None, "--jobs", "-j", min=1),
+    "jobs": partial(take, "Number of parallel processes.", None, "--jobs", "-j", min=1),
     "json": partial(take, "Write the rows as JSON."),
     "mapping": partial(
         take, "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.", None, "--map"
     ),
     "parquet": partial(take, "Write the rows as Parquet."),
     "seed": partial(take, "Seed of the sampler; another on each machine of a study.", 0),
-    "steering_offset": partial(take, "deg at the wheels, added to the steering."),
-    "steering_ratio": partial(take, "Of the logged steering to the wheels' angle (15.2)."),
-    "steering_sign": partial(take, "1 or -1, of the logged steering."),
+    "steering_offset": partial(take, "Offset that is added to the steering (deg at the wheels)."),
+    "steering_ratio": partial(take, "Logged steering angle over the wheels' angle (15.2)."),
+    "steering_sign": partial(take, "Sign of the logged steering: 1 or -1."),
     "storage": partial(take, "RDB URL or SQLite file; default: sideslip-tune.db here."),
     "trust": partial(
         take, "Read policies' zips, which may run code of their makers.", False, "--trust"
@@ -69,7 +69,7 @@ _SHARED: dict[str, Callable[[], Any]] = {
     "vehicle": partial(
         take, "The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")
     ),
-}  # of commands whose field of that name has no value
+}  # a command declares these fields without a value
 
 
 def register(name: str, line: str | None = None, to: typer.Typer = app) -> Callable[[Kind], Kind]:
@@ -77,8 +77,8 @@ def register(name: str, line: str | None = None, to: typer.Typer = app) -> Calla
 
     Args:
         name: Name of the command.
-        line: Text on it in the list of commands.
-        to: Application that it belongs to.
+        line: Short help in the list of commands.
+        to: Typer application of the command.
 
     Returns:
         Decorator of the class.
@@ -129,7 +129,7 @@ def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
     """Parse options, as `parse_option` does.
 
     Args:
-        texts: NAME=VALUE each, None for none.
+        texts: Texts such as NAME=VALUE, None for none.
 
     Returns:
         Values by name.

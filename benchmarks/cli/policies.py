@@ -39,7 +39,7 @@ EPISODES = 256  # of a policy's test
 class _Export:
     """Make a policy's file of a zip: weights and a card, which no reader has to trust."""
 
-    zipped: Path = take_argument("Of stable-baselines3.", ..., metavar="ZIP")
+    zipped: Path = take_argument("Zip of stable-baselines3.", ..., metavar="ZIP")
     out: File = take("Default: NAME.safetensors beside it.", None, "--out", "-o")
     env: str = take("The id that it was trained on.", ENV)
     estimator: str = take("The estimator around it.", "")
@@ -94,9 +94,9 @@ class _Enjoy:
 
     policy: str = take_argument("A shipped policy's name, or a file's or zip's path.", ...)
     env: Text = take("Another id than the policy's own.")
-    episodes: int = take("How many.", 256, min=1)
+    episodes: int = take("Number of episodes.", 256, min=1)
     scenario: Text = take("A scenario's name.")
-    seed: int | None = take("Of the first episode; default: test seeds made from the weights.")
+    seed: int | None = take("Seed of the first episode; default: test seeds by the weights.")
     html: File
     json: File
     parquet: File
@@ -179,15 +179,15 @@ def make_task_table(file: Path, kind: str, episodes: int) -> Table:
 class _Distill:
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
 
-    name: str = take_argument("Of the file NAME.safetensors.", ...)
-    kind: str = take("Of contests, as coms-model.", ..., "--class")
+    name: str = take_argument("Name of the file, NAME.safetensors.", ...)
+    kind: str = take("Class of contests, as coms-model.", ..., "--class")
     teacher: str = take("A rung, a controller of the matrix, or a policy.", "adaptive-nmpc")
     estimator: str = take("What the policy reads: joint, or nothing but the sensors.", "joint")
-    cars: int = take("Of each contest and round; its varied lessons share as many.", 6, min=1)
+    cars: int = take("Cars a contest and round; its varied lessons share as many.", 6, min=1)
     varied: int = take(
         "Lessons of each contest with another car, late camera, wind and outages.", 0, min=0
     )
-    rounds: int = take("Of driving and learning.", 7)
+    rounds: int = take("Rounds of driving and learning.", 7)
     epochs: int = take("Passes over all drives in a round.", 12)
     cells: int = take("Of its GRU; 0: no memory.", 0)
     hidden: list[int] | None = take("Size of a dense layer (64, 64).")
@@ -197,7 +197,7 @@ class _Distill:
     told: float = take("Weight of what the teacher reads, as its GRU or traces tell it.", 0.0)
     option: Texts = take("NAME=VALUE of what is observed: with_map, fast; repeatable.")
     seed: int = take("Of weights and episodes.", 0)
-    episodes: int = take("Of each contest's test.", 32, min=2)
+    episodes: int = take("Episodes of each contest's test.", 32, min=2)
     out: File = take("The file; default: NAME here.")
 
     def run(self) -> None:
@@ -235,11 +235,11 @@ class _Distill:
 class _TrainEstimator:
     """Train a correction of a filter; `learned` with `file=FILE` estimates with it."""
 
-    name: str = take_argument("Of the file NAME.safetensors.", ...)
+    name: str = take_argument("Name of the file, NAME.safetensors.", ...)
     base: str = take("The filter.", "exact-kf", autocompletion=complete("estimators"))
     scenarios: Texts = take("Repeatable; default: of all scored contests.")
     option: Texts = take("NAME=VALUE of the filter; repeatable.")
-    episodes: int = take("Of each contest, driver and sensor set.", 32)
+    episodes: int = take("Episodes of each contest, driver and sensor set.", 32)
     epochs: int = take("Passes over all samples.", 20)
     seed: int = take("Of weights and episodes.", 0, min=0)
     out: File = take("The file; default: NAME here.")

@@ -1,4 +1,4 @@
-"""The package's own entries of the open benchmark: on file, while their episodes cost the same.
+"""The open benchmark's own entries, reused as long as their stored episodes cost the same.
 
 `python -m sideslip.benchmarks.entrants.baselines` drives them all and writes the file.
 """
@@ -37,11 +37,11 @@ from .challenge import EPISODES
 FILE = Path(__file__).with_name("baselines.json")
 COMMAND = f"python -m {__name__}"
 _BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
-CONTROLLERS = ((REFERENCE_FILTER, "esc"),)
-ESTIMATORS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
-"""Estimator and controller of all baselines, of an agent's rivals and of an estimator's."""
+_AGENT_RIVALS = ((REFERENCE_FILTER, "esc"),)
+_RIVALS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
+"""(estimator, controller) pairs of all baselines, of an agent's and of an estimator's rivals."""
 _SAMPLE = 2  # episodes of a baseline that are driven again
-_SAME = 1e-6  # of a cost
+_SAME = 1e-6  # relative difference of equal costs
 
 
 @dataclass(frozen=True)
@@ -81,14 +81,14 @@ def make_baseline_entries(
     """Make the baselines' entries.
 
     Args:
-        tasks: Tasks.
+        tasks: Tasks that every pair drives.
         agents: Whether an agent's rivals are among them.
         estimators: Whether an estimator's rivals are among them.
 
     Returns:
         Entries, task by task.
     """
-    pairs = _BASELINE_PAIRS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
+    pairs = _BASELINE_PAIRS + (_AGENT_RIVALS if agents else ()) + (_RIVALS if estimators else ())
     return [ControlEntry(task, *pair) for task in tasks for pair in pairs]
 
 
@@ -96,13 +96,13 @@ def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
     """Read the records of a file that are of this version.
 
     Args:
-        path: File.
+        path: JSON file of the records.
 
     Returns:
         Records by entry.
 
     Raises:
-        ValueError: The file is of another kind.
+        ValueError: The file holds no such records.
     """
     items = enumerate(read_objects(path), 1)
     records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
@@ -112,13 +112,13 @@ def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
 def find_baselines(
     wanted: Sequence[ControlEntry], n: int, **options: Any
 ) -> tuple[str, Results] | None:
-    """Find the episodes of baselines that are all on file with so many.
+    """Find the stored episodes of baselines, if each baseline has n of them.
 
-    Nothing is found, too, where of a baseline no episode of a sample costs the same again:
-    `_SAMPLE` episodes of each, of the slow ones in one task.
+    Returns None if a sample driven again no longer reproduces any stored cost of a baseline. The
+    sample is `_SAMPLE` episodes of each entry, of slow entries the first alone.
 
     Args:
-        wanted: Entries.
+        wanted: Entries to look up.
         n: Number of episodes of each.
         options: Options of `measure`.
 
@@ -148,7 +148,7 @@ def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
     """Drive all baselines of the usual tasks, and write the file.
 
     Args:
-        path: File.
+        path: JSON file to write.
         jobs: Processes, None for all processors.
 
     Raises:

@@ -68,7 +68,7 @@ class UserEntry:
         """Make the entry of a task.
 
         Args:
-            task: Task.
+            task: Task that the contestant drives.
             options: Options of the env beside the task's.
 
         Returns:

@@ -145,7 +145,7 @@ def compose_verdict(comparison: Comparison) -> list[str]:
     """Compose at most five lines: the user's entries, the best first, and how far to trust them.
 
     Args:
-        comparison: Episodes.
+        comparison: Episodes of all contestants.
 
     Returns:
         Lines.
@@ -225,7 +225,7 @@ def make_table(comparison: Comparison) -> ResultTable:
     """Make the table of everybody over all tasks, the best first; the user's own are marked.
 
     Args:
-        comparison: Episodes.
+        comparison: Episodes of all contestants.
 
     Returns:
         Table.

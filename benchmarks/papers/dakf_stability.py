@@ -131,7 +131,7 @@ FIGURES = (
                 make_curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
             ("(b): yaw rate", make_curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
-                "Tyres 7000 real, 10000 N/rad nominal."),
+                "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
             ("(c): front steering angle",
                 make_curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
                 "Behind the EPS motor's lag of 30 ms."),

@@ -17,6 +17,8 @@ PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"
 CALM, ROAD = "double-layer-fig9-calm", "double-layer-fig9-road"
 PROPOSED, WALKS, THREE, LOB = "double-layer", "double-layer, prediction alone", "course-kf", "lob-2"
+# WALKS is the claims' "disturbance KF": the double layer that only predicts between courses. LOB is
+# a linear observer. A twin simulates a road test with all that the plant has.
 ROLL, KINEMATIC = "roll-kf", "kinematic-velocity-kf"
 DESIGNED = "kinematic-velocity-kf, Q of its sensors"
 FIXED = ", R of HDOP 1"
@@ -58,7 +60,7 @@ SIMULATIONS = (
 # fmt: on
 
 claim = make_claim_factory(PAPER)
-# A claim a paragraph, a part a line: by hand.
+# Formatted by hand: each claim is a paragraph, each part a line.
 # fmt: off
 CLAIMS = (
     claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
@@ -131,7 +133,7 @@ FIGURES = tuple(
     for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
     for panel, text, draw, caption in (
         ("a", "sideslip angle", make_curves("beta", _SLIP, _SLIPS),
-            "Tyres 7000 real, 10000 nominal."),
+            "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
         ("b", "sideslip angle between courses", make_curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
             "One second: five courses."),
         ("c", "yaw angle", make_curves("psi", "yaw angle / rad", ("truth", PROPOSED)),

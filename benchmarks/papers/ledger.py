@@ -404,7 +404,7 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
 
     Args:
         filters: Filters of a simulation.
-        base: Unwrapped env.
+        base: Env without wrappers, in an episode.
 
     Returns:
         Estimators by label.

@@ -117,7 +117,7 @@ def compute_coms_ranks(seed: int) -> tuple[Numbers, None]:
     """Compute the rank of each paper's observability matrix for the COMS at 25 km/h, exactly.
 
     Args:
-        seed: Not used.
+        seed: Without effect: nothing is random.
 
     Returns:
         Rank by paper, and no signals.

@@ -17,7 +17,7 @@ def add(suite: Suite, done: CaseResults) -> None:
     """Add every figure of the results to a suite.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the figures.
         done: Result of every case.
     """
     for car in CARS:

@@ -29,7 +29,7 @@ FREQUENCY, DWELL = 0.7, 0.5  # Hz, s
 ONSET = 0.5  # s, straight ahead before
 _AFTER = 2.0  # s, recorded after completion of steer
 _RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
-A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY
+A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY  # m/s2: at A, the line's ends
 FIRST, STEP, LAST = 1.5, 0.5, 6.5  # of A
 MIN_AMPLITUDE, MAX_AMPLITUDE = math.radians(270.0), math.radians(300.0)  # at the steering wheel
 RATIOS = ((1.0, 0.35), (1.75, 0.20))  # s after completion of steer, share of the peak
@@ -52,7 +52,7 @@ class SineDwellRun:
 
     @property
     def stable(self) -> bool:
-        """Whether S5.2.1 and S5.2.2 are met; NaN does not."""
+        """Whether S5.2.1 and S5.2.2 are met; False for NaN."""
         return self.ratio_1 <= RATIOS[0][1] and self.ratio_2 <= RATIOS[1][1]
 
     @property
@@ -62,7 +62,7 @@ class SineDwellRun:
 
 
 def _make_slow_steer(car: TestCar, side: float) -> Fields:
-    """Make the slowly rising steer, of which a quarter is driven."""
+    """Make the slowly rising steer; its first quarter is driven, where the car passes 0.375 g."""
     seconds = 30.0
     return {
         "steering": "ramp", "onset": ONSET, "amplitude": side * _RAMP_RATE / car.ratio * seconds,
@@ -95,7 +95,7 @@ def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
     """Make a sine with dwell.
 
     Args:
-        car: Car.
+        car: Car under test, with speed and steering ratio.
         amplitude: Amplitude (rad at the steering wheel), signed as its first half.
 
     Returns:
@@ -109,7 +109,7 @@ def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
 
 
 def _evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
-    """Evaluate a run; amplitude and A in rad at the steering wheel."""
+    """Evaluate a run; amplitude and A are in rad at the steering wheel."""
     towards = -math.copysign(1.0, amplitude)
     steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
     peak = float(np.max(towards * series.gamma[steered], initial=0.0))
@@ -146,11 +146,14 @@ def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
     """Measure A, the mean of turns to the left and to the right.
 
     Args:
-        drive: Drives of the car.
-        car: Car.
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
 
     Returns:
         Angle (rad at the steering wheel).
+
+    Raises:
+        ValueError: The car never passes 0.375 g.
     """
     turns = [drive(_make_slow_steer(car, side)) for side in (1.0, -1.0)]
     return float(np.mean([_fit_reference_angle(turn, car.ratio) for turn in turns]))
@@ -165,8 +168,8 @@ def run(
     """Run the procedure.
 
     Args:
-        drive: Drives of the car.
-        car: The car.
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
         A: Reference angle (rad at the steering wheel).
         multiples: Amplitudes (of A); None: the standard's series.
 

@@ -90,7 +90,7 @@ def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
     """Make the lanes where the car drives them.
 
     Args:
-        car: Car.
+        car: Car under test, with speed and steering ratio.
         track: One of `TRACKS`.
         speed: Speed (m/s).
 
@@ -140,8 +140,8 @@ def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float])
     """Drive one attempt at each speed.
 
     Args:
-        drive: Drives of the car.
-        car: Car.
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
         track: One of `TRACKS`.
         speeds: Speeds (m/s).
 
@@ -155,7 +155,7 @@ def find_highest_speed(runs: Sequence[TrackRun]) -> float:
     """Find the highest speed of a clean run.
 
     Args:
-        runs: Runs.
+        runs: Runs through one track at several speeds.
 
     Returns:
         Speed (m/s); 0 where there is none.

@@ -32,7 +32,7 @@ def compute_understeer_gradient(vehicle: Vehicle) -> float:
     """Compute the understeer gradient of the linear model.
 
     Args:
-        vehicle: Vehicle.
+        vehicle: Vehicle of the linear model.
 
     Returns:
         Gradient K (rad s2/m).
@@ -61,8 +61,8 @@ def run(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
     """Drive a circle on which the linear car would reach 0.5 g at its full speed.
 
     Args:
-        drive: Drives of the car.
-        car: The car.
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
         seconds: Time in which the speed rises (s).
 
     Returns:

@@ -53,7 +53,7 @@ def make_step(car: TestCar, steer: float) -> Fields:
     """Make a step of the steering angle that is held for 4 s.
 
     Args:
-        car: Car.
+        car: Car under test, with speed and steering ratio.
         steer: Steering angle (rad).
 
     Returns:
@@ -116,7 +116,7 @@ def compute_linear_response(
     """Compute the linear model's response to steering.
 
     Args:
-        vehicle: Vehicle.
+        vehicle: Vehicle of the linear model.
         speed: Speed (m/s).
         frequency: Frequencies (Hz), shape (k,).
 
@@ -135,7 +135,7 @@ def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[
     """Compute the numbers of the linear model under the same steering.
 
     Args:
-        vehicle: Vehicle.
+        vehicle: Vehicle of the linear model.
         speed: Speed (m/s).
         series: Motion of the car after a step.
 
@@ -171,8 +171,8 @@ def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, Fre
     It has passed half a segment when it comes to the lowest frequency of the standard.
 
     Args:
-        drive: Drives of the car.
-        car: Car.
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
         steer: Amplitude of the steering angle (rad).
 
     Returns:

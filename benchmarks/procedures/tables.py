@@ -78,7 +78,7 @@ def add(suite: Suite, done: CaseResults) -> None:
     """Add every table of the results to a suite.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the tables.
         done: Result of every case.
     """
     _add_sine(suite, select_cases(done, "fmvss-126"))

@@ -1,4 +1,4 @@
-"""A file with a recorded drive, replayed or identified: its parts, its wires, its car."""
+"""A file with a recorded drive, replayed or identified: its parts, signals' calibration, car."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ TRUTH_WARNING = "The truth of this log is in doubt, and with it all errors: see 
 
 
 def _split_urgent(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A reader's warnings, without their mark, and its other remarks."""
+    """Split a reader's remarks into warnings, without their mark, and all others."""
     urgent = [text for text in remarks if text.startswith(WARNING_PREFIX)]
     others = [text for text in remarks if not text.startswith(WARNING_PREFIX)]
     return [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in urgent], others
@@ -39,14 +39,14 @@ def identify_file(
 
     Args:
         log: File of the drive.
-        vehicle: Stated vehicle as for `make_vehicle`.
+        vehicle: Stated vehicle, as for `make_vehicle`.
         mapping: Texts such as "steer_rad=Delta".
-        wires: Stated calibration.
+        wires: Stated calibration of the signals.
         tyres: Law of the tyres, as for `identify`.
         until: End of the part that is used (s), None for all.
 
     Returns:
-        What the log shows, and its suite.
+        Identified car and calibration, and their suite.
     """
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = make_vehicle(vehicle)
@@ -71,14 +71,14 @@ def replay_file(
     """Read a drive and replay it, each part of a log with holes by itself; with truth, corners too.
 
     Args:
-        log: File of the drive; a receiver's log (NMEA) is replayed as by `replay_nmea`.
-        vehicle: Vehicle as for `make_vehicle`; "identify": found in the log, or in its first
-            `until` s, of which the rest is replayed, with the mass and arms of `nominal` and linear
-            tyres; None: the Ferrari 250 LM of the Stanford log, the fitted tyres x 0.7, and the
-            corners of the nominal one.
+        log: File of the drive. `replay_nmea` replays a receiver's log (NMEA), for which `wires`,
+            `nominal`, `until` and `settings` are ignored.
+        vehicle: Vehicle as for `make_vehicle`. "identify": the log identifies the car, or its
+            first `until` s do and the rest is replayed. None: the Ferrari 250 LM of the Stanford
+            log, for estimates with fitted tyres x 0.7, for corners with nominal tyres.
         mapping: Texts such as "steer_rad=Delta".
-        wires: Calibration beside the car, over an identified one.
-        nominal: Stated vehicle of the identification.
+        wires: Calibration of the signals; its latency and noise overrule identified ones.
+        nominal: Vehicle whose mass and arms an identified car with linear tyres has.
         until: End of the part that identifies the car (s).
         settings: Fields of `Settings`.
 
@@ -86,7 +86,7 @@ def replay_file(
         Suite of all parts and corners.
 
     Raises:
-        ValueError: `until` without "identify"; and what the readers and `replay` raise.
+        ValueError: A drive has `until` without "identify", or the readers or `replay` refuse it.
     """
     if is_nmea(log):
         from .receiver import make_receiver_suite, replay_nmea

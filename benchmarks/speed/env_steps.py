@@ -143,7 +143,7 @@ def add_filters(suite: Suite, effort: Effort) -> None:
     """Add rows and a table of the CPU time that each filter adds, in a third of the rounds.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         effort: Rounds and time of each.
     """
     envs = {

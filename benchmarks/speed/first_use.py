@@ -101,7 +101,7 @@ def add(suite: Suite, quick: bool) -> tuple[dict[str, Taken], dict[str, str]]:
     """Add rows and a table.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         quick: Whether a few processes do and nothing is compiled, which takes minutes.
 
     Returns:

@@ -71,9 +71,9 @@ def _load_c_plant(block: int) -> Any:
 
 
 class Cars(NamedTuple):
-    """Cars in the middle of a drive, arrays (blocks, fields, LANES) as in the plant's tuples."""
+    """Cars at reset with random commands, arrays (blocks, fields, LANES) as the plant's tuples."""
 
-    left: Array  # (4,): fraction left of an actuator's deviation: steering, motors; middle, end
+    remaining: Array  # (4,): fraction of a deviation at middle and end: steering, then motors
     cars: Array
     roads: Array
     pushes: Array
@@ -91,7 +91,7 @@ _Advance = Callable[[Cars, int], object]
 
 
 def _make_cars(count: int, seed: int = 0) -> Cars:
-    """Make cars as the seeds of `YawFusion-v0` draw; count: a multiple of LANES."""
+    """Make cars as the seeds of `YawFusion-v0` draw, all with car 0's lags; count: n LANES."""
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
     p, z, rng = env.params, env.states, np.random.default_rng(seed)
@@ -120,19 +120,19 @@ def _integrate_tick(
     push: Any,
     car: Any,
     road: Any,
-    left: Any,
+    remaining: Any,
     stages: int,
 ) -> Any:
-    """Integrate a tick by 3 or 4 stages; loads at its start and end are `first` and `last`."""
+    """Integrate a tick by 3 or 4 stages from the load `first`; returns load, motion and inputs."""
     between = TyreInputs(
-        apply_lag(command.delta_f, acting.delta_f, left[0]),
-        apply_lag(command.T_l, acting.T_l, left[2]),
-        apply_lag(command.T_r, acting.T_r, left[2]),
+        apply_lag(command.delta_f, acting.delta_f, remaining[0]),
+        apply_lag(command.T_l, acting.T_l, remaining[2]),
+        apply_lag(command.T_r, acting.T_r, remaining[2]),
     )
     acting = TyreInputs(
-        apply_lag(command.delta_f, acting.delta_f, left[1]),
-        apply_lag(command.T_l, acting.T_l, left[3]),
-        apply_lag(command.T_r, acting.T_r, left[3]),
+        apply_lag(command.delta_f, acting.delta_f, remaining[1]),
+        apply_lag(command.T_l, acting.T_l, remaining[3]),
+        apply_lag(command.T_r, acting.T_r, remaining[3]),
     )
     shifting = has_load_shift(0, FIALA, 1)
     middle, last = (
@@ -147,7 +147,7 @@ def _integrate_tick(
 
 @jit
 def _advance(
-    left: Any,
+    remaining: Any,
     cars: Any,
     roads: Any,
     pushes: Any,
@@ -165,7 +165,7 @@ def _advance(
         load = compute_tyre_load(applied, car, 0, has_load_shift(0, FIALA, 1))
         for _ in range(ticks):
             load, motion, applied = _integrate_tick(
-                load, motion, applied, command, push, car, road, left, stages
+                load, motion, applied, command, push, car, road, remaining, stages
             )
         write(motions[b], motion, _MOTION)
         write(acting[b], applied, _INPUTS)
@@ -193,18 +193,18 @@ def make_c_advance() -> _Advance:
     return advance_in_c
 
 
-def _make_workload(_advance: _Advance, cars: Cars) -> Workload:
+def _make_workload(advance: _Advance, cars: Cars) -> Workload:
     """Make calls that move cars by `_TICKS`, in every round from the same state on."""
     running = cars.clone()
 
     def reset_cars() -> None:
         running.motions[:], running.acting[:] = cars.motions, cars.acting
 
-    return Workload(lambda: _advance(running, _TICKS), CARS * _TICKS, reset_cars)
+    return Workload(lambda: advance(running, _TICKS), CARS * _TICKS, reset_cars)
 
 
 def make_workloads() -> WorkloadSet:
-    """Make both plants, unless there is no C compiler."""
+    """Make the workloads of both plants; without a compiler the one in C is absent."""
     note = (
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Kutta's rule; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "

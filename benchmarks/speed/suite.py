@@ -68,7 +68,7 @@ def add(
     """Add rows of measured targets, and first of all the table of all.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         taken: CPU time a unit (us) of the workloads in each round, by name.
         seconds: CPU seconds of the first use in each process, by name.
         absent: Reasons why others were not measured, by name.

@@ -134,7 +134,7 @@ class WorkloadSet:
         """Measure all, and add rows and a table to a suite.
 
         Args:
-            suite: Suite.
+            suite: Suite that gets the results.
             effort: Rounds and time of each.
 
         Returns:
@@ -158,7 +158,7 @@ def add_row(suite: Suite, name: str, metric: str, values: Taken) -> Estimate:
     """Add the median and range of rounds as a row of a suite.
 
     Args:
-        suite: Suite.
+        suite: Suite that gets the results.
         name: Name of the workload.
         metric: Metric of the row.
         values: A number of each round.
@@ -203,7 +203,7 @@ def format_three_digits(value: float) -> str:
     """Format a number to three digits, without an exponent.
 
     Args:
-        value: Number.
+        value: Number to format.
 
     Returns:
         Text.

@@ -1,6 +1,7 @@
 """Conditions of the suite `unknown`: drives, curves of one quantity, and what a filter can lack.
 
-A condition's drives are recorded once; every filter runs over the same records, beside the bound.
+A condition's drives are recorded once, and every filter runs over the same records. The bound is
+the error of the optimal filter of the true model (`compute_error_bound`).
 """
 
 import dataclasses
@@ -50,7 +51,7 @@ class Condition:
     scenario: Mapping[str, Any] = field(default_factory=dict)  # fields over `LINEAR`
     options: Mapping[str, Any] = field(default_factory=dict)  # options of `joint`
     since: float = SETTLED  # time from which errors count (s)
-    bounded: bool = True  # whether the bound is one: for a linear car that does not roll
+    bounded: bool = True  # whether the bound exists: the car is linear and does not roll
     modelled: bool = True  # whether `joint` has a state or a level for all that happens
     filters: Filters = field(default_factory=dict)  # others: (estimator, options) by label
     vehicle: str = "coms"  # vehicle of the env
@@ -71,35 +72,35 @@ _LIMITED = {"inverse_friction_sd": 0.5}
 _BIASED = {"bias_sd": 0.01}
 _INERTIAL = {"fast": ["gyro", "accel_y"]}
 _GUSTY = {"levels": ((1.0, 1.0), (8.0, 2.0)), "disturbance_time": 1.0}
-"""One model expects a force that is eight times as strong; both, one that lasts."""
+"""One of two models expects an eightfold force; both expect disturbances to last for 1 s."""
 
 
 def _scale_disturbances(factor: float) -> dict[str, Any]:
-    """Disturbances of a factor times the levels that filters assume."""
+    """Scale disturbances to a factor times the levels that filters assume."""
     return MIX | {"disturbance_force": 50.0 * factor, "disturbance_moment": 20.0 * factor}
 
 
 def _make_gyro_bias(degrees: float) -> dict[str, Any]:
-    """A gyro with a bias (deg/s)."""
+    """Make the fields of a gyro with a bias (deg/s)."""
     return MIX | {"noise": {"gyro_bias": np.radians(degrees)}}
 
 
 def _make_rolling(
     name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = _GUST
 ) -> Condition:
-    """A car whose accelerometer feels that it rolls; there is no bound."""
+    """Make a condition without a bound: the accelerometer feels that the car rolls."""
     scenario = MIX | {"roll": True} | dict(gust)
     return Condition(name, CAMERA, scenario, options, bounded=False, modelled=False)
 
 
 FIALA = {"tyres": "fiala", "friction": 0.9}
 _SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
-_LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank, as the gust's start
+_LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank of filters
 _LATER_GUST = _GUST | {"wind_start": 4.13}
 CAR = {"speed": 80.0 * _KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
+"""The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
 _CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
 _CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", _CAR_LEVELS)}
-"""The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
 _UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
 _on_car = partial(Condition, filters=_CAR_FILTERS, vehicle="passenger-car")
 _HALF, _TWICE = _scale_disturbances(0.5), _scale_disturbances(2.0)
@@ -173,7 +174,7 @@ def _vary_steering(degrees: float) -> Condition:
 
 
 def _vary_noise(factor: float) -> Condition:
-    """A car that rolls, since its accelerometer feels that: there is no bound."""
+    """Make a condition without a bound: the accelerometer feels that the car rolls."""
     noise = {"roll": True, "noise": {"accel": 0.1 * factor}}
     options = _INERTIAL | {"accel_time": 2.0}
     filters: Filters = {
@@ -357,7 +358,7 @@ def run_with_bound(env: gym.Env[Any, Any], seed: int) -> tuple[Log, Array]:
     """Run an episode with its bound.
 
     Args:
-        env: Env.
+        env: Env of a linear car that does not roll.
         seed: Seed of the episode.
 
     Returns:
@@ -373,7 +374,7 @@ def run_with_bound(env: gym.Env[Any, Any], seed: int) -> tuple[Log, Array]:
 
 
 def _delay_gyro(log: Log, late: float) -> Log:
-    """A log whose gyro is read late (s); the first value until then."""
+    """Make a log whose gyro is read late (s), until then with its first value."""
     if late == 0.0:
         return log
     fast, rows = log.record.fast.copy(), round(late / log.record.dt)
@@ -399,7 +400,7 @@ def _run_episode(env: gym.Env[Any, Any], seed: int) -> tuple[Log, tuple[Vehicle,
 
 
 def _get_levels(scenario: Scenario) -> dict[str, Any]:
-    """The true levels of disturbances, as options of a filter."""
+    """Return the true levels of disturbances, as options of a filter."""
     return {"force_sd": scenario.disturbance_force, "moment_sd": scenario.disturbance_moment}
 
 
@@ -415,7 +416,7 @@ def _make_filters(condition: Condition, base: Any, log: Log) -> dict[str, Estima
 def _compute_bound(
     base: Any, log: Log, cars: tuple[Vehicle, Vehicle], gyro_late: float = 0.0
 ) -> Array:
-    """The bound (rad) at every row, which knows all but the strength of a gust."""
+    """Compute the bound (rad) at every row; its filter knows all but the strength of a gust."""
     scene, passing = base.scenario, dict[str, Any]()
     if scene.tyre_change_time is not None:
         passing["change"] = VehicleChange(scene.tyre_change_time, cars[1])

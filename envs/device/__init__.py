@@ -23,7 +23,7 @@ def make_device_env(
     """Make the environments of an id on a device.
 
     Args:
-        env_id: Registered id.
+        env_id: Id that Gymnasium has registered.
         num_envs: Number of environments.
         engine: "torch" makes a `DeviceVectorEnv`, the gradient engine, "cuda" a `CudaVectorEnv`,
             one kernel a step.

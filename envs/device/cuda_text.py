@@ -28,11 +28,11 @@ def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
     """Rebuild a function and its callees, as plain Python in the simulator.
 
     Args:
-        function: Compiled function.
+        function: Function compiled by `jit`.
         real: Type of floats.
 
     Returns:
-        The device function.
+        Device function, or plain Python function in the simulator.
     """
 
     def finish(rebuilt: Any) -> Any:
@@ -84,7 +84,7 @@ def _make_table(real: Any) -> dict[str, _Function]:
     floor = libdevice.floorf if single else libdevice.floor
     sqrt = libdevice.fsqrt_rn if single else libdevice.dsqrt_rn
     frexp = libdevice.frexpf if single else libdevice.frexp
-    texts = {
+    functions = {
         "minimum": lambda a, b: a if a < b else b,
         "maximum": lambda a, b: a if a > b else b,
         "absolute": lambda a: fabs(a),
@@ -94,7 +94,7 @@ def _make_table(real: Any) -> dict[str, _Function]:
         "to_float": lambda a: real(a),
         "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
         "to_int": lambda a: int(a),
-        "to_word": lambda a: int(a),
+        "to_word": lambda a: int(a),  # a float64 has a word's value, a float32 its bits
         "from_word": lambda a: real(a),
         "any_lane": lambda condition: condition,
         "lane_width": lambda array: 1,
@@ -103,9 +103,9 @@ def _make_table(real: Any) -> dict[str, _Function]:
         "iota": lambda first: first,
     }
     if single:
-        texts["to_word"] = lambda a: int(libdevice.float_as_int(a))
-        texts["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
-    return {name: _compile_device(text) for name, text in texts.items()} | _register_access()
+        functions["to_word"] = lambda a: int(libdevice.float_as_int(a))
+        functions["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
+    return {name: _compile_device(f) for name, f in functions.items()} | _register_access()
 
 
 def _register_access() -> dict[str, _Function]:

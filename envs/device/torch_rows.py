@@ -26,7 +26,7 @@ class DeviceRows:
     Args:
         episodes: Episodes on the host.
         capacities: Capacity of each slow sensor present, by index.
-        device: Device.
+        device: Device of the tensors.
         dtype: Type of floats.
         start: Tick 0 on tensors, for gradients; without it parameters stay at their place.
     """

@@ -77,7 +77,7 @@ class TorchStep:
         capacities: Capacity of each slow sensor present, by index.
         dtype: Type of floats.
         obs_dtype: Type of observations.
-        device: Device.
+        device: Device of the tensors.
         compile: Whether `torch.compile` is used.
     """
 

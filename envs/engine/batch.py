@@ -170,7 +170,7 @@ def step_rows(
         actions: Fractions of full scale, float32 of shape (N, 1) or (N, 2).
         bounds: Bounds of the observation, shape (2, k).
         results: Rewards, terminated and truncated, shape (N,) each, which are written.
-        buffers: Working arrays.
+        buffers: Working arrays of the blocks.
 
     Returns:
         The count, with WILD added for an action beyond its limit. REFUSED, with nothing stepped, if

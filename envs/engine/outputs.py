@@ -65,7 +65,7 @@ def update_newest(z: Vector, packet: Vector, tick: Scalar) -> None:
     """Take a delivered packet as its sensor's newest sample, if it is newer.
 
     Args:
-        z: Packed state.
+        z: Packed state, shape (STATE_WIDTH,).
         packet: The packet, shape (PACKET_WIDTH,).
         tick: Tick of its arrival.
     """
@@ -114,7 +114,7 @@ def make_measurement_context(
     """Make the inputs of the slow sensors' measurements at a tick.
 
     Args:
-        p: Packed parameters.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
         motion: Motion of the car.
         small_angle: 1 for the small-angle plant.
         key: Lower and upper 32 bits of the episode's key.
@@ -256,7 +256,7 @@ def write_report(report: Vector, z: Vector) -> None:
 
     Args:
         report: The report, shape (len(StepReport),).
-        z: Packed state.
+        z: Packed state, shape (STATE_WIDTH,).
     """
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]

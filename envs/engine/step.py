@@ -43,7 +43,7 @@ def make_step_params(p: Vector) -> StepParams:
     """Make the parameters that are constant within an env-step.
 
     Args:
-        p: Packed parameters.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
 
     Returns:
         The parameters.
@@ -62,19 +62,19 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
     """Make the variant of a vehicle's ticks.
 
     Args:
-        p: Packed parameters.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
         switches: `Switches` of the episode.
 
     Returns:
-        The variant.
+        Variant of the ticks.
     """
     flags = read(switches, FLAGS)
-    lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
+    n_lagging = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     has_driver = int(flags.steering == DRIVER)
     load_shift = has_load_shift(flags.small_angle, flags.law, flags.roll)
     return StepVariant(
-        flags.small_angle, flags.law, flags.reference, flags.roll, has_driver, lag, load_shift,
-        flags.road,
+        flags.small_angle, flags.law, flags.reference, flags.roll, has_driver, n_lagging,
+        load_shift, flags.road,
     )  # fmt: skip
 
 
@@ -99,18 +99,18 @@ def integrate_step(
 
     Args:
         p: Packed parameters; of a block of vehicles p, z and report have a column for each.
-        z: Packed state.
+        z: Packed state, shape (STATE_WIDTH,).
         variant: Variant of the ticks.
         yaw_share: Yaw moment as a fraction of full scale, within +-1.
         steer_share: Added steering as a fraction of full scale, within +-1.
         n: Number of ticks.
-        rows: Array for the fast sensors; of a block rows and window have one axis more.
-        report: Array for the report.
-        window: Window, with noise and steering of the ticks.
+        rows: Fast rows to write, shape (n, FAST_WIDTH); a block's have an axis more, as its window.
+        report: Report to write, shape (len(REPORT),).
+        window: Noise and steering of the ticks, shape (WINDOW_HEIGHT, columns).
         is_single: Whether it is one vehicle.
 
     Returns:
-        Number of ticks done; 0 where one of a block ends early, z and report then unchanged.
+        Number of ticks integrated; 0 where one of a block ends early, z and report then unchanged.
     """
     params = make_step_params(p)
     task = params.task
@@ -196,9 +196,9 @@ def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix, window: V
     Args:
         row: Arrays of the episode.
         n: Ticks of a control period.
-        done: Ticks of the step.
+        done: Ticks integrated in the step.
         bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step.
+        window: Window of the step, shape (WINDOW_HEIGHT, columns).
     """
     finish_slow_sensors(row, done, _observe_step(row, n, done, bounds), bounds, window)
 
@@ -211,10 +211,10 @@ def finish_slow_sensors(
 
     Args:
         row: Arrays of the episode.
-        done: Ticks of the step.
-        k: The first of their entries in the observation.
+        done: Ticks integrated in the step.
+        k: Index of the slow sensors' first entry in the observation.
         bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step.
+        window: Window of the step, shape (WINDOW_HEIGHT, columns).
     """
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
 
@@ -233,18 +233,18 @@ def _find_next_due(z: Vector, tick: Scalar) -> Scalar:
 def sample_slow_ticks(
     row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Vector
 ) -> int:
-    """Sample the slow sensors at ticks first to last - 1 of a step.
+    """Sample the slow sensors at the ticks of a step's rows first to last - 1.
 
     Args:
         row: Arrays of the episode.
-        first: The first of the ticks.
-        last: The tick behind the last one.
+        first: First of the rows; row 0 is the step's first tick.
+        last: The row behind the last one.
         count: Number of packets of the step that were delivered before.
-        done: Ticks of the step.
-        window: Window of the step.
+        done: Ticks integrated in the step.
+        window: Window of the step, shape (WINDOW_HEIGHT, columns).
 
     Returns:
-        The number that is delivered by then.
+        Number of packets of the step that are delivered by then.
     """
     z = row.z
     start_tick = z[Z.clock.tick] - done
@@ -276,7 +276,7 @@ def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Ma
     Args:
         row: Arrays of the episode.
         n: Ticks of a control period.
-        done: Ticks of the step.
+        done: Ticks integrated in the step.
         count: Number of packets.
         bounds: Bounds of the observation, shape (2, k).
     """
@@ -358,10 +358,10 @@ def step_vehicle(row: EpisodeArrays, action: Vector, n: int, bounds: Matrix, win
         action: Fractions of full scale of the yaw moment and, if there are two, the added steering.
         n: Ticks of a control period.
         bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step.
+        window: Window of the step, shape (WINDOW_HEIGHT, columns).
 
     Returns:
-        Ticks done; for an action that is not finite REFUSED, or 0 with `fail_bad`.
+        Ticks integrated; for an action that is not finite REFUSED, or 0 with `fail_bad`.
     """
     p, z = row.p, row.z
     yaw_share, steer_share = clip_action(action)

@@ -246,7 +246,7 @@ def compute_inputs(
     """Compute the plant's inputs during a tick.
 
     Args:
-        params: Parameters.
+        params: Parameters of the step.
         N_z: Commanded yaw moment (N m).
         steer_command: Commanded added steering (rad).
         state: State at the start.
@@ -318,7 +318,7 @@ def measure_tick(
     """Compute the driver's command and the measurements at the end of a tick.
 
     Args:
-        params: Parameters.
+        params: Parameters of the step.
         motion: Motion at the end.
         accel: (a_x, a_y), specific forces (m/s2).
         applied: Mean inputs over the tick.
@@ -359,7 +359,7 @@ def integrate_tick(
     """Integrate one tick of the plant.
 
     Args:
-        params: Parameters.
+        params: Parameters of the step.
         N_z: Commanded yaw moment (N m).
         steer_command: Commanded added steering (rad).
         state: State at the start.

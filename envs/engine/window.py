@@ -122,8 +122,8 @@ def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
     """Write the angles of a trace, or of a wandering driver, over those of the profile.
 
     Args:
-        p: Packed parameters.
-        z: Packed state.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
+        z: Packed state, shape (STATE_WIDTH,).
         n: Number of ticks.
         window: Window of the step, whose row `steer` is written.
     """
@@ -147,8 +147,8 @@ def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vec
     """Write noise and steering of one vehicle's next ticks.
 
     Args:
-        p: Packed parameters.
-        z: Packed state.
+        p: Packed parameters, shape (PARAMS_WIDTH,).
+        z: Packed state, shape (STATE_WIDTH,).
         n: Number of ticks.
         has_driver: Whether a driver reacts to the car, so that no profile steers.
         window: Window of the step, which is written.

@@ -297,7 +297,7 @@ def make_kernel(
     """Make the kernel of a function, in IEEE arithmetic and the order written.
 
     Args:
-        function: The function.
+        function: Python function in numba's subset.
         folder: Folder of the kernel's files, or None.
         apart: Whether callers call its machine code instead of taking its text in, as suits what is
             long and called by several kernels.

@@ -111,8 +111,8 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
     The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
 
     Args:
-        y: Second coordinate.
-        x: First coordinate.
+        y: Ordinate of the point.
+        x: Abscissa of the point.
 
     Returns:
         The angle (rad).
@@ -186,7 +186,7 @@ def clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Clip a value to [low, high].
 
     Args:
-        value: The value.
+        value: Number to limit.
         low: Lower limit.
         high: Upper limit, at least low.
 

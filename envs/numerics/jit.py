@@ -26,10 +26,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit(function: F) -> F:
-    """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible.
+    """Compile with numba: IEEE arithmetic in the order written; stock numba has no disk cache.
 
     Args:
-        function: The function.
+        function: Python function in numba's subset.
 
     Returns:
         The compiled function.
@@ -43,7 +43,7 @@ def jit_nrt(function: F) -> F:
     All others in `envs` and `estimators` do without it, which halves the time of a filter's tick.
 
     Args:
-        function: The function.
+        function: Python function in numba's subset.
 
     Returns:
         The compiled function.
@@ -58,7 +58,7 @@ def inline(function: F) -> F:
     the function itself.
 
     Args:
-        function: The function.
+        function: Python function in numba's subset.
 
     Returns:
         The compiled function.
@@ -69,8 +69,10 @@ def inline(function: F) -> F:
 def noinline(function: F) -> F:
     """Compile once, to machine code that all callers call: what is long and called seldom.
 
+    Stock numba compiles the function as `jit` does.
+
     Args:
-        function: The function.
+        function: Python function in numba's subset.
 
     Returns:
         The compiled function.

@@ -86,8 +86,8 @@ def load_element(array: Vector, *index: int) -> Scalar:
     """Load a number of an array.
 
     Args:
-        array: The array.
-        index: Its index.
+        array: Vector, or an array with further axes.
+        index: Index of the element, by axis.
 
     Returns:
         The number.
@@ -99,9 +99,9 @@ def store_element(array: Vector, value: Scalar, *index: int) -> None:
     """Store a number in an array.
 
     Args:
-        array: The array.
-        value: The number.
-        index: Its index.
+        array: Vector, or an array with further axes.
+        value: Number to store.
+        index: Index of the element, by axis.
     """
     array[index] = value
 
@@ -110,7 +110,7 @@ def as_matrix(array: Vector, first: int, rows: int, columns: int) -> Matrix:
     """View numbers of a vector as a matrix.
 
     Args:
-        array: The vector.
+        array: Vector that holds the numbers.
         first: Index of the first number.
         rows: Number of rows.
         columns: Number of columns.
@@ -125,7 +125,7 @@ def as_int64(array: Vector, first: int, count: int) -> Vector:
     """View the bytes of a vector's numbers as integers.
 
     Args:
-        array: The vector.
+        array: Vector that holds the numbers.
         first: Index of the first number.
         count: Number of integers.
 
@@ -139,7 +139,7 @@ def as_float32(array: Vector, first: int, count: int) -> Vector:
     """View the bytes of a vector's numbers as float32, two to a number.
 
     Args:
-        array: The vector.
+        array: Vector that holds the numbers.
         first: Index of the first number.
         count: Number of float32.
 

@@ -123,7 +123,7 @@ def to_int(a: Scalar) -> Scalar:
     """Convert a float that is a whole number to an integer.
 
     Args:
-        a: The float.
+        a: Float to convert.
 
     Returns:
         The integer.
@@ -147,7 +147,7 @@ def from_word(a: Scalar) -> Scalar:
     """Convert a 32-bit word to a float.
 
     Args:
-        a: The word.
+        a: Word to convert.
 
     Returns:
         The float that stands for it.
@@ -159,7 +159,7 @@ def any_lane(condition: Scalar) -> Scalar:
     """Check whether a condition holds for any of the cars in the lanes.
 
     Args:
-        condition: The condition.
+        condition: Truth value of each lane.
 
     Returns:
         One condition for all lanes.

@@ -41,9 +41,9 @@ def load8_symmetric(matrix: Matrix, k: int, j: int) -> Scalar:
     """Load eight neighbours of a row of a symmetric matrix.
 
     Args:
-        matrix: The matrix.
-        k: Row.
-        j: First column.
+        matrix: Symmetric matrix.
+        k: Index of the row.
+        j: Index of the first column.
 
     Returns:
         The eight numbers.
@@ -55,7 +55,7 @@ def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
     """Count the rows of a symmetric matrix that count in its last columns.
 
     Args:
-        matrix: The matrix.
+        matrix: Symmetric matrix.
         rows: Number of its rows.
         j: First of the columns.
 
@@ -70,7 +70,7 @@ def store8(array: Matrix, values: Scalar, *index: int) -> None:
 
     Args:
         array: The matrix or vector.
-        values: The numbers.
+        values: Eight numbers, or one number.
         index: Index of the first of them.
     """
     *row, first = index
@@ -81,7 +81,7 @@ def mirror(array: Matrix, i: int, j: int) -> None:
     """Mirror an 8 x 8 block of a matrix across the diagonal.
 
     Args:
-        array: The matrix.
+        array: Matrix whose block is mirrored.
         i: First row of the block.
         j: First column, at least i; where they are equal the upper part is mirrored.
     """

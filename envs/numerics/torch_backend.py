@@ -72,7 +72,7 @@ def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
 
     Args:
         dtype: Type of the tensors' floats.
-        functions: Compiled functions.
+        functions: Functions compiled by `jit`.
 
     Returns:
         The rebuilt functions, in the same order.
@@ -89,7 +89,7 @@ def compile_method(function: Any) -> Any:
     compilation of a code object, so each method gets a copy.
 
     Args:
-        function: Bound method.
+        function: Bound method to compile.
 
     Returns:
         The compiled method.

@@ -2,7 +2,7 @@
 
 Fields have the forms and conversions of pynmeagps (needs the extra `wires`). Its parser of whole
 sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a tunnel),
-while here that field alone is left out. Degrees from north, knots and times of day stay here.
+while here that field alone is left out. Degrees from north and knots do not leave this file.
 """
 
 import math
@@ -102,7 +102,7 @@ def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
 
 
 def _parse_value(name: str, form: str, text: str) -> Any:
-    """Parse a field's value; None where the text is none."""
+    """Parse a field's value; None where the text has no value in range."""
     try:
         value = _parse_time(text) if name == "time" else NMEAMessage.str2val(text, form)
     except ValueError:
@@ -129,7 +129,7 @@ _CONTINUOUS = 60.0  # s: a time of day within these is continuous, whatever its 
 _ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
 _EPOCH = date(1970, 1, 1).toordinal()
 _FIRST = DAY * (date(1980, 1, 6).toordinal() - _EPOCH)  # s: GPS has no earlier date
-_NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in
+_NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in; 8, simulated, counts
 _TIMED = ("GLL", "RMC", "GNS", "GGA")  # with a position
 
 
@@ -148,7 +148,7 @@ class Epoch(NamedTuple):
     hdop: float
     satellites: int  # used
     in_view: int  # satellites, of the newest GSV of each system
-    quality: int  # of the course: 0 without a fix or below COURSE_SPEED, else 1
+    quality: int  # of the course: 1 with a fix, from COURSE_SPEED on, if the course is sent; else 0
     age: float  # s since the newest fix, by t: 0 with a fix, NaN before the first or without a time
 
     @property
@@ -198,7 +198,7 @@ class Decoder:
 
     An epoch is returned with the sentence that completes it: motion (RMC or VTG) and GGA or GNS,
     and GSA where these have no HDOP; an incomplete one when the next begins. Of several talkers the
-    first makes the epoch. At most `LONGEST` bytes and one epoch are held.
+    first makes the epoch. Held are `LONGEST` bytes at most, one epoch and a part of the next.
     """
 
     def __init__(self) -> None:
@@ -270,7 +270,7 @@ class Decoder:
         return self._add_sentence(sentence)
 
     def _add_sentence(self, sentence: _Sentence) -> list[Epoch]:
-        """Add a sentence to its epoch; those without a time belong to the one at hand."""
+        """Add a sentence to its epoch; a sentence without a time joins the epoch at hand."""
         talker, kind, values, _ = sentence
         done: list[Epoch] = []
         time, existing = values.get("time"), self._parts.get(kind)
@@ -363,7 +363,7 @@ def correct_dates(epochs: list[Epoch]) -> list[Epoch]:
         epochs: Epochs of a whole log, as `Decoder` returns them.
 
     Returns:
-        The epochs by their last date, or one newer by whole rollovers. A real pause remains.
+        Epochs dated by the last date, or by a date newer by whole rollovers; real pauses remain.
     """
     t = np.array([epoch.t for epoch in epochs])
     rows = np.flatnonzero(np.isfinite(t))

@@ -1,8 +1,9 @@
 """Scenarios of the papers' simulations and of their road tests, which no score contains.
 
-The comment above each says what its paper gives. The rest is chosen here: by default the vehicle of
-tie-vision's Table I at 25 km/h, with the default Ornstein-Uhlenbeck disturbance and noise. GPS
-noise is that at HDOP 1 in the simulations; in the road tests half of it follows a varying HDOP.
+docs/PAPERS.md lists the papers; the comment above each scenario says what its paper gives. The rest
+is chosen here: by default the vehicle of tie-vision's Table I at 25 km/h, with the default
+Ornstein-Uhlenbeck disturbance and noise. GPS noise is that at HDOP 1 in the simulations; in the
+road tests half of it follows a varying HDOP.
 """
 
 from ..vehicle.parameters import COMS
@@ -19,7 +20,7 @@ _SIMULATED: Fields = {  # the plant of the papers' own equations
     "small_angle": True, "tyres": "linear", "lags": False, "roll": False,
     "hdop": 1.0, "hdop_spread": 0.0, "hdop_law": "constant",
 }  # fmt: skip
-_ON_THE_ROAD: Fields = {"half_width": 200.0}  # all that the plant has
+_ON_THE_ROAD: Fields = {"half_width": 200.0}  # m, a wide road; all else is the full plant
 _QUIET: Fields = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
 _WIND: Fields = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
 
@@ -51,7 +52,7 @@ _DAKF_STEP = _DAKF.replace(
     gps_outage=None, lags=True,
     vehicle={**_make_stiffness(7000.0), "motor_lag": 0.0, "steering_lag": 0.03},
 )  # fmt: skip
-# given: slalom with wind; course alone and with the gyro
+# given: slalom with wind; measured is the course, with or without the gyro
 _DUAL = Scenario(
     name="dual-rate-fig4", duration=12.0, steering="slalom", onset=1.0, amplitude=0.1,
     frequency=0.25, gps_period=0.1, vehicle=_make_stiffness(7000.0),

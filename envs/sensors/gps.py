@@ -46,8 +46,8 @@ def compute_hdop_deviation(
 
     Args:
         before: Deviation at the capture before.
-        sky: `SatelliteGeometry`.
-        link: `Link` of the GPS.
+        sky: Law of the HDOP.
+        link: Outage and period of the GPS (ticks).
         tick: Tick of the capture.
         n: Standard normal numbers, of which the first is used.
 
@@ -62,7 +62,7 @@ def compute_hdop_deviation(
 
 @jit
 def _count_satellites(hdop: Scalar) -> Scalar:
-    """Satellites that a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
+    """Count the satellites that a receiver sees: 12 at HDOP 1, 4 at HDOP 5, fewer above."""
     return floor(2.0 + minimum(10.0 / hdop, 28.0))
 
 
@@ -87,7 +87,7 @@ def sample_gps(
         left: Place of the antenna left of it (m).
         hdop: Horizontal dilution of precision.
         weight: Fraction of the noise that follows HDOP, of `HDOP_LAWS`.
-        noise: `Noise`.
+        noise: Standard deviations and biases of the sensors.
         n: Four standard normal numbers.
         small_angle: 1 for the small-angle plant, else 0.
 

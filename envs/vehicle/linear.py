@@ -189,7 +189,7 @@ def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Inputs are delta_f and N_z, the output is gamma.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
 
     Returns:
@@ -208,7 +208,7 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Outputs are gamma, psi and y_l.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
 
     Returns:
@@ -226,7 +226,7 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Inputs are delta_f and N_z, outputs gamma and the course psi + beta.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
 
     Returns:
@@ -249,7 +249,7 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
     The body's weight, M_s g h_s phi, is within a_y. The output is phi_dot.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the model.
 
     Returns:
         The model.
@@ -266,7 +266,7 @@ def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
     rate v_y is unobservable from v_x alone.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle of the model.
         gamma: Yaw rate (rad/s).
 
     Returns:

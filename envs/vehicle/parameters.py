@@ -163,7 +163,7 @@ def critical_speed(vehicle: Vehicle) -> float:
     """Compute the speed above which the linear vehicle is unstable.
 
     Args:
-        vehicle: The vehicle.
+        vehicle: Vehicle with stiffnesses and arms.
 
     Returns:
         The critical speed (m/s); inf if the vehicle understeers.

@@ -1,8 +1,8 @@
 """The tyres: normal load, friction circle, slip and lateral force.
 
-The functions have no branches on values, as in `dynamics`. A law of the lateral force has its name
-in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.model` has Fiala's
-once more, with slopes; a test holds both equal.
+As in `dynamics`, no function branches on values, except by `any_lane`. A law of the lateral force
+has its name in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.model`
+has Fiala's once more, with slopes; a test holds both equal.
 """
 
 from typing import Any, NamedTuple, TypeAlias
@@ -44,7 +44,7 @@ class TyreLoad(NamedTuple):
     slope_f: Scalar  # C / (3 F_max) of the same tyres
     slope_l: Scalar
     slope_r: Scalar
-    rear_l: Scalar  # N, of the left and right rear tyre in all directions, without roll
+    rear_l: Scalar  # N, friction of the left and right rear tyre in all directions, without roll
     rear_r: Scalar
     F_l: Scalar  # N, drive force that the left motor commands
     F_r: Scalar  # N, that of the right motor
@@ -87,18 +87,18 @@ def _compute_axle_shift(
 def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> TyreLoad:
     """Compute the tyres' load under the inputs of one instant.
 
-    Each rear tyre's friction limits its motor's force; the front tyres have the mean of both sides.
-    Drive force moves load between the axles, but not on the small-angle plant.
+    The front tyres have the mean friction of both sides. Each rear tyre's friction limits its
+    motor's force, and drive force moves load between the axles, but not on the small-angle plant.
 
     Args:
-        inputs: `TyreInputs`.
-        car: `CarParams`.
+        inputs: Steering and torques, `TyreInputs`.
+        car: Parameters, `CarParams`.
         small_angle: 1 for the small-angle plant, else 0.
-        load_shift: Result of `has_load_shift`; with 1 the rear tyres' limits and slopes, drive
-            force and moment are those of the inputs without any friction.
+        load_shift: Result of `has_load_shift`; with 1 friction does not limit the drive force here,
+            and the rear tyres' limits are mu F_z.
 
     Returns:
-        The `TyreLoad`.
+        Forces and capacities, `TyreLoad`.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
@@ -127,7 +127,7 @@ class Tyre(NamedTuple):
     """One tyre at one instant."""
 
     tangent: Scalar  # t, tangent of its slip angle; on the small-angle plant the angle itself
-    limit: Scalar  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
+    limit: Scalar  # N, F_max: what the drive force leaves of mu F_z on the friction circle
     slope: Scalar  # C / (3 F_max)
 
 
@@ -181,10 +181,10 @@ def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_a
 
 
 @jit
-def _compute_slip_ratios(
+def _split_slip_tangents(
     motion: State, load: TyreLoad, car: Car, small_angle: int
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Numerator and denominator (m/s) of the tangents of the front and the rear slip angle."""
+    """Split the tangents of both slip angles into numerator and denominator (m/s)."""
     front = motion.v_y + car.l_f * motion.gamma
     rear = motion.v_y - car.l_r * motion.gamma
     if small_angle:
@@ -211,7 +211,7 @@ def compute_slips(
     Returns:
         (front, rear), positive where the force is to the left.
     """
-    across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, small_angle)
+    across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
     return across_f / along_f, across_r / along_r
 
 
@@ -286,7 +286,7 @@ def _compute_shifted_tyres(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """`compute_tyres` where roll moves load from side to side; all quotients come from one."""
-    across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
+    across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, 0)
     e_f, e_r = _compute_load_transfer(motion, car, g_y)
     relieved, burdened = 1.0 - e_f, 1.0 + e_f
     rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)

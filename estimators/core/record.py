@@ -3,7 +3,8 @@
 A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
 so every filter runs on the same compiled code. The codes `kind` (of model), `late` (rule for late
 samples), `between` (rule between samples) and `periodic` (1: gains from a table, 0: from P) say
-which fields are used. `design.assemble` writes all up to the gains, `reset_filters` the rest.
+which fields are used. `design.assemble` writes what options and vehicle decide; `reset_filters` and
+the ticks write the rest. A missing place is 0 where place 0 is always taken, else -1.
 """
 
 import math
@@ -42,7 +43,7 @@ rows. Zeros where they are computed from P."""
 
 
 class SkipCounters(NamedTuple):
-    """Counters of what a filter skipped, by reason."""
+    """Places in the field `counts`, which counts what a filter skipped, by reason."""
 
     refused: int = 0  # captured before the oldest state the filter still has
     duplicates: int = 1  # same sensor and captured tick as an earlier packet
@@ -95,8 +96,8 @@ _FIELDS = [
     ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("per_tyre", _FLOAT, (2, 2)),  # N, slopes of each axle's force: by its factor, by 1/friction
-    ("rest", _FLOAT, (2,)),  # N, each axle's force less its linear terms
-    ("again", _INT),  # ticks between two expansions of the tyres' forces
+    ("rest", _FLOAT, (2,)),  # N, force of each axle that its linear terms leave over
+    ("again", _INT),  # ticks after which the tyres' forces are expanded again
     ("q_tyres", _FLOAT, (3,)),  # variances of a step of factors and 1/friction, while it moves
     ("model_error", _FLOAT),  # fraction of the axles' forces by which the tyres' law errs
     ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without `model_error`
@@ -165,7 +166,7 @@ _FIELDS = [
     ("hdop_factor", _FLOAT, (N_KNOTS,)),
     ("least_satellites", _FLOAT),  # packets with fewer are refused
     ("gate", _FLOAT, (N_ROWS + 1,)),  # by dimension, the largest NIS; 0: no gate
-    ("wary", _INT),  # gated samples that agree until the sensor is believed again; 0: it never is
+    ("wary", _INT),  # gated samples in agreement that restore a sensor's trust; 0: never
     ("adapt", _FLOAT),  # weight of a new innovation in the scale of R; 0: R as configured
     ("first_slow", _INT),  # index of the first slow sensor that is used; -1: none
     ("period", _INT, (N_SLOW,)),  # ticks; 0: not used
@@ -174,7 +175,7 @@ _FIELDS = [
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # tick, phase of a single-rate filter's steps
     # the rule for late samples
-    ("late", _INT),
+    ("late", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
@@ -204,7 +205,7 @@ _FIELDS = [
     ("tick", _INT),  # tick of the last row
     ("has_started", _INT),  # 1: there was a first step
     ("road_turn", _FLOAT),  # rad, by which the road has turned since the first row
-    ("at", _INT),  # step within the schedule's cycle
+    ("at", _INT),  # index of the present step in the schedule's cycle
     ("x", _FLOAT, (N_TOTAL,)),  # states, then clones
     ("P", _FLOAT, (N_TOTAL, N_TOTAL)),
     ("u", _FLOAT, (N_INPUTS,)),  # the last finite inputs

@@ -77,7 +77,7 @@ def locate_stack(net: CorrectionNet) -> Scalar:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:
-        net: A correction.
+        net: Network of the correction.
 
     Returns:
         Index of its first number.
@@ -181,7 +181,7 @@ def filter_and_correct(
         packets: Packets, shape (count or more, PACKET_WIDTH).
         count: Number of packets to take.
         m: Memory of the correction, shape (memory_size,).
-        net: The correction.
+        net: Network of the correction.
     """
     start, first_packet, empty, last = 0, 0, fast[:0], m[TICK_PLACE] + rows
     for j in range(rows):
@@ -210,7 +210,7 @@ def apply_correction(f: FilterRecord, m: Vector, net: CorrectionNet) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: The correction.
+        net: Network of the correction.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(f.P[b, :n], row)
@@ -229,7 +229,7 @@ def remove_correction(f: FilterRecord, m: Vector, net: CorrectionNet) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: The correction.
+        net: Network of the correction.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(row[:n], f.P[b])
@@ -246,7 +246,7 @@ class LearnedEstimator:
     the filter's own.
 
     Args:
-        base: The filter.
+        base: Filter that is corrected.
         correction: Network and card.
         vehicle: The filter's vehicle, whose mass the network reads.
 

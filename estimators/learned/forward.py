@@ -267,7 +267,7 @@ def forward(net: PackedNetwork, x: Matrix, state: Matrix, out: Matrix) -> None:
     """Compute the network's outputs.
 
     Args:
-        net: The network.
+        net: Weights of the network.
         x: Observations, shape (N, inputs).
         state: Memory of each row, shape (N, memory), updated.
         out: Output, shape (N, width).

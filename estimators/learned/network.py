@@ -240,7 +240,7 @@ def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
     """Read the tensors and the metadata of a safetensors file.
 
     Args:
-        path: The file.
+        path: File in the safetensors format.
         what: Kind of file for messages.
 
     Returns:
@@ -285,7 +285,7 @@ def describe_network(network: Network) -> dict[str, object]:
     """Describe a network for its card.
 
     Args:
-        network: The network.
+        network: Network of the file.
 
     Returns:
         Sizes and kinds by name, JSON types only.
@@ -399,7 +399,7 @@ def collect_tensors(network: Network) -> Tensors:
     """Collect the tensors of a network for its file.
 
     Args:
-        network: The network.
+        network: Network of the file.
 
     Returns:
         Tensors by name.

@@ -1,4 +1,4 @@
-"""What the wrappers need of a vector env: its members, its cars, its snapshot and its spec."""
+"""Vector envs as the wrappers use them: attributes, cars, snapshot and spec."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,14 @@ IntArray = npt.NDArray[np.int64]
 
 
 class BatchedEnv(Protocol):
-    """The members of a vector env that steps all cars at once.
+    """The attributes of a vector env that steps all cars at once.
 
-    The final_... ones are a row's record before its newest reset. They are read in the step that
-    ended its episode.
+    The final_... attributes are a car's record before its newest reset. They are read in the step
+    that ended its episode.
     """
 
-    rows: Array  # fast rows, (N, k, FAST_WIDTH)
-    ticks_done: IntArray  # number of fast rows of each car, (N,)
+    rows: Array  # fast samples of each car, (N, k, FAST_WIDTH)
+    ticks_done: IntArray  # number of fast samples of each car, (N,)
     packets: Array  # (N, capacity, PACKET_WIDTH)
     delivered: IntArray  # number of packets of each car, (N,)
     final_rows: Array
@@ -36,19 +36,19 @@ class BatchedEnv(Protocol):
     slow_sensors: Sequence[Mapping[str, SlowSensor]]  # of each car, by name
     nominal: Sequence[Vehicle]  # of each car
     held_speed: Sequence[float | None]  # m/s, of each car where it is held
-    layout: tuple[ObservationEntry, ...]  # of a row's observation
+    layout: tuple[ObservationEntry, ...]  # of a car's observation
     dt: float  # tick (s)
 
 
 def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
-    """Return the true vehicles of some rows in this episode.
+    """Return the true vehicles of some cars in this episode.
 
     Args:
         base: Vector environment without wrappers.
-        rows: Indices of the rows.
+        rows: Indices of the cars.
 
     Returns:
-        Vehicle of each of these rows.
+        Vehicle of each of these cars.
 
     Raises:
         TypeError: The vehicles are out of reach.
@@ -83,10 +83,10 @@ def get_env_state(env: Any) -> Any:
 def make_vector_spec(
     spec: EnvSpec | None, single: type[gym.Wrapper[Any, Any, Any, Any]], kwargs: Mapping[str, Any]
 ) -> EnvSpec | None:
-    """Make the spec of a vector env whose rows wear the wrapper `single(**kwargs)`.
+    """Make the spec of a vector env whose cars have the wrapper `single(**kwargs)`.
 
-    `gym.make_vec` of it makes environments that are wrapped one by one: it puts no wrappers around
-    an env that is a vector by itself.
+    `gym.make_vec` puts no wrappers around an env that is a vector by itself. With this spec it
+    makes single environments and wraps each of them.
 
     Args:
         spec: Spec of the vector env, or None.

@@ -137,7 +137,7 @@ class Pinhole:
         """Compute the directions of the pixels of some rows in car axes, of unit depth.
 
         Args:
-            first: First row.
+            first: Index of the first row.
             last: Row behind the last one.
 
         Returns:
