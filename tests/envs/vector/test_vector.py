@@ -1,6 +1,7 @@
 """StabilityVectorEnv: every row has the bits of the environment alone."""
 
 import copy
+import itertools
 import json
 import pickle
 from typing import Any
@@ -23,15 +24,17 @@ FUSION = "sideslip/YawFusion-v0"
 UNEVEN = "sideslip/YawVisionUneven-v0"
 
 
-@pytest.mark.parametrize(
-    ("duration", "steps"),
-    [
-        pytest.param(0.25, 800, marks=pytest.mark.smoke),
-        pytest.param(3.0, 20_000, marks=pytest.mark.long),
-    ],
-)
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", IDS)
+BRIEF = [
+    pytest.param(*each, 0.25, 800, marks=pytest.mark.smoke)
+    for each in itertools.product(IDS, MODES)
+]
+LENGTHY = [
+    pytest.param(*each, 3.0, 20_000, marks=pytest.mark.long)
+    for each in zip(IDS, itertools.cycle(MODES), strict=False)
+]
+
+
+@pytest.mark.parametrize(("name", "mode", "duration", "steps"), [*BRIEF, *LENGTHY])
 def test_every_row_is_the_environment_alone(
     name: str, mode: str, duration: float, steps: int
 ) -> None:

@@ -1,5 +1,6 @@
 """EstimateObservation around the vector env: the bits of the one around single environments."""
 
+import itertools
 from typing import Any
 
 import gymnasium as gym
@@ -45,8 +46,7 @@ def test_members_that_interact_have_the_same_bits() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize(("env_id", "mode"), [*zip(IDS, itertools.cycle(MODES), strict=False)])
 def test_so_it_does_over_a_hundred_thousand_steps(env_id: str, mode: str) -> None:
     name = "course-kf" if env_id == "sideslip/YawGps-v0" else "multirate-kf"
     alone, together = wrapped(env_id, 5, mode, {"estimator": name})
