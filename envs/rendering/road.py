@@ -1,8 +1,7 @@
 """The scene of a car and its road from above: lane or cones, trail, the camera's field of view.
 
 A scene is read from the packed numbers of an episode (`engine.layout`). The road's direction at the
-car is drawn to the right, its left is up. A body has the car's width, and 1.62 wheelbases of
-length; the wheels are drawn at its sides.
+car is drawn to the right, its left is up. A body has the car's width and 1.62 wheelbases' length.
 """
 
 import math
