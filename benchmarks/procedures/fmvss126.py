@@ -62,7 +62,7 @@ class SineDwellRun:
 
 
 def _make_slow_steer(car: TestCar, side: float) -> Fields:
-    """Make the slowly rising steer; its first quarter is driven, where the car passes 0.375 g."""
+    """Make the slowly rising steer; its first quarter is driven, enough to pass 0.375 g."""
     seconds = 30.0
     return {
         "steering": "ramp", "onset": ONSET, "amplitude": side * _RAMP_RATE / car.ratio * seconds,
