@@ -2,18 +2,17 @@
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol, overload
+from typing import TYPE_CHECKING, Any, Protocol, overload
 
 from ..envs.validation import check_options
 from ..estimators.registry import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.lane_keeping import LaneKeeping
 from .controllers.lqr import Lqr
-from .controllers.model_following import ModelFollowing
 from .controllers.mpc import Mpc
 from .controllers.nmpc import AdaptiveLqr, AdaptiveNmpc, Nmpc
 from .controllers.two_dof import Feedforward, TwoDof
-from .controllers.yaw_stability import Esc, SlidingMode
+from .controllers.yaw_stability import Esc, ModelFollowing, SlidingMode
 from .env_info import AnyEnv
 from .learned.policy import ZIP, PolicyController, is_policy, list_shipped
 
@@ -82,32 +81,13 @@ class Agent(Protocol):
         """
 
 
-@overload
-def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
-    """Make a controller or policy by its name.
+if TYPE_CHECKING:
 
-    Args:
-        name: Name of the agent.
-        env: Env of this package.
-        options: Arguments of the agent, and `trust`.
+    @overload
+    def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller: ...
 
-    Returns:
-        The controller.
-    """
-
-
-@overload
-def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent:
-    """Make an agent by a factory.
-
-    Args:
-        name: Factory, or the agent itself.
-        env: Env of this package.
-        options: Arguments of the factory.
-
-    Returns:
-        The agent.
-    """
+    @overload
+    def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent: ...
 
 
 def make_agent(

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium as gym
 
 from ..envs.scenarios.scenario import Scenario
-from ..envs.sensors.gps import HDOP_LAWS
+from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice
 from ..estimators.vector import estimate as vector
 from ..estimators.vector.truth import TruthObservation as VectorTruthObservation

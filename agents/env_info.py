@@ -34,8 +34,8 @@ _TRANSPARENT = {
     "DictInfoToList HumanRendering ObstructView RecordEpisodeStatistics RecordVideo "
     "RenderCollection VectorizeTransformReward",
     "stable_baselines3": "Monitor VecCheckNan VecMonitor VecNormalize VecVideoRecorder",
-    __name__.partition(".")[0]: "CompactObservation EstimateObservation MemoryObservation "
-    "NativeObservation RewardScaleWrapper TruthObservation",
+    __name__.partition(".")[0]: "CompactObservation EstimateObservation NativeObservation "
+    "RewardScaleWrapper TruthObservation",
 }
 # A wrapper that overrides one of these may change observations or actions.
 _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
@@ -53,6 +53,11 @@ class EnvFacts:
     control_period: int  # ticks between two decisions
     reference: str  # name in `envs.task.REFERENCES`
     width: int  # number of entries of an action
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of an observation."""
+        return tuple(entry.name for entry in self.layout)
 
 
 class PlantKind(NamedTuple):

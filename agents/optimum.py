@@ -28,7 +28,6 @@ from .controllers.base import Controller
 from .design.sampled_model import (
     DesignModel,
     DesignSpec,
-    compute_cost_weights,
     make_design_model,
     make_tick_model,
 )
@@ -62,7 +61,7 @@ class LinearPlant:
     @property
     def driver(self) -> int:
         """Index of the driver's angle in x."""
-        return self.model.design_spec.states.index("driver")
+        return self.model.states.index("driver")
 
     @property
     def decay(self) -> float:
@@ -140,7 +139,7 @@ def _make_linear_plant(env: AnyEnv) -> LinearPlant:
     design_spec = DesignSpec(n, full, False, kind, "forces", scenario.disturbance_time)
     model = make_design_model(car, speed, design_spec)
     G1, _, C, _ = make_tick_model(car, speed, design_spec)
-    names, weights = design_spec.states, TICK * np.diag(compute_cost_weights(design_spec))
+    names, weights = design_spec.states, TICK * np.diag(design_spec.cost_weights)
     sd = np.zeros(len(names))
     sd[names.index("F_d")] = scenario.disturbance_force
     sd[names.index("N_d")] = scenario.disturbance_moment
@@ -232,7 +231,7 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
     base: Any = env.unwrapped
     facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
     filter_ = make_estimator(FILTER, **facts, **_make_true_options(env))
-    names = plant.model.design_spec.states
+    names = plant.model.states
     state_indices = [names.index(name) for name in OUTPUTS]
     filter_indices = [filter_.names.index(name) for name in OUTPUTS]
     covariances = np.zeros((plant.steps, len(names), len(names)))
@@ -250,7 +249,7 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
 
 def _select_gains(plant: LinearPlant, gains: Array) -> Array:
     """Select, from gains (..., n) on the state, those (..., 5) on the entries `Lqg.needs`."""
-    names = plant.model.design_spec.states
+    names = plant.model.states
     selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
     selected[..., -1] *= plant.decay
     return selected

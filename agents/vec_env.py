@@ -99,7 +99,7 @@ class _VecEnvRow:
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
         obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
         base: Any = self._env.unwrapped
-        return obs[self._i], make_info(base.reports[self._i].tolist())
+        return obs[self._i], make_info(base.engine.arrays.reports[self._i].tolist())
 
     def is_wrapped(self, wrapper_class: type) -> bool:
         """Return whether a layer has this class, or is the vector twin of it."""
@@ -125,23 +125,15 @@ class _EmptyInfo(dict[str, object]):
 EMPTY_INFO = _EmptyInfo()
 
 
-class NativeVecEnv(VecEnv):
+class _NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
     It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
     for bit, but for `infos`: where no episode ends it holds one empty dict that all rows share
     (`EMPTY_INFO`, which refuses to be written into). Where one ends, its row has the whole info of
     the last step, `terminal_observation` and `TimeLimit.truncated`. `reset_infos` are those of each
-    row's newest reset.
-
-    `set_options` takes the options of a single env's `reset`, for all rows or a list of them.
-
-    Args:
-        vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.
-
-    Raises:
-        TypeError: The env is of another kind.
-        ValueError: The env has another autoreset mode.
+    row's newest reset. `set_options` takes the options of a single env's `reset`, for all rows or a
+    list of them.
     """
 
     def __init__(self, vector_env: CarVectorEnv) -> None:
@@ -182,22 +174,11 @@ class NativeVecEnv(VecEnv):
         return np.asarray(obs)
 
     def step_async(self, actions: npt.NDArray[np.floating]) -> None:
-        """Store the actions for `step_wait`.
-
-        Args:
-            actions: Actions, shape (N, width).
-        """
+        """Store the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Apply each row's action for one control period.
-
-        Returns:
-            Observations (N, k) and rewards (N,) as float32, dones (N,) and N infos.
-
-        Raises:
-            ValueError: The actions have another shape or are not finite; then no row steps.
-        """
+        """Apply each row's action for one control period."""
         actions, self._actions = self._actions, None
         obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
         dones = terminated | truncated
@@ -216,7 +197,7 @@ class NativeVecEnv(VecEnv):
         """Store the infos that the resets of these rows returned."""
         reset_infos = {key: value for key, value in infos.items() if "final_" not in key}
         for i, info in zip(rows, _split_infos(reset_infos, rows), strict=True):
-            self.reset_infos[i] = make_info(self._base.reports[i].tolist()) | info
+            self.reset_infos[i] = make_info(self._base.engine.arrays.reports[i].tolist()) | info
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """Get a frame of each row, with render_mode="rgb_array"."""
@@ -224,14 +205,7 @@ class NativeVecEnv(VecEnv):
         return frames or ()
 
     def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
-        """Render all rows as one frame (height, width, 3); None for "human".
-
-        Args:
-            mode: As in stable-baselines3, without effect on the frame.
-
-        Returns:
-            The frame.
-        """
+        """Render all rows as one frame (height, width, 3); None for "human"."""
         return None if self.render_mode == "human" else super().render(mode)
 
     def close(self) -> None:
@@ -239,57 +213,25 @@ class NativeVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: _Indices = None) -> list[Any]:
-        """Get what a single env has of each row; AttributeError where rows do not have it.
-
-        Args:
-            attr_name: Name of the attribute.
-            indices: Rows, None for all.
-
-        Returns:
-            Values, one for each row.
-        """
+        """Get what a single env has of each row; AttributeError where rows do not have it."""
         return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: _Indices = None) -> None:
-        """Store a value beside the env for each row; AttributeError where the name is the env's.
-
-        Args:
-            attr_name: Name of the value.
-            value: Value.
-            indices: Rows, None for all.
-        """
+        """Store a value beside the env for each row; AttributeError where the name is the env's."""
         for row in self._get_rows(indices):
             row.set_wrapper_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a row's `reset` or a method of wrapped attributes; AttributeError without one.
-
-        Args:
-            method_name: Name of the method.
-            method_args: Arguments of the method.
-            indices: Rows, None for all.
-            method_kwargs: Arguments of the method by name.
-
-        Returns:
-            Results, one for each row.
-        """
+        """Call a row's `reset` or a method of wrapped attributes; AttributeError without one."""
         chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: _Indices = None
     ) -> list[bool]:
-        """Return for each row whether it has a wrapper's class or its vector twin.
-
-        Args:
-            wrapper_class: Class of the wrapper.
-            indices: Rows, None for all.
-
-        Returns:
-            Whether it has, one for each row.
-        """
+        """Return for each row whether it has a wrapper's class or its vector twin."""
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
     def _get_rows(self, indices: _Indices) -> list[_VecEnvRow]:
@@ -308,6 +250,9 @@ def make_vec_env(
 ) -> VecMonitor:
     """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
+    It has the bits of a `DummyVecEnv` of single environments with the same seeds. Its `infos` hold
+    one empty dict for all rows but those whose episode ends.
+
     Args:
         env_id: Id of an env with a native vector env.
         num_envs: Number of rows.
@@ -323,7 +268,7 @@ def make_vec_env(
         `VecEnv` that monitors episodes.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
-    bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
+    bridge = _NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
     bridge.action_space.seed(seed)
     bridge.seed(seed)
     return VecMonitor(bridge, monitor_file, tuple(info_keywords))

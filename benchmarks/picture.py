@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
 from ..envs.rendering.palette import INK, find_colour
-from .control.report import is_default_filter, select_complete
+from .control.entries import Entry
+from .control.report import select_complete
 from .control.tasks import TITLES, list_scored_tasks
 from .harness.metrics import METRICS
 from .harness.results import ResultRow, ShareMap, Suite
@@ -79,7 +80,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
 
 def _is_shown(row: ResultRow) -> bool:
     """Whether a row stands in the picture: of the scores those on the controller's own filter."""
-    return row.metric != "score" or is_default_filter(row.controller, row.estimator)
+    return row.metric != "score" or Entry(row.controller, row.estimator).is_default
 
 
 def _find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:

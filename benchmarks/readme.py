@@ -16,10 +16,9 @@ import typer
 from rich.console import Console
 
 from .. import __version__
-from .control.baseline_gaps import make_score_scales
-from .control.entries import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
+from .control.entries import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .control.run import Results, measure
-from .control.score import make_rows, rank_entries
+from .control.score import make_score_scales, rank_entries
 from .control.tasks import (
     NOMINAL,
     PARAMETERS,
@@ -31,7 +30,7 @@ from .control.tasks import (
     make_task_seeds,
 )
 from .harness.parallel import report_user_errors
-from .harness.results import ResultRow, read_json, write_json, write_text
+from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 
 README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
 PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
@@ -86,26 +85,26 @@ def _measure_first(
 ) -> list[ResultRow]:
     """Drive README's entries in every scored contest with steering; return the tiers' rows."""
     tasks = [item for item in list_scored_tasks() if item.tier and item.env_id == STEERING]
-    policies = {policy: kind for kind, pairs in LEARNED.items() for _, policy in pairs}
-    requests = [
-        ControlEntry(task, estimator, controller)
+    policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
+    cases = [
+        (task, Entry(*pair))
         for task in tasks
-        for entries in FIRST.values()
-        for controller, estimator in entries
-        if policies.get(controller, task.kind) == task.kind
+        for pairs in FIRST.values()
+        for pair in pairs
+        if policies.get(pair[0], task.kind) == task.kind
     ]
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, EPISODES)
-    results = measure(requests, seeds, jobs=jobs, console=console, title="README")
+    results = measure(cases, seeds, jobs=jobs, console=console, title="README")
     _check_driven(results)
     return _make_tier_rows(results, tasks, salt)
 
 
 def _check_driven(results: Results) -> None:
     """Raise ValueError for an entry that could not drive."""
-    for entry, result in results.outcomes.items():
+    for (task, entry), result in results.items():
         if result.error:
-            raise ValueError(f"{entry.label} in {entry.task.name}: {result.error}")
+            raise ValueError(f"{entry.label} in {task.name}: {result.error}")
 
 
 def _make_tier_rows(
@@ -115,9 +114,11 @@ def _make_tier_rows(
     rows: list[ResultRow] = []
     for tier in HEADS:
         scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
-        for standing in rank_entries(results.outcomes, tier, scales):
-            if controller in ("", standing.entry.controller):
-                metric_rows = (r for r in make_rows(standing, salt) if r.metric in METRICS)
+        for standing in rank_entries(results, tier, scales):
+            if controller in ("", standing.entry.agent):
+                suite = Suite("control", "", "")
+                standing.add_rows(suite, salt)
+                metric_rows = (row for row in suite.rows if row.metric in METRICS)
                 rows += [row for row in metric_rows if row.scenario == f"tier {tier}"]
     return rows
 
@@ -211,11 +212,10 @@ def _add_policy(
 
     Its contests' reference points are driven anew.
     """
-    estimators = {
-        kind: read for kind, pairs in LEARNED.items() for read, policy in pairs if policy == name
-    }
-    if not estimators:
-        known = ", ".join(policy for pairs in LEARNED.values() for _, policy in pairs)
+    known_entries = [(kind, entry) for kind, entries in LEARNED.items() for entry in entries]
+    policies = {kind: entry for kind, entry in known_entries if entry.agent == name}
+    if not policies:
+        known = ", ".join(entry.agent for _, entry in known_entries)
         raise ValueError(f"the matrix's policies are {known}, got {name!r}")
     tier_1 = [row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1")]
     versions = {row.env_version for row in tier_1}
@@ -224,11 +224,11 @@ def _add_policy(
         raise ValueError(f"expected rows of {STATE} in tier 1, of version {__version__}, got {got}")
     count = sum(task.tier == "1" for task in list_scored_tasks())
     episodes = -(-tier_1[0].n // count)  # n: of those that the rungs survived
-    tasks = [task for task in list_scored_tasks() if task.tier and task.kind in estimators]
-    requests = [ControlEntry(task, "", oracle) for task in tasks for oracle in (NOMINAL, STATE)]
-    requests += [ControlEntry(task, estimators[task.kind], name) for task in tasks]
+    tasks = [task for task in list_scored_tasks() if task.tier and task.kind in policies]
+    cases = [(task, Entry(oracle)) for task in tasks for oracle in (NOMINAL, STATE)]
+    cases += [(task, policies[task.kind]) for task in tasks]
     seeds = make_task_seeds(tier_1[0].salt, episodes)
-    results = measure(requests, seeds, jobs=jobs, console=console, title=name)
+    results = measure(cases, seeds, jobs=jobs, console=console, title=name)
     _check_driven(results)
     merged = [row for row in rows if row.controller != name]
     return merged + _make_tier_rows(results, tasks, tier_1[0].salt, name)

@@ -11,6 +11,7 @@ from latex2mathml.converter import convert
 project = "sideslip"
 author = "The sideslip authors"
 release = importlib.import_module("sideslip").__version__
+make_estimator = importlib.import_module("sideslip.estimators").make_estimator
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 exclude_patterns = ["_build"]
@@ -72,5 +73,7 @@ def block(self: Any, node: Any) -> None:
 
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    # autodoc reads defaults from the text of a signature; `FilterOptions` lists a filter's options
+    vars(make_estimator).pop("__signature__", None)
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("autodoc-process-docstring", typeset)

@@ -7,6 +7,7 @@ if __name__ != "sideslip.envs":
 from .record import Log, Record
 from .scenarios.manoeuvres import SCENARIOS, make_scenario
 from .scenarios.scenario import Scenario
+from .scenarios.world import World, make_world
 from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task import FAILURES, ObservationEntry
@@ -27,7 +28,9 @@ __all__ = [
     "StabilityEnv",
     "StabilityVectorEnv",
     "Vehicle",
+    "World",
     "critical_speed",
     "make_scenario",
     "make_vehicle",
+    "make_world",
 ]

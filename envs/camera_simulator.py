@@ -8,22 +8,24 @@ delay before the next tick delivers anything.
 import math
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 
-from .engine.layout import P, Z
-from .engine.step import finish_outputs, sample_slow_ticks
+from .engine.layout import EpisodeArrays, P, Z
+from .engine.outputs import finish_outputs, sample_slow_ticks
 from .engine.window import WINDOW
-from .engine.workspace import EpisodeArrays
 from .numerics import require_extra
 from .numerics.functions import PI, draw_uniforms
 from .numerics.jit import as_python
 from .numerics.packed import read
 from .record import PACKET, PACKET_WIDTH, Array
-from .sensors.camera.analytic import compute_preview_offset
-from .sensors.camera.detector import MAX_DELAY, count_delay_ticks, load_detector
+from .sensors.camera.analytic import (
+    MAX_DELAY,
+    compute_preview_offset,
+    count_delay_ticks,
+    load_detector,
+)
 from .sensors.slow import BLOCKS, CAMERA
 from .validation import check_mapping, describe_unknown
 from .vehicle.dynamics import Motion
@@ -66,17 +68,13 @@ class CameraSimulator:
         self.metadata_flags = {"nondeterministic": True} if delay == "measured" else {}
         self.finder.find(np.zeros(self.finder.camera.size[::-1], np.uint8))  # warm
 
-    def process_step(
-        self, before: Array, row: EpisodeArrays, done: int, bounds: Array, window: Array
-    ) -> None:
+    def process_step(self, before: Array, row: EpisodeArrays, done: int) -> None:
         """Replay the slow sensors of a step, with pictures.
 
         Args:
             before: Packed state before the step.
             row: Arrays of the episode.
             done: Number of ticks that the step took.
-            bounds: Bounds of the observation, shape (2, n).
-            window: Window of the step, whose columns are its ticks.
         """
         z = row.z
         z[_SLOW_STATE] = before[_SLOW_STATE]
@@ -85,11 +83,11 @@ class CameraSimulator:
         while j < done:
             frame = int(z[Z.slow[CAMERA].next_capture]) - first
             stop = min(frame, done)
-            count = sample_slow_ticks(row, j, stop, count, done, window)
+            count = sample_slow_ticks(row, j, stop, count, done)
             if frame <= done:
-                self.capture(row.p, z, read(window, WINDOW.track, stop - 1), first + stop)
+                self.capture(row.p, z, read(row.window, WINDOW.track, stop - 1), first + stop)
             j = stop
-        finish_outputs(row, len(row.rows), done, count, bounds)
+        finish_outputs(row, len(row.rows), done, count)
 
     def capture(self, p: Array, z: Array, motion: Motion, tick: int) -> None:
         """Take a picture for the packets that were captured at a tick, if there are any.
@@ -105,8 +103,9 @@ class CameraSimulator:
         if not is_captured.any():
             return
         key = int(z[Z.clock.key_low]), int(z[Z.clock.key_high])
-        heading = math.remainder(motion.psi - motion.theta, 2.0 * PI)
-        scene = self._scene_class(heading, motion.y, motion.s, motion.phi, 0.0, read(p, P.road))
+        yaw, pitch = float(p[P.errors.camera_yaw]), float(p[P.errors.camera_pitch])
+        heading = math.remainder(motion.psi - motion.theta + yaw, 2.0 * PI)
+        scene = self._scene_class(heading, motion.y, motion.s, motion.phi, pitch, read(p, P.road))
         self.picture = self.renderer.render_picture(scene, (key[0] | key[1] << 32, tick))
         self.finder.view = read(p, P.field_of_view)
         start = time.perf_counter()
@@ -125,47 +124,3 @@ class CameraSimulator:
             arrivals += tick + count_delay_ticks(seconds) - arrivals.min()
             queue[is_captured, PACKET.arrived] = arrivals
             z[Z.clock.next_due] = queue[:, PACKET.arrived].min()
-
-
-class CameraMixin:
-    """An environment whose camera may take pictures; `env.unwrapped.camera` has the newest.
-
-    With `vision="image"` a picture of the road is rendered at every frame, and a lane finder reads
-    it. A "measured" delay is not deterministic, which `spec`, `metadata` and `info` state.
-    """
-
-    camera: CameraSimulator | None = None
-    metadata: dict[str, Any]
-    _params: Array
-    _state: Array
-    _spec: EnvSpec | None = None
-
-    def _init_camera(
-        self, vision: str, delay: str | None, appearance: Mapping[str, object] | None
-    ) -> None:
-        if vision == "image":
-            self.camera = CameraSimulator(delay or "fitted", appearance)
-            self.metadata = {**self.metadata, **self.camera.metadata_flags}
-        elif appearance is not None:
-            raise ValueError("appearance is of pictures: vision='image'")
-
-    def _start_episode(self) -> None:
-        """Begin an episode whose tick 0 is packed, with its picture."""
-        if self.camera is not None:
-            self.camera.capture(self._params, self._state, read(self._state, Z.motion), 0)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """The spec that `gym.make` builds this env from."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        """Set the spec.
-
-        Args:
-            spec: Spec that states whether the env is deterministic.
-        """
-        if spec is not None and self.camera is not None and self.camera.metadata_flags:
-            spec.nondeterministic = True
-        self._spec = spec

@@ -8,27 +8,35 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 
-from .camera_simulator import CameraMixin
+from .camera_simulator import CameraSimulator
 from .engine.config import EnvConfig
-from .engine.layout import PARAMS_WIDTH, Z
+from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
-from .engine.views import compute_true_states, get_slow_sensors, get_vehicle, make_record
-from .engine.workspace import WorkspaceMixin
+from .engine.views import Episode, compute_true_states
+from .engine.workspace import Workspace
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record
-from .rendering.renderer import PackedArrays, SingleRenderMixin
+from .rendering.renderer import SingleRenderMixin
 from .scenarios.manoeuvres import ScenarioSource, make_scenario
 from .scenarios.scenario import Scenario
+from .scenarios.world import WorldSource, make_world
 from .sensors.link import SlowSensor
-from .task import REFUSED, RUNNING, WILD, ObservationEntry, make_info
+from .task import REFUSED, REPORT, RUNNING, WILD, ObservationEntry, make_info
 from .ticks import TICK
 from .validation import parse_action, warn_once
 from .vehicle.dynamics import Motion
 from .vehicle.parameters import Vehicle, VehicleSource, make_vehicle
+
+_SNAPSHOT = {
+    "params": "p", "state": "z", "switches": "switches", "rows": "rows", "packets": "packets",
+    "report": "report",
+}  # fmt: skip
+"""Arrays of the workspace by their names in a snapshot."""
 
 
 @functools.cache
@@ -37,12 +45,7 @@ def _compile_step() -> Callable[..., int]:
     return compile_call(step_workspace, np.zeros(1), np.zeros(1, np.float32))
 
 
-class StabilityEnv(
-    WorkspaceMixin,
-    CameraMixin,
-    SingleRenderMixin,
-    gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]],
-):
+class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
@@ -79,7 +82,8 @@ class StabilityEnv(
     Minus the integral over the step of
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steering added/0.05)^2,
     capped at 100 per second, which a failure costs for the rest of the episode too; N_z and the
-    added steering are those delivered; with "zero-slip" the yaw rate is not judged.
+    added steering are those delivered; with "zero-slip" the yaw rate is not judged. The world "v1"
+    adds 0.00025 s2 ((N_z(t) - N_z(t - 10 ms))/(10 ms N_max))^2.
 
     ## Episode end
     `terminated`: the car spun (sideslip above 0.5 rad) or left the ground, or the lane that a
@@ -91,7 +95,8 @@ class StabilityEnv(
 
     ## Options of reset
     `scenario`, `vehicle`, `friction`, `duration` (s), `state` (mapping of `v_x, v_y, gamma, psi, X,
-    Y, s, y, theta`, and `phi, phi_dot` where the car rolls); unknown keys raise ValueError.
+    Y, s, y, theta`, `phi, phi_dot` where the car rolls, `slip_f, slip_r` where its tyres relax);
+    unknown keys raise ValueError.
 
     Args:
         sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
@@ -112,10 +117,14 @@ class StabilityEnv(
         appearance: With "image", fields of `Appearance` that replace the clear road's.
         render_mode: None, "rgb_array" or "human".
         strict: Whether implausible numbers of the scenario and vehicles are refused.
+        world: Errors of car and sensors, drawn by the seed: name ("ideal", "v1"), mapping of ranges
+            or `World`, as `make_world` reads it.
+        lead_in: Gentle driving before the scenario (s), in which actions do nothing and cost
+            nothing: estimators and policies with memory settle.
         slow: By sensor ("camera", "gps"), fields of `SlowSensor` that replace the id's.
     """
 
-    config: EnvConfig
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -135,6 +144,8 @@ class StabilityEnv(
         appearance: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         strict: bool = True,
+        world: WorldSource = "ideal",
+        lead_in: float = 0.0,
         **slow: Mapping[str, Any] | None,
     ) -> None:
         car = make_vehicle(vehicle, strict)
@@ -142,19 +153,22 @@ class StabilityEnv(
         self.config = EnvConfig(
             sensors, make_scenario(scenario), car, nominal_vehicle, control_period, reference, fast,
             with_map, yaw_first, steering, on_bad_action, vision, delay, strict, slow,
+            make_world(world), lead_in,
         )  # fmt: skip
         self.control_period, self.reference = int(control_period), reference
         self._episode = self.config.base
         self._init_rendering(render_mode)
-        self._init_camera(vision, delay, appearance)
-
+        self.camera: CameraSimulator | None = None  # with `vision="image"`; has the newest picture
+        if vision == "image":
+            self.camera = CameraSimulator(delay or "fitted", appearance)
+            self.metadata = {**self.metadata, **self.camera.metadata_flags}
+        elif appearance is not None:
+            raise ValueError("appearance is of pictures: vision='image'")
         self.layout: tuple[ObservationEntry, ...] = self.config.layout
-        low, high = self.config.bounds.astype(np.float32)
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space, self.action_space = self.config.make_spaces()
         self._action_width = self.config.action_width
         self._fail_on_bad_action = on_bad_action == "fail"
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._action_width,), np.float32)
-        self._allocate(PARAMS_WIDTH)
+        self._workspace = Workspace(self.config)
         self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
@@ -178,17 +192,17 @@ class StabilityEnv(
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
         self.final_rows[:], self.final_packets[:] = self.rows, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
-        self._allocate(len(config.start.params))
-        reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row)
+        self._workspace.allocate(len(config.start.params))
+        reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._row)
         self._over = False
         self._start_episode()
         self.ticks_done, self.annotations = 1, {}
-        info = make_info(self._read_report())
+        info = make_info(self._workspace.read_report())
         if self.camera is not None:
             info |= self.camera.metadata_flags
         if self._traces:
             self._record_step()
-        return self._copy_observation(), info
+        return self._workspace.copy_observation(), info
 
     def step(
         self, action: npt.ArrayLike
@@ -209,37 +223,80 @@ class StabilityEnv(
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
         camera = self.camera
-        before = self._state if camera is None else self._state.copy()
+        row = self._workspace.row
+        before = row.z if camera is None else row.z.copy()
         done = self._advance(command)
         if done <= 0:
             if done == REFUSED:
                 raise ValueError(f"action {command.tolist()} is not finite; nothing was stepped")
-            self._obs[:] = 0.0
+            row.obs[:] = 0.0
         elif camera is not None:
-            camera.process_step(before, self._row, done, self._bounds, self._window)
+            camera.process_step(before, row, done)
         self.ticks_done = done
-        info = make_info(self._read_report())
+        info = make_info(self._workspace.read_report())
         if camera is not None:
             info |= camera.metadata_flags
         terminated, truncated = info["failure"] != RUNNING, info["is_success"]
         self._over = terminated or truncated
         if self._traces:
             self._record_step()
-        return self._copy_observation(), -info["cost"], terminated, truncated, info
+        return self._workspace.copy_observation(), -info["cost"], terminated, truncated, info
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Advance one control period; returns the ticks done, or the code of a refusal."""
-        done: int = _compile_step()(self._workspace, command)
+        done: int = _compile_step()(self._workspace.vector, command)
         if done >= WILD:
             done -= WILD
             warn_once(self, command)
         return done
 
+    def _start_episode(self) -> None:
+        """Begin an episode whose tick 0 is packed, with its picture."""
+        if self.camera is not None:
+            row = self._row
+            self.camera.capture(row.p, row.z, self.motion, 0)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The spec that `gym.make` builds this env from; it says whether it is deterministic."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        """Set the spec.
+
+        Args:
+            spec: Spec that states whether the env is deterministic.
+        """
+        if spec is not None and self.camera is not None and self.camera.metadata_flags:
+            spec.nondeterministic = True
+        self._spec = spec
+
+    @property
+    def _row(self) -> EpisodeArrays:
+        return self._workspace.row
+
+    @property
+    def rows(self) -> Array:
+        """Fast rows of the newest record, of which `ticks_done` are there, (n, FAST_WIDTH)."""
+        rows: Array = self._row.rows
+        return rows
+
+    @property
+    def packets(self) -> Array:
+        """Packets of the newest record, of which `delivered` are there, (max, PACKET_WIDTH)."""
+        packets: Array = self._row.packets
+        return packets
+
+    @property
+    def delivered(self) -> int:
+        """Number of packets of the newest record."""
+        return int(self._row.report[REPORT.packets])
+
     @property
     def record(self) -> Record:
         """The record of the newest step, or of tick 0 after a reset (a copy)."""
-        rows, packets = self.rows[: self.ticks_done], self.packets[: self.delivered]
-        return make_record(self._state, rows, packets)
+        return self._get_episode().record
 
     @property
     def dt(self) -> float:
@@ -254,18 +311,18 @@ class StabilityEnv(
     @property
     def vehicle(self) -> Vehicle:
         """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
-        return get_vehicle(self._episode, self._params, self._state)
+        return self._get_episode().vehicle
 
     @property
     def motion(self) -> Motion:
         """The true velocities, heading, place and roll now, in SI units."""
-        return read(self._state, Z.motion)
+        return read(self._row.z, Z.motion)
 
     @property
     def true_state(self) -> Array:
         """The `TrueState` now, shape (len(TrueState),); no sensor measures these."""
-        rows = self._params[None], self._state[None], self._switches[None]
-        return np.asarray(compute_true_states(*rows)[0])
+        row = self._row
+        return np.asarray(compute_true_states(row.p[None], row.z[None], row.switches[None])[0])
 
     @property
     def nominal(self) -> Vehicle:
@@ -280,27 +337,25 @@ class StabilityEnv(
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:
         """The slow sensors by name, with the clock phase that this episode drew."""
-        return get_slow_sensors(self._episode, self._state)
+        return self._get_episode().slow_sensors
 
     @property
     def redraws(self) -> int:
         """Number of unstable draws that this reset rejected."""
-        return int(self._state[Z.clock.redraws])
+        return int(self._row.z[Z.clock.redraws])
 
-    def _get_packed_arrays(self, row: int) -> PackedArrays:
-        return self._params, self._state, self._switches, self._report, self._episode
+    def _get_episode(self, row: int = 0) -> Episode:
+        arrays = self._row
+        rows, packets = arrays.rows[: self.ticks_done], arrays.packets[: self.delivered]
+        numbers = arrays.p, arrays.z, arrays.switches, arrays.report
+        return Episode(*numbers, self._episode, rows, packets)
 
     def get_state(self) -> dict[str, Any]:
         """Copy the state of env and generator, from which `set_state` continues bit for bit."""
-        return {
-            "params": self._params.copy(),
-            "state": self._state.copy(),
-            "switches": self._switches.copy(),
+        arrays = {name: getattr(self._row, part).copy() for name, part in _SNAPSHOT.items()}
+        return arrays | {
             "config": self._episode,
             "layout": self.layout,
-            "rows": self.rows.copy(),
-            "packets": self.packets.copy(),
-            "report": self._report.copy(),
             "progress": (self.ticks_done, self._over),
             "rng": copy.deepcopy(self.np_random),
         }
@@ -319,9 +374,9 @@ class StabilityEnv(
             raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._allocate(len(snapshot["params"]))
-        for name in ("_params", "_state", "_switches", "rows", "packets", "_report"):
-            getattr(self, name)[:] = snapshot[name.strip("_")]
+        self._workspace.allocate(len(snapshot["params"]))
+        for name, part in _SNAPSHOT.items():
+            getattr(self._row, part)[:] = snapshot[name]
         self._episode = snapshot["config"]
         self.ticks_done, self._over = snapshot["progress"]
         self.np_random = copy.deepcopy(snapshot["rng"])

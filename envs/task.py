@@ -120,16 +120,18 @@ def filter_reference(
 
 BETA_SCALE, GAMMA_SCALE, STEER_SCALE = 0.02, 0.1, 0.05  # rad, rad/s, rad
 EFFORT_WEIGHT, COST_CAP = 0.01, 100.0  # 1/s both
+RATE_TICKS = 10  # over which the yaw moment's rate is taken
 
 
 @jit
 def compute_cost_rate(
-    e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference_kind: int
-) -> Scalar:
+    e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference_kind: int,
+    moment_rate: Scalar = 0.0,
+) -> Scalar:  # fmt: skip
     """Compute the cost rate of a tick, capped at 100 per second.
 
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (added steering/0.05)^2,
-    angles in rad and rates in rad/s.
+    angles in rad and rates in rad/s, and what the moment's rate costs.
 
     Args:
         e_beta: Error of the sideslip angle (rad).
@@ -137,12 +139,14 @@ def compute_cost_rate(
         moment_share: Yaw moment as a fraction of its full scale.
         steer_added: Added steering angle (rad).
         reference_kind: Place of the reference in `REFERENCES`.
+        moment_rate: Cost rate of the yaw moment's rate (1/s).
 
     Returns:
         Cost rate (1/s).
     """
     b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
     c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
+    c = c + moment_rate
     if reference_kind != ZERO_SLIP:
         g = e_gamma * (1.0 / GAMMA_SCALE)
         c = c + g * g

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 import numpy.typing as npt
 from gymnasium import logger
-from gymnasium.vector import AutoresetMode
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 MAX_NUMBER = 1e12  # of a scenario or a vehicle: its ticks and its square stay finite
 _MAX_LISTED_ROWS = 8  # rows that a message lists
 _CONVERSION_ERRORS = (TypeError, ValueError, OverflowError)  # numpy's, for no numbers
@@ -167,23 +166,6 @@ def check_int(
     return int(value)
 
 
-def parse_autoreset_mode(autoreset_mode: object) -> AutoresetMode:
-    """Parse an autoreset mode or its name; ValueError for another.
-
-    Args:
-        autoreset_mode: The mode or its name.
-
-    Returns:
-        The mode.
-    """
-    try:
-        return AutoresetMode(autoreset_mode)
-    except ValueError:
-        known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        got = short_repr(autoreset_mode)
-        raise ValueError(f"unknown autoreset_mode {got}; known: {known}") from None
-
-
 def format_rows(rows: npt.ArrayLike) -> str:
     """Format rows for a message: "row 3" or "rows 1, 5, ...".
 
@@ -201,7 +183,7 @@ def format_rows(rows: npt.ArrayLike) -> str:
 
 
 def parse_seeds(seed: object, count: int) -> list[int | None]:
-    """Make a seed for each row.
+    """Make a seed for each row; ValueError or TypeError for none.
 
     Args:
         seed: A number s, of which row i gets s + i, a list (N,) of numbers or None, or None.
@@ -209,10 +191,6 @@ def parse_seeds(seed: object, count: int) -> list[int | None]:
 
     Returns:
         Seed of each row, or None.
-
-    Raises:
-        ValueError: For a list of another length or a negative seed.
-        TypeError: For a seed that is no whole number.
     """
     if seed is None:
         return [None] * count
@@ -231,18 +209,19 @@ def parse_seeds(seed: object, count: int) -> list[int | None]:
     return seeds
 
 
-def parse_reset_mask(mask: object, count: int) -> Mask:
+def parse_reset_mask(mask: Any, count: int) -> Mask:
     """Parse options["reset_mask"], all rows without it; TypeError or ValueError for no mask.
 
     Args:
-        mask: The mask, or None.
-        count: Number of rows.
+        mask: The mask, an array or a tensor, or None.
+        count: Number of rows N.
 
     Returns:
-        A mask of the rows, shape (count,).
+        A mask of the rows, shape (N,).
     """
     if mask is None:
         return np.ones(count, np.bool_)
+    mask = mask.cpu().numpy() if hasattr(mask, "cpu") else mask
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
         what = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
         raise TypeError(f"options['reset_mask'] is an array of bool, got {what}")
@@ -250,7 +229,7 @@ def parse_reset_mask(mask: object, count: int) -> Mask:
         raise ValueError(f"options['reset_mask'] has shape ({count},), got {mask.shape}")
     if not mask.any():
         raise ValueError("options['reset_mask'] resets no row")
-    return mask.copy()
+    return mask
 
 
 def split_options(options: Mapping[str, object], count: int) -> list[dict[str, Any]]:
@@ -258,7 +237,7 @@ def split_options(options: Mapping[str, object], count: int) -> list[dict[str, A
 
     Args:
         options: Options by name.
-        count: Number of rows.
+        count: Number of rows N.
 
     Returns:
         Options of each row by name.
@@ -410,7 +389,7 @@ def check_plausible(values: "DataclassInstance") -> None:
     entries = [spec for spec in dataclasses.fields(values) if "plausible" in spec.metadata]
     entries.sort(key=lambda spec: len(spec.metadata["per"]))  # ranges that depend on others last
     for entry in entries:
-        unit, _, (low, high), per = entry.metadata.values()
+        unit, (low, high), per = map(entry.metadata.__getitem__, ("unit", "plausible", "per"))
         value, scale = getattr(values, entry.name), math.prod(getattr(values, n) for n in per)
         low, high = scale * low, scale * high
         for number in value if isinstance(value, tuple) else (value,):

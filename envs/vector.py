@@ -1,45 +1,95 @@
 """StabilityVectorEnv: many cars in one compiled call a step, each with a single car's bits."""
 
-import copy
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.error import ResetNeeded
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import AutoresetMode
 
-from .engine.batch import step_rows
+from .engine.batch import IntArray, NumbaEngine
+from .engine.batch_env import BatchEnv, Infos
 from .engine.config import EnvConfig
-from .engine.episodes import EpisodeBatch
 from .engine.layout import Z
-from .record import Array
-from .rendering.renderer import PackedArrays, VectorRenderMixin
+from .engine.views import Episode, compute_true_states
+from .record import Array, Record
+from .rendering.renderer import VectorRenderMixin
+from .scenarios.scenario import Scenario
+from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task import REFUSED, WILD, make_infos
-from .validation import (
-    check_int,
-    format_rows,
-    parse_actions,
-    parse_autoreset_mode,
-    parse_reset_mask,
-    parse_seeds,
-    warn_once,
-)
+from .ticks import TICK
+from .validation import Mask, check_int, parse_actions, warn_once
+from .vehicle.parameters import Vehicle
 
 Observations = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-Infos = dict[str, Any]
+T = TypeVar("T")
 
 _INFO_MODES = ("all", "ends")
 
 
-class StabilityVectorEnv(
-    VectorRenderMixin, EpisodeBatch, VectorEnv[Observations, Any, npt.NDArray[Any]]
-):
+def make_rows(
+    num_envs: int, arguments: Mapping[str, Any], is_uniform: bool = False
+) -> tuple[StabilityEnv, list[EnvConfig]]:
+    """Make the rows of a batch, of which those with the same objects share an env and its config.
+
+    Args:
+        num_envs: Number of rows N.
+        arguments: Arguments of `StabilityEnv`; scenario and vehicle may each be a list (N,).
+        is_uniform: Whether they may not, and all rows have one config.
+
+    Returns:
+        The first row's env, and each row's config.
+    """
+    N = check_int("num_envs", num_envs, "environments")
+    count = 1 if is_uniform else N
+    if arguments.get("vision") == "image":
+        mode = "make_vec(..., vectorization_mode='sync')"
+        raise ValueError(f"vision='image' sees for one car at a time: {mode}")
+    columns = {}
+    for name in ("scenario", "vehicle"):  # arguments that may be a list
+        value = arguments.get(name)
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
+        columns[name] = value
+    envs: dict[tuple[int, ...], StabilityEnv] = {}
+    rows = []
+    for values in zip(*columns.values(), strict=True):
+        key = tuple(map(id, values))
+        if key not in envs:
+            named = zip(columns, values, strict=True)
+            own_arguments = {name: value for name, value in named if value is not None}
+            envs[key] = StabilityEnv(**{**arguments, **own_arguments})
+        rows.append(envs[key].config)
+    return next(iter(envs.values())), rows * N if is_uniform else rows
+
+
+class _LazyRows(Sequence[T]):
+    """Items of a batch's `count` rows, each made by `make_item` when it is read."""
+
+    def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
+        self._rows, self._make_item = range(count), make_item
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, i: int) -> T: ...
+    @overload
+    def __getitem__(self, i: slice) -> tuple[T, ...]: ...
+    def __getitem__(self, i: int | slice) -> T | tuple[T, ...]:
+        if isinstance(i, slice):
+            return tuple(map(self._make_item, self._rows[i]))
+        return self._make_item(self._rows[i])
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} rows>"
+
+
+class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
 
     Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
@@ -89,26 +139,21 @@ class StabilityVectorEnv(
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
-        self.num_envs = N = check_int("num_envs", num_envs, "environments")
-        self._mode = parse_autoreset_mode(autoreset_mode)
         if info not in _INFO_MODES:
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
         self._all_infos = info == "all"
         self._max_steps = max_episode_steps
         if max_episode_steps is not None:
             self._max_steps = check_int("max_episode_steps", max_episode_steps, "steps")
-        first_env, rows = _make_row_configs(arguments, N)
-        EpisodeBatch.__init__(self, rows)
-        self.reference = first_env.reference
+        _, rows = make_rows(num_envs, arguments)
+        super().__init__(autoreset_mode, rows)
         self._init_rendering(render_mode)
-        self.metadata["autoreset_mode"] = self._mode
-        self.single_observation_space = first_env.observation_space
-        self.single_action_space = first_env.action_space
-        self.observation_space = batch_space(first_env.observation_space, N)
-        self.action_space = batch_space(first_env.action_space, N)
-
-        self._started = False
-        self._n_over = 0  # rows that are over
+        self.engine = NumbaEngine(self.config, self.num_envs)
+        arrays = self.engine.arrays
+        self._obs, self._over, self._reports = arrays.obs, arrays.over, arrays.reports
+        self.rows, self.packets, self.ticks_done, self.delivered = arrays.record
+        final = self.engine.final
+        self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered = final
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -128,132 +173,121 @@ class StabilityVectorEnv(
 
     _spec: EnvSpec | None = None
 
-    def reset(
-        self, *, seed: Any = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observations, Infos]:
-        """Start episodes; where it raises, everything stays as it was.
+    def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
+        self._restart_rows(chosen, *self._make_configs(options, chosen), seeds)
+        self._has_over = bool(self._over.any())
 
-        Args:
-            seed: An int s (row i gets s + i), or a list (N,) of int or None.
-            options: Options of `StabilityEnv`, each one or a list (N,), and `reset_mask`.
-
-        Returns:
-            Observations (N, width), and the infos of the rows that were reset.
-
-        Raises:
-            ResetNeeded: If a mask leaves out rows that were never started.
-        """
-        N, remaining = self.num_envs, dict(options or {})
-        seeds, mask = parse_seeds(seed, N), parse_reset_mask(remaining.pop("reset_mask", None), N)
-        if not (self._started or mask.all()):
-            raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
-        chosen = np.flatnonzero(mask)
-        configs, config_index = self.apply_options(remaining, chosen.tolist())
-        rows = [i for i in chosen.tolist() if seeds[i] is not None]
-        new_generators = {i: seeding.np_random(seeds[i]) for i in rows}
-        for i, pair in new_generators.items():
-            self.generators[i], self.seeds[i] = pair
-        self.reset_rows(chosen, configs, config_index)
-        self.over[mask] = False
-        self._n_over, self._started = int(self.over.sum()), True
+    def _read_reset(self, mask: Mask) -> tuple[Observations, Infos]:
         if self._traces:
             self._record_step()
-        return self.obs.copy(), make_infos(self.reports, mask) if self._all_infos else {}
+        return self._obs.copy(), make_infos(self._reports, mask) if self._all_infos else {}
 
-    def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
-        """Hold each row's action for one control period.
+    def _list_over_rows(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(self._over).tolist()
+        return rows
 
-        Args:
-            actions: Fractions of full scale, shape (N, 1), or (N, 2) with `steering`.
-
-        Returns:
-            Observations, rewards (N,), terminated (N,), truncated (N,) and infos.
-
-        Raises:
-            ResetNeeded: If no episode was started, or a row that ended waits for its reset.
-            ValueError: If an action is refused; nothing is stepped.
-        """
-        N = self.num_envs
-        if not self._started:
-            raise ResetNeeded("no episode was started: call reset() first")
-        if self._n_over and self._mode == AutoresetMode.DISABLED:
-            raise ResetNeeded(
-                f"the episode is over in {format_rows(np.flatnonzero(self.over))}: "
-                "call reset() with a reset_mask"
-            )
-        config = self.config
+    def _step_rows(self, actions: Any) -> tuple[Observations, Array, Mask, Mask, Infos]:
+        N, config, over = self.num_envs, self.config, self._over
         commands = parse_actions(actions, N, config.action_width, config.on_bad_action == "fail")
-        over_rows = np.flatnonzero(self.over) if self._n_over else None
+        over_rows = np.flatnonzero(over) if self._has_over else None
         results = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
         rewards, terminated, truncated = results
-        n_ended = step_rows(self.arrays, commands, config.bounds, results, self.lane_buffers)
+        n_ended = self.engine.step(commands, results)
         if n_ended == REFUSED:
-            bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~self.over)
-            raise ValueError(
-                f"the action of {format_rows(bad)} is not finite, {commands[bad[0]].tolist()}; "
-                "nothing was stepped"
-            )
+            bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~over)
+            self._refuse_actions(bad.tolist(), commands)
         if n_ended >= WILD:
             n_ended -= WILD
             warn_once(self, commands)
         if over_rows is not None:
-            self.reset_rows(over_rows)
+            self._start_rows(over_rows, {}, {})
         if self._max_steps is not None:
             last_tick = (self._max_steps - 1) * self.control_period
-            is_timed_out = self.states[:, Z.clock.tick] > last_tick
+            is_timed_out = self.engine.arrays.states[:, Z.clock.tick] > last_tick
             truncated |= is_timed_out
-            n_ended += int((is_timed_out & ~self.over).sum())
-            self.over |= is_timed_out
+            n_ended += int((is_timed_out & ~over).sum())
+            over |= is_timed_out
         infos: Infos = {}
         if n_ended and self._mode == AutoresetMode.SAME_STEP:
             infos, n_ended = self._reset_finished(), 0
-        self._n_over = n_ended
+        self._has_over = n_ended > 0
         if self._all_infos:
-            infos |= make_infos(self.reports, np.ones(N, np.bool_))
+            infos |= make_infos(self._reports, np.ones(N, np.bool_))
         elif n_ended:
-            infos |= make_infos(self.reports, self.over)
+            infos |= make_infos(self._reports, over)
         if self._traces:
             self._record_step()
-        return self.obs.copy(), rewards, terminated, truncated, infos
+        return self._obs.copy(), rewards, terminated, truncated, infos
 
     def _reset_finished(self) -> Infos:
         """Reset the rows that are over; returns their last infos."""
-        final_obs, rows = np.full(self.num_envs, None), np.flatnonzero(self.over)
+        final_obs, over = np.full(self.num_envs, None), self._over.copy()
+        rows = np.flatnonzero(over)
         for i in rows:
-            final_obs[i] = self.obs[i].copy()
-        infos: Infos = {"final_info": make_infos(self.reports, self.over), "final_obs": final_obs}
-        for key in tuple(infos):
-            infos[f"_{key}"] = self.over.copy()
-        self.reset_rows(rows)
-        self.over[:] = False
+            final_obs[i] = self._obs[i].copy()
+        infos: Infos = {"final_info": make_infos(self._reports, over), "final_obs": final_obs}
+        infos |= {f"_{key}": over.copy() for key in infos}
+        self._start_rows(rows, {}, {})
         return infos
 
-    def _get_packed_arrays(self, row: int) -> PackedArrays:
-        numbers = self.params[row], self.states[row], self.switches[row], self.reports[row]
-        return *numbers, self.configs[row]
+    def _get_episode(self, row: int) -> Episode:
+        params, states, switches, *_ = self.engine.arrays
+        rows, packets = self.rows[row], self.packets[row]
+        record = rows[: self.ticks_done[row]], packets[: self.delivered[row]]
+        numbers = params[row], states[row], switches[row], self._reports[row]
+        return Episode(*numbers, self.configs[row], *record)
 
-    @property  # type: ignore[misc]  # without a setter, as in sync
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """Each row's generator, which draws one 64-bit key a reset."""
-        return tuple(map(self._get_generator, range(self.num_envs)))
+    def _map_episodes(self, read: Callable[[Episode], T]) -> Sequence[T]:
+        return _LazyRows(self.num_envs, lambda i: read(self._get_episode(i)))
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seed of each row's generator."""
-        for i in range(self.num_envs):
-            self._get_generator(i)  # a row without one gets one now
-        return tuple(self.seeds)
+    def dt(self) -> float:
+        """The base tick in seconds."""
+        return TICK
+
+    @property
+    def motion(self) -> Array:
+        """True `Motion` of each row now, in SI units, shape (N, len(Motion))."""
+        return np.array(self.engine.arrays.states[:, Z.motion[0] : Z.motion[-1] + 1])
+
+    @property
+    def true_state(self) -> Array:
+        """`TrueState` of each row now, which no sensor has, shape (N, len(TrueState))."""
+        return compute_true_states(*self.engine.arrays[:3])
+
+    @property
+    def record(self) -> Sequence[Record]:
+        """Each row's `StabilityEnv.record`."""
+        return self._map_episodes(lambda episode: episode.record)
+
+    @property
+    def scenario(self) -> Sequence[Scenario]:
+        """The scenario of each row's episode."""
+        return self._map_episodes(lambda episode: episode.config.scenario)
+
+    @property
+    def vehicle(self) -> Sequence[Vehicle]:
+        """The true vehicle of each row's episode, with what its seed drew."""
+        return self._map_episodes(lambda episode: episode.vehicle)
+
+    @property
+    def nominal(self) -> Sequence[Vehicle]:
+        """The vehicle that estimators and controllers of each row are designed from."""
+        return self._map_episodes(lambda episode: episode.config.nominal)
+
+    @property
+    def held_speed(self) -> Sequence[float | None]:
+        """Each row's speed in m/s that is held exactly (small-angle plant), or None."""
+        return self._map_episodes(lambda episode: episode.config.held_speed)
+
+    @property
+    def slow_sensors(self) -> Sequence[dict[str, SlowSensor]]:
+        """Each row's slow sensors by name, with the clock phases that its episode drew."""
+        return self._map_episodes(lambda episode: episode.slow_sensors)
 
     def get_state(self) -> dict[str, Any]:
         """Copy the state of all rows, from which `set_state` continues bit for bit."""
-        arrays = {name: array.copy() for name, array in self.arrays._asdict().items()}
-        return arrays | {
-            "layout": self.layout,
-            "configs": list(self.configs),
-            "rng": copy.deepcopy(self.generators),
-            "seeds": list(self.seeds),
-            "started": self._started,
-        }
+        return self._copy_state()
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -264,46 +298,4 @@ class StabilityVectorEnv(
         Raises:
             ValueError: If it has another number of rows, control period or observation.
         """
-        shape, own_shape = np.shape(snapshot["rows"]), self.rows.shape
-        if shape != own_shape:
-            raise ValueError(
-                f"the snapshot has {shape[0]} rows of {shape[1]} ticks a step, this env "
-                f"{own_shape[0]} of {own_shape[1]}"
-            )
-        if snapshot["layout"] != self.layout:
-            raise ValueError("the snapshot is of an env with other sensors or another observation")
-        for name, array in self.arrays._asdict().items():
-            if name != "params":
-                array[:] = snapshot[name]
-        self._set_params(snapshot["params"].copy())
-        self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
-        self.generators = copy.deepcopy(snapshot["rng"])
-        self._started, self._n_over = snapshot["started"], int(self.over.sum())
-        self._group_by_variant()
-
-
-def _make_row_configs(
-    arguments: Mapping[str, Any], count: int
-) -> tuple[StabilityEnv, list[EnvConfig]]:
-    """Make the first row's env, and each row's config; rows with the same objects share both."""
-    if arguments.get("vision") == "image":
-        mode = "make_vec(..., vectorization_mode='sync')"
-        raise ValueError(f"vision='image' sees for one car at a time: {mode}")
-    columns = {}
-    for name in ("scenario", "vehicle"):  # arguments that may be a list
-        value = arguments.get(name)
-        if not isinstance(value, list | tuple):
-            value = [value] * count
-        elif len(value) != count:
-            raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
-        columns[name] = value
-    envs: dict[tuple[int, ...], StabilityEnv] = {}
-    rows = []
-    for values in zip(*columns.values(), strict=True):
-        key = tuple(map(id, values))
-        if key not in envs:
-            named = zip(columns, values, strict=True)
-            own_arguments = {name: value for name, value in named if value is not None}
-            envs[key] = StabilityEnv(**{**arguments, **own_arguments})
-        rows.append(envs[key].config)
-    return next(iter(envs.values())), rows
+        self._restore_state(snapshot)

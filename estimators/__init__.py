@@ -14,7 +14,7 @@ May import `envs`; nothing of `agents` or `benchmarks`.
 
 from .analysis.linear_system import DualRate
 from .analysis.smoother import smooth
-from .design.config import FilterConfig
+from .design.options import FilterConfig, FilterOptions
 from .estimator import Estimator
 from .filters import FILTERS
 from .make import make_estimator, register_estimator
@@ -30,6 +30,7 @@ __all__ = [
     "EstimatorFactory",
     "EstimatorLike",
     "FilterConfig",
+    "FilterOptions",
     "UnobservableWarning",
     "make_estimator",
     "register_estimator",

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
+from .core.filter import advance, process_packet_all
 from .core.record import FILTER, FilterRecords
-from .design.options import FIND, find_columns
+from .design.options import FAST_CHANNELS, FIND
 from .design.periodic import count_ticks
-from .estimator import EMPTY, NO_NIS, Estimator, compile_advance, compile_process_packet
+from .estimator import EMPTY, NO_NIS, Estimator, TickOutputs, TickRecord, compile_filter_call
 from .protocol import compute_std
 
 _MAX_SEARCHED_LATENCY = 0.12  # s
@@ -125,7 +126,7 @@ class _LatencySearch:
         packets = np.ascontiguousarray(packets[is_past])
         nis, empty = np.full(len(packets), np.nan), np.zeros((0, 0))
         record = fast, count, packets, len(packets), 0, empty, empty, nis
-        compile_advance()(filters, gains, *record)
+        compile_filter_call(advance)(filters, gains, *record)
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
@@ -149,11 +150,11 @@ class LateEstimator(Estimator):
         self._search: _LatencySearch | None = None
         for channel, late in self.config.latency.items():
             if late == FIND:
-                self._search = _LatencySearch(find_columns(channel), self.dt)
+                self._search = _LatencySearch(FAST_CHANNELS[channel], self.dt)
                 self._search.begin(self.delayed_filters, self._rows, self._waiting)
                 late = 0.0
             lag = count_ticks(float(late), self.dt, f"{self.name}: a latency of {channel}")
-            self._fixed_lags |= dict.fromkeys(find_columns(channel), lag)
+            self._fixed_lags |= dict.fromkeys(FAST_CHANNELS[channel], lag)
 
     @property
     def _lags(self) -> dict[int, int]:
@@ -167,9 +168,7 @@ class LateEstimator(Estimator):
     def _step(self, fast: Array, packets: Array) -> None:
         self.take(fast, len(fast), packets, len(packets))
 
-    def _take(
-        self, record: tuple[Array, int, Array, int], outputs: tuple[Array, Array, Array]
-    ) -> None:
+    def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
         """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS."""
         (fast, rows, packets, count), (X, S, nis) = record, outputs
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
@@ -214,10 +213,10 @@ class LateEstimator(Estimator):
         pending_nis = np.full(len(pending), np.nan)
         if len(fast):
             record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
-            compile_advance()(self.delayed_filters, self.gains, *record)
+            compile_filter_call(advance)(self.delayed_filters, self.gains, *record)
         else:
             for packet in packets:
-                compile_process_packet()(self.delayed_filters, self.gains, packet)
+                compile_filter_call(process_packet_all)(self.delayed_filters, self.gains, packet)
         if len(nis):
             is_new = pending[:, _INDEX_COLUMN] >= 0.0
             nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
@@ -233,13 +232,13 @@ class LateEstimator(Estimator):
             rows = _align_rows(self._rows, self._lags)
             packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
             record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
-            compile_advance()(self.filters, self.gains, *record)
+            compile_filter_call(advance)(self.filters, self.gains, *record)
 
     @property
     def latency(self) -> dict[str, float]:
         """Latency in force (s) by channel."""
         channels = self.config.latency
-        return {channel: self._lags[find_columns(channel)[0]] * self.dt for channel in channels}
+        return {channel: self._lags[FAST_CHANNELS[channel][0]] * self.dt for channel in channels}
 
     @property
     def latency_sd(self) -> float:

@@ -18,14 +18,16 @@ from ..envs.sensors.slow import SLOW_NAMES
 from .core.filter import advance, process_packet_all, reset_filters, step_all, write_estimate
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
-from .design.config import FilterConfig
 from .design.models import STATES
+from .design.options import FilterConfig
 from .design.periodic import Schedule, compute_table_shape, count_ticks
 from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
 _T = TypeVar("_T")
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
+TickRecord = tuple[Array, int, Array, int]  # fast rows and their number, packets and theirs
+TickOutputs = tuple[Array, Array, Array]  # states, standard deviations and NIS, or empty ones
 EMPTY = np.zeros((0, 0))
 NO_NIS = np.zeros(0)
 
@@ -49,33 +51,26 @@ def compile_call(function: Callable[..., _T], *example_args: object) -> Callable
 
 
 _MATRIX, _VECTOR = np.zeros((1, 1)), np.zeros(1)
-
-
-def _compile_filter_call(function: Callable[..., _T], *example_args: object) -> Callable[..., _T]:
-    """Return a function of a filter's memory, its gains and these arguments as a plain call."""
-    return compile_call(function, np.zeros(1, FILTER), np.zeros((1, 1, 1)), *example_args)
-
-
-@cache
-def compile_advance() -> Callable[..., int]:
-    """Return `advance` as a plain call."""
-    return _compile_filter_call(advance, _MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX, _VECTOR)
+_Call = Callable[..., Any]
+_EXAMPLES: dict[_Call, tuple[object, ...]] = {
+    advance: (_MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX, _VECTOR),
+    process_packet_all: (np.zeros(PACKET_WIDTH),),
+    write_estimate: (_VECTOR, _MATRIX),
+    step_all: (_MATRIX, _MATRIX, 0),
+}
 
 
 @cache
-def compile_process_packet() -> Callable[..., None]:
-    """Return `process_packet_all` as a plain call."""
-    return _compile_filter_call(process_packet_all, np.zeros(PACKET_WIDTH))
+def compile_filter_call(function: _Call) -> _Call:
+    """Compile a function of `core.filter` to a plain call.
 
+    Args:
+        function: `advance`, `process_packet_all`, `write_estimate` or `step_all`.
 
-@cache
-def _compile_estimate() -> Callable[..., bool]:
-    return _compile_filter_call(write_estimate, _VECTOR, _MATRIX)
-
-
-@cache
-def _compile_step() -> Callable[..., int]:
-    return _compile_filter_call(step_all, _MATRIX, _MATRIX, 0)
+    Returns:
+        A callable with the same positional arguments.
+    """
+    return compile_call(function, np.zeros(1, FILTER), np.zeros((1, 1, 1)), *_EXAMPLES[function])
 
 
 class Estimator:
@@ -219,11 +214,16 @@ class Estimator:
         self._step(fast, packets)
 
     def _step(self, fast: Array, packets: Array) -> None:
-        done = _compile_step()(self.filters, self.gains, fast, packets, len(packets))
-        while done < len(fast):
-            self.design_missing()
+        done = compile_filter_call(step_all)(self.filters, self.gains, fast, packets, len(packets))
+        if done < len(fast):
             record = fast, len(fast), packets, len(packets)
-            done = compile_advance()(self.filters, self.gains, *record, done, EMPTY, EMPTY, NO_NIS)
+            self._finish(done, record, (EMPTY, EMPTY, NO_NIS))
+
+    def _finish(self, done: int, record: TickRecord, outputs: TickOutputs) -> None:
+        """Process the rows behind the first `done`, whose tables of gains may be missing."""
+        while done < record[1]:
+            self.design_missing()
+            done = compile_filter_call(advance)(self.filters, self.gains, *record, done, *outputs)
 
     def take(
         self,
@@ -248,14 +248,10 @@ class Estimator:
         """
         self._take((fast, rows, packets, count), (X, S, nis))
 
-    def _take(
-        self, record: tuple[Array, int, Array, int], outputs: tuple[Array, Array, Array]
-    ) -> None:
+    def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
         """Process rows and packets: record, outputs are arguments of `advance` around `start`."""
-        done = compile_advance()(self.filters, self.gains, *record, 0, *outputs)
-        while done < record[1]:
-            self.design_missing()
-            done = compile_advance()(self.filters, self.gains, *record, done, *outputs)
+        done = compile_filter_call(advance)(self.filters, self.gains, *record, 0, *outputs)
+        self._finish(done, record, outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Process one fast row: from the last tick to this one, with the gyro.
@@ -280,7 +276,7 @@ class Estimator:
         self._receive(values)
 
     def _receive(self, packet: Array) -> None:
-        compile_process_packet()(self.filters, self.gains, packet)
+        compile_filter_call(process_packet_all)(self.filters, self.gains, packet)
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record; errors as in `prepare_record`.
@@ -348,7 +344,7 @@ class Estimator:
     def _read_estimate(self, width: int) -> tuple[Array, Array]:
         """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
         x, P = np.empty(len(self.names)), np.zeros((width, width))
-        while not _compile_estimate()(self.filters, self.gains, x, P):
+        while not compile_filter_call(write_estimate)(self.filters, self.gains, x, P):
             self._design_cell(int(self._f.cell))
         return x, P
 

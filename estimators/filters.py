@@ -28,7 +28,7 @@ class FilterDefinition:
     poles: tuple[float, ...] = ()  # rad/s, where gains are placed
     second: str = ""  # model of a second layer
     options: tuple[tuple[str, Any], ...] = ()  # (option, its default) unlike the common defaults
-    hdop: tuple[tuple[float, float], ...] = ()  # (HDOP, factor on the GPS's noise)
+    hdop_table: tuple[tuple[float, float], ...] = ()  # (HDOP, factor on the GPS's noise)
     source: str  # paper with the equations
 
 
@@ -54,7 +54,7 @@ _ROBUST = (
     ("accel_scale_sd", 0.045),
     ("steer_rate", 3.0),
 )
-"""For a car of unknown parameters: found by `benchmarks.tuning.robust` on simulated drives."""
+"""For a car of unknown parameters: found on simulated drives with drawn errors of sensors."""
 
 FILTERS: dict[str, FilterDefinition] = {
     "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),
@@ -89,7 +89,7 @@ FILTERS: dict[str, FilterDefinition] = {
         gains="covariance",
         disturbances="walk",
         second="velocity-roll",
-        hdop=((1.0, 1.0), (20.0, 20.0)),
+        hdop_table=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
     # the poles of both have the least error of beta of a grid from 1 to 200 rad/s, on the training

@@ -1,6 +1,7 @@
 """Estimators by name: from a row of the table of filters, or a factory, and options."""
 
 import functools
+import inspect
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, overload
@@ -9,8 +10,9 @@ from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
 from ..envs.vehicle.parameters import COMS, VehicleSource, make_vehicle
 from .delayed_channels import LateEstimator
-from .design.assemble import assemble, remove_tyre_states, select_first_sensor
+from .design.assemble import assemble
 from .design.config import parse_config
+from .design.options import PARAMETERS
 from .estimator import Estimator
 from .filters import FILTERS
 from .protocol import EstimatorFactory, ForeignEstimator, get_label
@@ -47,7 +49,7 @@ def make_estimator(
         sensors: Available slow sensors by name ("camera", "gps").
         dt: Tick (s).
         speed: Speed (m/s) if it is held; None measures it with the front wheels.
-        **options: Options of a filter of `FILTERS`, which `FilterConfig` lists, or of the factory.
+        **options: Options of a filter of `FILTERS`, which `FilterOptions` lists, or of the factory.
 
     Returns:
         The estimator; what a factory builds comes as a `ForeignEstimator`.
@@ -72,11 +74,17 @@ def make_estimator(
     car = make_vehicle(vehicle)
     layers, schedules = assemble(config, car, dt, speed)
     estimator = (LateEstimator if config.latency else Estimator)(config, dt, layers, schedules)
-    is_multi_sensor = len(config.sensors) > 1  # no cycle of both to check
-    checked = remove_tyre_states(select_first_sensor(config) if is_multi_sensor else config)
+    checked = config.linear_part
     estimator.check(layers if checked is config else assemble(checked, car, dt, speed)[0])
     return estimator
 
+
+_SIGNATURE = inspect.signature(make_estimator)
+*_NAMED, _OTHERS = _SIGNATURE.parameters.values()
+# completions and `help` see every option of a filter
+make_estimator.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
+    parameters=[*_NAMED, *PARAMETERS, _OTHERS]
+)
 
 _LEARNED = f"{__package__}.learned.correction"  # rooms above this one, loaded when asked for
 ESTIMATORS = Registry(

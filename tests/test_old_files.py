@@ -35,9 +35,8 @@ from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.vehicle.parameters import WIRE_TABLES, Vehicle, make_vehicle
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, WIRE_TABLES, Vehicle, make_vehicle
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.learned.network import describe_network
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 OLD = Path(__file__).parent / "files/old"
@@ -64,7 +63,7 @@ def names_now() -> dict[str, list[str]]:
     calibration = sideslip.benchmarks.control.calibration
     return {
         "policy card": fields_of(sideslip.agents.learned.policy.Card),
-        "network": list(describe_network(load_policy(list_shipped()[0]).network)),
+        "network": list(load_policy(list_shipped()[0]).network.description),
         "correction card": fields_of(sideslip.estimators.learned.correction_file.CorrectionCard),
         "scenario": fields_of(Scenario),
         "vehicle": fields_of(Vehicle),
@@ -106,6 +105,7 @@ def test_a_scenario_a_vehicle_with_its_wires_and_a_camera_are_read() -> None:
     noisy = {"base": "gust", "duration": 0.5, "noise": {"gyro": 0.01}}
     assert make_scenario(OLD / "scenario.toml") == make_scenario(noisy)
     car, coms = make_vehicle(OLD / "vehicle.toml").to_dict(), make_vehicle("coms").to_dict()
+    coms["relaxation"] = PASSENGER_CAR.relaxation  # younger than the file
     assert car == pytest.approx(coms, nan_ok=True)
     assert read_wires(OLD / "vehicle.toml") == SignalCalibration(
         15.2, -1, 0.01, {"gps": 0.2}, {"gyro_noise": 0.01}
@@ -119,8 +119,8 @@ def test_rows_and_a_session_are_read() -> None:
         "control", "tier 1", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12, salt="ab12"
     )
     assert read_json(OLD / "rows.json") == [row]
-    assert controller.read_setup(OLD / "session.slip")["estimator"] == "exact-kf"
-    (block,) = controller.read_blocks(OLD / "session.slip")
+    assert controller.Session(OLD / "session.slip").setup["estimator"] == "exact-kf"
+    (block,) = controller.Session(OLD / "session.slip").blocks
     found = [messages.decode(arrival.data) for batch in block.batches for arrival in batch]
     kinds = [getattr(each, "kind", each) for each in found]
     assert kinds == [messages.DatagramKind.INERTIAL, messages.DatagramKind.END]
@@ -163,7 +163,7 @@ def test_a_training_goes_on_from_its_checkpoint(
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
     state = read_state(folder / trainer.CHECKPOINT)
     monkeypatch.setattr(trainer, "__version__", state["sideslip"])
-    task = trainer.read_task(folder)
-    found = trainer.train(task, state["steps"], folder, resume=True)
+    task = trainer.read_training(folder).task
+    found = trainer.Trainer(task, state["steps"], folder, resume=True).train()
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

@@ -3,30 +3,35 @@
 Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within
 the limits, and runs of the env that try the new actions with the pass's gains. A result costs what
 the env computes, failures included. It is a local optimum, sought from several starts.
+
+Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 """
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import P
+from ...envs.numerics.jit import as_python, jit
+from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
+from ...envs.vehicle.actuators import limit_angle
 from ..rollout import iterate_steps
-from .preview import Forecast, PlanState, make_forecast, read_plan_state
-from .sweep import (
+from .linearisation import (
     N_INPUTS,
     IlqrProblem,
+    Linearisation,
     PlanRun,
-    compute_limits,
     linearise_run,
     make_problem,
-    run_backward_pass,
 )
+from .preview import Forecast, PlanState, make_forecast, read_plan_state
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
@@ -34,11 +39,112 @@ if TYPE_CHECKING:
 Actions = npt.NDArray[np.float32]
 
 STEP_LENGTHS = (1.0, 0.4, 0.1)  # fractions of the step d that are tried in turn
-_FIRST_DAMPING = 1e-2  # damping of the first sweep, as for `run_backward_pass`
+_FIRST_DAMPING = 1e-2  # damping of the first sweep, as for `_run_backward_pass`
 _DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
 _DAMPING_FACTOR = 4.0  # from one damping to the next
 MAX_ITERATIONS = 60
 _STALL_RULE = (1e-3, 3)  # settled: a smaller fraction of the cost gained in so many steps in a row
+
+
+class Limits(NamedTuple):
+    """The limits of the inputs in every period."""
+
+    low: Array  # lower limits, shape (K, N_INPUTS)
+    high: Array  # upper limits, shape (K, N_INPUTS)
+    rate_low: Array  # lower limit of the steering by its rate, shape (K,)
+    rate_high: Array  # upper limit of the steering by its rate, shape (K,)
+    column: int  # scaled state that moves the rate's limits: the last command of added steering
+    slope: float  # rise of both rate limits per unit of the scaled state `column`
+
+
+def _compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> Limits:
+    """Compute limits by full scale, the wheels' stop, and the steering's rate along a run."""
+    fixed, K = problem.fixed, problem.fixed.periods
+    low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
+    low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0
+    if fixed.width < N_INPUTS:
+        return Limits(low, high, zero, zero, 0, 0.0)
+    task, column = fixed.task, problem.names.index("slewing")
+    clip_angle = as_python(limit_angle, ARRAYS)
+    low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
+    high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
+    position = run.states[:K, PlanState._fields.index("slewing")] / task.authority
+    max_change = task.slew * fixed.ticks / task.authority
+    slope = problem.scale[column] / task.authority
+    return Limits(low, high, position - max_change, position + max_change, column, slope)
+
+
+@jit
+def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
+    """Minimise q'd + d'Qd / 2 with low <= d <= high: d, and whether each part is free of limits."""
+    det = Q[0, 0] * Q[1, 1] - Q[0, 1] * Q[0, 1]
+    x = (Q[0, 1] * q[1] - Q[1, 1] * q[0]) / det
+    y = (Q[0, 1] * q[0] - Q[0, 0] * q[1]) / det
+    if low[0] < x < high[0] and low[1] < y < high[1]:
+        return x, y, True, True
+    min_cost, best, free = math.inf, np.zeros(2), np.zeros(2, np.bool_)
+    d = np.zeros(2)
+    for i in range(2):
+        for side in range(2):
+            other = 1 - i
+            d[i] = high[i] if side else low[i]
+            interior = -(q[other] + Q[0, 1] * d[i]) / Q[other, other]
+            d[other] = min(max(interior, low[other]), high[other])
+            cost = q @ d + 0.5 * (d @ (Q @ d))
+            if cost < min_cost:
+                min_cost = cost
+                best[:], free[:] = d, False
+                free[other] = d[other] == interior
+    return best[0], best[1], free[0], free[1]
+
+
+@jit
+def _run_backward_pass(
+    linearisation: Linearisation,
+    limits: Limits,
+    inputs: Matrix,
+    length: int,
+    damping: float,
+    d: Matrix,
+    G: Matrix,
+) -> None:
+    """Run the backward pass over a run's linearisation, with damping on the diagonal of Quu.
+
+    Fills d (K, 2) and G (K, 2, size), with zeros behind the run's length: an input u of the run
+    becomes u + d + G dx, with dx the scaled state less the run's. G = -Quu^-1 Qux where both inputs
+    are free. Where the rate limits the steering, the limit moves with the last command: so does the
+    gain.
+    """
+    # The cost to go from the next period's state is v'dx + dx'V dx / 2. With this period's cost,
+    # in the state and the inputs, it is q'(dx, du) + (dx, du)'Q (dx, du) / 2.
+    size = linearisation.F.shape[1]
+    V, v = linearisation.H[length][:size, :size].copy(), linearisation.g[length][:size].copy()
+    d[:], G[:] = 0.0, 0.0
+    low, high = np.empty(2), np.empty(2)
+    for k in range(length - 1, -1, -1):
+        F = linearisation.F[k]
+        q, Q = linearisation.g[k] + F.T @ v, linearisation.H[k] + F.T @ (V @ F)
+        Qxx, Qux, Quu = Q[:size, :size], Q[size:, :size].copy(), Q[size:, size:].copy()
+        low[:], high[:] = limits.low[k] - inputs[k], limits.high[k] - inputs[k]
+        low_1, high_1 = low[1], high[1]
+        if limits.slope > 0.0:  # the rate's limits, moved into the others
+            low[1] = min(max(limits.rate_low[k] - inputs[k, 1], low_1), high_1)
+            high[1] = max(min(limits.rate_high[k] - inputs[k, 1], high_1), low_1)
+        damped = Quu + damping * np.eye(2)
+        d[k, 0], d[k, 1], free_0, free_1 = _solve_input_qp(damped, q[size:], low, high)
+        gain = G[k]
+        if not free_1 and low_1 < d[k, 1] < high_1:
+            gain[1, limits.column] = limits.slope
+        if free_0 and free_1:
+            gain[:] = -np.linalg.solve(damped, Qux)
+        elif free_0:
+            gain[0] = -(Qux[0] + damped[0, 1] * gain[1]) / damped[0, 0]
+        elif free_1:
+            gain[1] = -(Qux[1] + damped[0, 1] * gain[0]) / damped[1, 1]
+        v = q[:size] + gain.T @ (Quu @ d[k] + q[size:]) + Qux.T @ d[k]
+        cross = gain.T @ Qux
+        V = Qxx + gain.T @ (Quu @ gain) + cross + cross.T
+        V = 0.5 * (V + V.T)
 
 
 def _simulate_run(
@@ -108,13 +214,13 @@ def _run_line_search(
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_steering(problem, run)
     linearisation = linearise_run(problem, forecast.known, nominal_run)
-    limits = compute_limits(problem, forecast, nominal_run)
+    limits = _compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
     inputs[:, : fixed.width] = nominal_run.actions
     d, G = np.empty_like(inputs), np.empty((*inputs.shape, size))
     gains = np.zeros((fixed.periods, fixed.width, len(PlanState._fields)))
     while damping < _DAMPING_LIMITS[1]:
-        run_backward_pass(linearisation, limits, inputs, run.length, damping, d, G)
+        _run_backward_pass(linearisation, limits, inputs, run.length, damping, d, G)
         gains[:, :, problem.state_indices] = -G[:, : fixed.width] / problem.scale
         for length in STEP_LENGTHS:
             candidate = nominal_run.actions + length * d[:, : fixed.width]

@@ -6,11 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
+from ...envs.engine.layout import ActuatorState, EpisodeArrays, P, StepVariant, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
-from ...envs.engine.tick import StepVariant
 from ...envs.engine.window import compute_profile_angle, make_window
-from ...envs.engine.workspace import EpisodeArrays
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
 from ...envs.numerics.primitives import Scalar
@@ -64,6 +62,8 @@ class PlanState(NamedTuple):
     theta: Scalar
     phi: Scalar
     phi_dot: Scalar
+    slip_f: Scalar
+    slip_r: Scalar
     T_l: Scalar  # torque of the left motor (N m)
     T_r: Scalar
     integral: Scalar
@@ -172,11 +172,12 @@ def _simulate_actions(
     base: Any, snapshot: dict[str, Any], actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
     """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
-    z, window = snapshot["state"], make_window(1)
+    z = snapshot["state"]
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
     p, switches = snapshot["params"], snapshot["switches"]
     obs, report = np.empty(len(base.layout), np.float32), np.zeros(len(REPORT))
-    row = EpisodeArrays(p, z, switches, obs, snapshot["rows"], snapshot["packets"], report)
+    record = snapshot["rows"], snapshot["packets"]
+    row = EpisodeArrays(p, z, switches, obs, *record, report, bounds, make_window(1))
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     last = n * len(actions)
     drive, driver = np.empty((last + 1, len(ActuatorState._fields))), np.empty(last + 1)
@@ -184,7 +185,7 @@ def _simulate_actions(
     for tick in range(last + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
-        step_vehicle(row, held_actions[tick], 1, bounds, window)
+        step_vehicle(row, held_actions[tick], 1)
     # an unstable simulation may give NaN or inf
     return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
 

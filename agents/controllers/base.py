@@ -14,6 +14,7 @@ from ...envs.numerics.primitives import ARRAYS, Scalar
 from ...envs.record import Array
 from ...envs.vehicle.actuators import compute_torque_limit
 from ...envs.vehicle.dynamics import CarParams
+from ...envs.vehicle.linear import Bicycle
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..env_info import AnyEnv, get_env_facts
 
@@ -53,7 +54,7 @@ class Controller(ABC):
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = get_env_facts(env)
-        names = [entry.name for entry in facts.layout]
+        names = facts.names
         self.grip = None if grip is None else check_positive("grip", grip)
         reads_friction = grip is not None or self.knows_friction
         self._true_friction = reads_friction and FRICTION in names
@@ -83,6 +84,11 @@ class Controller(ABC):
     @cached_property
     def _car(self) -> CarParams:
         return make_car(self.vehicle)
+
+    @property
+    def _bicycle(self) -> Bicycle:
+        """Numbers by which laws know the nominal car."""
+        return Bicycle(*map(float, self.nominal.lateral))
 
     def _get_friction(self, inputs: Array) -> Array:
         """Friction that a grip limit uses, shape (N,)."""
@@ -178,18 +184,6 @@ def _describe_wrapper(missing: list[str]) -> str:
     if any(name.endswith("_hat") for name in missing):
         return "; wrap the env in sideslip.estimators.EstimateObservation"
     return ""
-
-
-def list_entry_names(env: AnyEnv) -> set[str]:
-    """Collect the names of the entries in the env's observation.
-
-    Args:
-        env: Env, single or vector.
-
-    Returns:
-        Names, without order.
-    """
-    return {entry.name for entry in get_env_facts(env).layout}
 
 
 def check_positive(name: str, value: float, allow_zero: bool = False) -> float:

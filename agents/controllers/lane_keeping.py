@@ -18,7 +18,7 @@ from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, make_vision_model
 from ...envs.vehicle.parameters import Vehicle
-from ..design.sampled_model import SPEEDS, interpolate_gains, solve_lqr
+from ..design.sampled_model import SPEEDS, DesignModel, interpolate_gains
 from ..env_info import AnyEnv
 from .base import Controller, check_positive
 
@@ -50,9 +50,9 @@ _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
 def _make_lane_model(
-    vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Make the model of `Lane` over a period (ticks) and its cost, as `solve_lqr` takes them."""
+    vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float, inputs: slice
+) -> DesignModel:
+    """Make the model of `Lane` over a period (ticks) and its cost, for some of the two inputs."""
     # Inputs are the fraction of the full yaw moment (N m), and rad added to the driver's steering.
     n, T = len(AT), period * TICK
     plane = make_vision_model(vehicle, speed)
@@ -85,7 +85,9 @@ def _make_lane_model(
     W = T * np.diag([share / scale**2 for share, scale in zip(shares, scales, strict=True)])
     cost_matrix = cost_outputs.T @ W @ cost_outputs
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
-    return G, H, cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
+    Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
+    inputs_cost = R[inputs, inputs], N[:, inputs]
+    return DesignModel(G, H[:, inputs], Q, *inputs_cost, Lane._fields, len(MOVED))
 
 
 @jit
@@ -154,13 +156,8 @@ class LaneKeeping(Controller):
         if not 0.0 <= haste < math.inf:
             raise ValueError(f"haste is zero or more, got {haste!r}")
         speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
-        gains, car = [], self.nominal
-        for speed in speeds:
-            G, H, Q, R, N = _make_lane_model(
-                car, speed, self.control_period, self.full_scale, haste
-            )
-            optimum = solve_lqr(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
-            gains.append(optimum[0])
+        design, car = (self.control_period, self.full_scale, haste, inputs), self.nominal
+        gains = [_make_lane_model(car, speed, *design).solve()[0] for speed in speeds]
         self._design = (
             np.ascontiguousarray(np.array(gains)[:, None, None]),
             (np.array(speeds), np.zeros(1), np.zeros(1)),

@@ -16,8 +16,8 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
 from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_gain_table
-from ..env_info import AnyEnv
-from .base import Controller, check_positive, list_entry_names
+from ..env_info import AnyEnv, get_env_facts
+from .base import Controller, check_positive
 
 Inputs = namedtuple(
     "Inputs",
@@ -77,7 +77,7 @@ def _lqr_law(
         max_w = max(straight + sliding_slip[row], 0.0)
         min_w = min(straight - sliding_slip[row], 0.0)
         low, high = _clip(min_w, low, high), _clip(max_w, low, high)
-        u, w = _solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_share[row], low, high)
+        u, w = _solve_box_qp(KS, n, u, w, max_share[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
 
 
@@ -122,9 +122,9 @@ class Lqr(Controller):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
             raise ValueError(f"span rises from above zero, with 2 knots or more: {span}, {knots}")
-        names = list_entry_names(env)
+        names = get_env_facts(env).names
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
-        kind = next((kind for kind, pair in pairs.items() if names.issuperset(pair)), "none")
+        kind = next((kind for kind, pair in pairs.items() if set(pair) <= set(names)), "none")
         substitutes = ("beta_ref", "beta_ref")
         self.needs = (
             *Inputs._fields[: IN.gamma_hat],
@@ -159,7 +159,7 @@ class Lqr(Controller):
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
-    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
+    def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
         """List entries of an observation that a subclass reads behind `Inputs`."""
         return ()
 
@@ -230,16 +230,10 @@ def _clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 @jit
 def _solve_box_qp(
-    s_uu: Scalar,
-    s_uw: Scalar,
-    s_ww: Scalar,
-    u: Scalar,
-    w: Scalar,
-    max_u: Scalar,
-    low: Scalar,
-    high: Scalar,
+    KS: Matrix, n: int, u: Scalar, w: Scalar, max_u: Scalar, low: Scalar, high: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Find the point with |u| <= max_u, low <= w <= high that is nearest to (u, w)."""
+    """Find the point with |u| <= max_u, low <= w <= high nearest to (u, w) by S = KS[:, n:]."""
+    s_uu, s_uw, s_ww = KS[0, n], KS[0, n + 1], KS[1, n + 1]
     # The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: the point is (u, w)
     # itself where it is within, else the least of the four edges' own minima.
     if absolute(u) <= max_u and low <= w <= high:

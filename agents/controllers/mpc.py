@@ -13,7 +13,7 @@ from scipy.sparse import csc_matrix
 from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
-from ..design.sampled_model import SPEEDS, DesignSpec, compute_cost_to_go, make_design_model
+from ..design.sampled_model import SPEEDS, DesignSpec, make_design_model
 from ..env_info import AnyEnv
 from .lqr import IN, Lqr, make_design_state
 
@@ -58,7 +58,7 @@ def _condense_program(
         rows, next_rows = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
         Sx[next_rows], Su[next_rows] = model.G @ Sx[rows], model.G @ Su[rows]
         Su[next_rows, i * m : (i + 1) * m] += model.H
-    Q = block_diag(*[model.Q] * horizon, compute_cost_to_go(model)[1])
+    Q = block_diag(*[model.Q] * horizon, model.solve()[1])
     R = block_diag(*[model.R] * horizon)
     N = np.vstack([block_diag(*[model.N] * horizon), np.zeros((n, horizon * m))])
     scale = np.tile(limits[: len(design_spec.inputs)], horizon)

@@ -12,23 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.engine.tick import StepVariant
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
-from ...envs.vehicle.dynamics import DisturbanceForces, Motion
+from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ...envs.vehicle.tyres import MIN_SPEED, TYRE_LAWS, has_load_shift
+from ...envs.vehicle.tyres import MIN_SPEED
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
 from ..design.prediction import (
     PredictionModel,
     PredictionStart,
-    make_blocks,
+    PredictionTask,
     make_prediction_model,
-    replace_tyres,
 )
 from ..design.sampled_model import interpolate_gains
 from ..env_info import AnyEnv, list_plant_kinds
@@ -65,6 +63,20 @@ class Design(NamedTuple):
     iterations: int  # of a decision
 
 
+def _make_blocks(steps: int, count: int) -> Array:
+    """Make lengths of at most `count` blocks that grow towards the end of a horizon of steps."""
+    ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
+    return np.diff(ends, prepend=0)
+
+
+@jit
+def _replace_tyres(car: CarParams, C_f: Scalar, C_r: Scalar, mu: Scalar) -> CarParams:
+    """Replace a car's stiffnesses of a tyre (N/rad) and its friction, under all wheels."""
+    # C_f and C_r are the fields 4 and 5, mu of the left wheels is 10, mu_r of the right ones 19
+    tyres, left, right = (C_f, C_r), (mu,), (mu,)
+    return CarParams(*(car[:4] + tyres + car[6:10] + left + car[11:19] + right + car[20:]))
+
+
 @jit
 def _shift_plan(plan: Vector, blocks: Vector, m: int, steps: float) -> None:
     """Shift a plan by so many steps of the prediction, each block towards its next."""
@@ -98,15 +110,15 @@ def _prepare_prediction(
     roll: Vector,
     added_command: Scalar,
     max_moment: Scalar,
-) -> tuple[PredictionStart, Matrix, Matrix]:
-    """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
+) -> PredictionTask:
+    """Prepare the predictions of a row's decision."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
     # added_command: the last one of added steering (rad), max_moment: fraction of full scale
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
     rear = x[IN.rear_stiffness] if design.scheduled else model.car.C_r
-    car = replace_tyres(model.car, front, rear, friction)
+    car = _replace_tyres(model.car, front, rear, friction)
     gamma, driver, refs = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
     steady = (
         compute_reference(driver, v, design.target, LAGGED)
@@ -138,7 +150,8 @@ def _prepare_prediction(
     )
     per_force = (1.0 / per[0], 1.0 / per[1])
     K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
-    return start, K, _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
+    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
+    return PredictionTask(model, start, K, terminal, design.blocks)
 
 
 @jit
@@ -155,16 +168,15 @@ def _nmpc_law(
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
         last_command = state[row, LAST.added_command]
-        start, K, T = _prepare_prediction(
+        task = _prepare_prediction(
             design, x[row], friction[row], rolls[row], last_command, max_moment[row]
         )
         plan, extra_iterations = state[row, PLAN:].copy(), _FIRST_ITERATIONS
         if state[row, LAST.status] == SOLVED:
             _shift_plan(plan, blocks, m, design.steps)
             extra_iterations = 0
-        J, share, added_command = update_plan(
-            design.model, start, K, T, blocks, plan, design.iterations + extra_iterations
-        )
+        iterations = design.iterations + extra_iterations
+        J, share, added_command = update_plan(task, plan, iterations)
         if np.isfinite(J):
             state[row, PLAN:], state[row, LAST.added_command] = plan, added_command
             state[row, LAST.status] = SOLVED
@@ -225,34 +237,32 @@ class Nmpc(Lqr):
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
-        design_spec, target = self.design_spec, make_reference_params(self.nominal)
-        period = design_spec.period
-        steps = max(round(check_positive("horizon", horizon) / (period * TICK)), 1)
-        blocks = make_blocks(steps, MAX_VARIABLES // self.width)
+        spec, target = self.design_spec, make_reference_params(self.nominal)
+        steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
+        blocks = _make_blocks(steps, MAX_VARIABLES // self.width)
         self.memory = PLAN + self.width * len(blocks)
-        kind, lags, yaw_first = _read_plant_kind(env, design_spec.kind)
-        model = make_prediction_model(
-            self.vehicle, kind, period, lags,
-            disturbance_time if design_spec.disturbances == "forces" else math.inf,
-            target.rest if design_spec.kind == LAGGED else 1.0,
-            design_spec.steer_weight, self.full_scale, self.authority, yaw_first,
-        )  # fmt: skip
+        plants = list_plant_kinds(env)
+        plant, *others = plants
+        if others:
+            raise ValueError(
+                "the rows of a vector env share one prediction, but their plants differ"
+            )
         self.design = Design(
-            model,
+            make_prediction_model(self.vehicle, plant, spec, target, self.authority),
             target,
             np.ascontiguousarray(self.table[..., : -self.width]),
             self._terminal,
             self.axes,
             blocks,
             int(self.scheduled),
-            ("none", "forces", "rates").index(design_spec.disturbances),
-            self.control_period / period,
+            ("none", "forces", "rates").index(spec.disturbances),
+            self.control_period / spec.period,
             iterations,
         )
 
-    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
+    def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
         rolling = ("phi_hat", "phi_rate_hat")
-        self._rolling = names.issuperset(rolling)
+        self._rolling = set(rolling) <= set(names)
         return rolling if self._rolling else ()
 
     def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:
@@ -278,20 +288,6 @@ class Nmpc(Lqr):
         _nmpc_law(inputs, state, action, max_moment, friction, rolls, self.design)
 
 
-def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bool]:
-    """Read the plant's variant, whether actuators lag, and whether the yaw moment comes first."""
-    plants = list_plant_kinds(env)
-    if len(plants) != 1:
-        raise ValueError("the rows of a vector env share one prediction, but their plants differ")
-    (plant,) = plants
-    law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
-    shifting = has_load_shift(small, law, roll)
-    kind = StepVariant(
-        small, law, reference, roll, has_driver=0, lag=2, has_load_shift=shifting, road=0
-    )
-    return kind, plant.lags, plant.yaw_first
-
-
 class AdaptiveLqr(Lqr):
     """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
 
@@ -306,7 +302,7 @@ class AdaptiveLqr(Lqr):
     def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
         super().__init__(env, stiffness=TYRES, grip=grip, **options)
 
-    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
+    def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
         extra = (INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()
         return (*super()._list_extra_entries(names), *extra)
 

@@ -16,7 +16,8 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
-from ..design.pi import CAR, PLACEMENTS, POLE, compute_plant, design_pi, make_nominal_car, sample_pi
+from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
+from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_info import AnyEnv
 from .base import Controller, check_positive, integrate_antiwindup
 
@@ -36,13 +37,13 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _compute_denominator(car: Vector, V: Scalar) -> Scalar:
+def _compute_denominator(car: Bicycle, V: Scalar) -> Scalar:
     """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
 
     At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
     a speed, m V^2 = 2 (l_r C_r - l_f C_f).
     """
-    mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
+    mV2, excess = car.m * V * V, car.l_f * car.C_f - car.l_r * car.C_r
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
         denominator = select(denominator < 0.0, -min_size, min_size)
@@ -50,20 +51,23 @@ def _compute_denominator(car: Vector, V: Scalar) -> Scalar:
 
 
 @jit
-def _compute_static_gain(car: Vector, V: Scalar) -> Scalar:
+def _compute_static_gain(car: Bicycle, V: Scalar) -> Scalar:
     """Compute N_z / delta_f for a steady beta of zero (N m/rad), tie-vision (24)."""
-    m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
+    m, l_f, l_r, C_f, C_r = car.m, car.l_f, car.l_r, car.C_f, car.C_r
     mV2 = m * V * V
     numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
     return numerator / _compute_denominator(car, V)
 
 
 @jit
-def _compute_sideslip_gain(car: Vector, V: Scalar) -> Scalar:
+def _compute_sideslip_gain(car: Bicycle, V: Scalar) -> Scalar:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
-    plant, m = compute_plant(car, V), car[CAR.m]
-    yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
-    return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
+    m = car.m
+    a11, _, a21, a22, _, _, b22 = compute_bicycle_coefficients(
+        m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
+    )
+    yaw_rate = a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
+    return -(a21 + a22 * yaw_rate) / b22
 
 
 @jit
@@ -124,7 +128,7 @@ class Feedforward(Controller):
 
     def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
-        self._design = make_nominal_car(self.nominal), self.full_scale
+        self._design = self._bicycle, self.full_scale
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _feedforward_law(inputs, action, self._design)
@@ -178,7 +182,7 @@ class TwoDof(Controller):
             pis = [design_pi(self.nominal, float(v), pole, placement) for v in SPEEDS]
         table = factor * np.array([(pi.k_p, pi.k_i) for pi in pis])
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
-        car = make_nominal_car(self.nominal)
+        car = self._bicycle
         follows = int(feedforward == FEEDFORWARDS[0])
         self._design = follows, car, self.k_p, self.k_i, self.full_scale, wait, dt
 

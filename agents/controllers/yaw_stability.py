@@ -1,12 +1,18 @@
-"""ESC as cars have it and sliding mode: yaw rate and sideslip angle are held by the yaw moment."""
+"""Controllers of yaw rate and sideslip angle: ESC, sliding mode, and following of a model.
+
+The laws compute the nominal car's plant at the measured speed, the mean of the two front wheels'.
+
+The papers' short names, such as dakf-stability, are those of docs/PAPERS.md.
+"""
 
 import math
 from collections import namedtuple
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.numerics.jit import jit
+from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import (
@@ -19,27 +25,60 @@ from ...envs.task import (
     make_reference_params,
 )
 from ...envs.ticks import TICK
+from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
 from ...envs.vehicle.parameters import Vehicle
-from ..design.pi import (
-    BicyclePlant,
-    compute_drift,
-    compute_plant,
-    compute_plant_python,
-    compute_steady_yaw_rate,
-    make_nominal_car,
-)
 from ..design.sampled_model import SPEEDS, find_cell
-from ..env_info import AnyEnv
-from .base import (
-    Controller,
-    check_positive,
-    integrate_antiwindup,
-    list_entry_names,
-)
-from .model_following import MIN_SPEED
+from ..env_info import AnyEnv, get_env_facts
+from .base import Controller, check_positive, integrate_antiwindup
 
 BANDWIDTH = 16.0  # rad/s, double pole of the yaw-rate loop
+MODEL_BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
+_MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed
 _RELEASE = 0.5  # s, time constant by which the integral decays within the dead band
+
+
+class BicyclePlant(NamedTuple):
+    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
+
+    a11: Scalar  # effect of beta on beta' (1/s)
+    a12: Scalar  # effect of gamma on beta'
+    a21: Scalar  # effect of beta on gamma' (1/s^2)
+    a22: Scalar  # effect of gamma on gamma' (1/s)
+    b11: Scalar  # effect of the steering angle on beta' (1/s)
+    b21: Scalar  # effect of the steering angle on gamma' (1/s^2)
+    b22: Scalar  # effect of the yaw moment on gamma' (1/(kg m^2))
+
+
+@jit
+def _compute_plant(car: Bicycle, V: Scalar) -> BicyclePlant:
+    """Compute the plant of a nominal car at a speed (m/s)."""
+    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
+        car.m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
+    )
+    return BicyclePlant(a11, a12, a21, a22, b11, b21, b22)
+
+
+@jit
+def _compute_drift(plant: BicyclePlant, beta: Scalar, gamma: Scalar) -> tuple[Scalar, Scalar]:
+    """Compute A [beta, gamma], the rates without inputs."""
+    return plant.a11 * beta + plant.a12 * gamma, plant.a21 * beta + plant.a22 * gamma
+
+
+@jit
+def _compute_steady_yaw_rate(plant: BicyclePlant, beta: Scalar, delta: Scalar) -> Scalar:
+    """Compute the yaw rate (rad/s) that keeps a sideslip angle at a steering angle (rad)."""
+    return -(plant.a11 * beta + plant.b11 * delta) / plant.a12
+
+
+@jit
+def _solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> tuple[Scalar, Scalar]:
+    """Solve B u = [first, second] for steering (rad) and yaw moment (N m): dakf-stability (26)."""
+    delta_f = first / plant.b11
+    return delta_f, (second - plant.b21 * delta_f) / plant.b22
+
+
+_plant, _drift = as_python(_compute_plant), as_python(_compute_drift)
+_inputs = as_python(_solve_inputs)
 
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
 """Columns of the law's inputs; the last one only where the sideslip angle is bounded."""
@@ -53,7 +92,7 @@ def _compute_yaw_gains(
     # both poles at the bandwidth (rad/s): s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2;
     # where the yaw equation's own damping is more, k_p is zero
     I = vehicle.yaw_inertia  # noqa: E741
-    a22 = compute_plant_python(make_nominal_car(vehicle), speed).a22
+    a22 = _plant(Bicycle(*map(float, vehicle.lateral)), speed).a22
     return max(I * (2.0 * bandwidth + a22), 0.0), I * bandwidth * bandwidth
 
 
@@ -122,7 +161,7 @@ class Esc(Controller):
         stiffness: float | None = None,
         grip: float | None = None,
     ) -> None:
-        bounded = "beta_hat" in list_entry_names(env)
+        bounded = "beta_hat" in get_env_facts(env).names
         self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
         super().__init__(env, grip)
         bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
@@ -151,11 +190,11 @@ SlidingModeInputs = namedtuple(
     "wheel_left wheel_right steer_command steer beta_ref gamma_ref beta_hat gamma_hat",
 )
 """Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate."""
-Memory = namedtuple("Memory", "beta_ref gamma_ref known")
+SlidingModeMemory = namedtuple("SlidingModeMemory", "beta_ref gamma_ref known")
 """The references of the last decision, for their derivatives, and whether there was one."""
 
 SLIDING_IN = SlidingModeInputs(*range(8))
-LAST = Memory(*range(3))
+SLIDING_LAST = SlidingModeMemory(*range(3))
 
 
 @jit
@@ -174,7 +213,7 @@ def _compute_reference(
         return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
     beta, gamma = compute_reference(x[SLIDING_IN.steer_command], v, target, kind)
     if kind == ZERO_SLIP:
-        gamma = compute_steady_yaw_rate(plant, beta, x[SLIDING_IN.steer])
+        gamma = _compute_steady_yaw_rate(plant, beta, x[SLIDING_IN.steer])
     return beta, gamma
 
 
@@ -182,28 +221,28 @@ def _compute_reference(
 def _sliding_mode_law(
     x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
-    """Compute the actions from `SlidingModeInputs` x and update the `Memory` state."""
+    """Compute the actions from `SlidingModeInputs` x and update the `SlidingModeMemory` state."""
     car, target, kind, pole, rate, layer, full_scale, dt = design
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), MIN_SPEED)
-        plant = compute_plant(car, v)
+        v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), _MIN_SPEED)
+        plant = _compute_plant(car, v)
         beta, gamma = x[n, SLIDING_IN.beta_hat], x[n, SLIDING_IN.gamma_hat]
         delta = x[n, SLIDING_IN.steer]
         xi = _compute_surface_slope(plant, pole)
         beta_ref, gamma_ref = _compute_reference(x[n], v, plant, target, kind)
         beta_ref_rate, gamma_ref_rate = 0.0, 0.0  # the references' derivatives
-        if state[n, LAST.known] > 0.0:
-            beta_ref_rate = (beta_ref - state[n, LAST.beta_ref]) / dt
-            gamma_ref_rate = (gamma_ref - state[n, LAST.gamma_ref]) / dt
+        if state[n, SLIDING_LAST.known] > 0.0:
+            beta_ref_rate = (beta_ref - state[n, SLIDING_LAST.beta_ref]) / dt
+            gamma_ref_rate = (gamma_ref - state[n, SLIDING_LAST.gamma_ref]) / dt
         s = gamma - gamma_ref + xi * (beta - beta_ref)
-        drift_rates = compute_drift(plant, beta, gamma)
+        drift_rates = _compute_drift(plant, beta, gamma)
         s_rate = drift_rates[1] + plant.b21 * delta - gamma_ref_rate
         # s' without the yaw moment
         s_rate += xi * (drift_rates[0] + plant.b11 * delta - beta_ref_rate)
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
-        state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref
-        state[n, LAST.known] = 1.0
+        state[n, SLIDING_LAST.beta_ref], state[n, SLIDING_LAST.gamma_ref] = beta_ref, gamma_ref
+        state[n, SLIDING_LAST.known] = 1.0
         action[n, 0] = min(max(N_z / full_scale, -max_share[n]), max_share[n])
 
 
@@ -224,7 +263,7 @@ class SlidingMode(Controller):
         grip: Grip limit, as for `Controller`.
     """
 
-    memory = len(Memory._fields)
+    memory = len(SlidingModeMemory._fields)
 
     def __init__(
         self,
@@ -234,12 +273,12 @@ class SlidingMode(Controller):
         layer: float = 0.2,
         grip: float | None = None,
     ) -> None:
-        yaw_rate = "gamma_hat" if "gamma_hat" in list_entry_names(env) else "gyro"
+        yaw_rate = "gamma_hat" if "gamma_hat" in get_env_facts(env).names else "gyro"
         self.needs = (*SlidingModeInputs._fields[: SLIDING_IN.gamma_hat], yaw_rate)
         super().__init__(env, grip)
         self.pole, self.rate = check_positive("pole", pole), check_positive("rate", rate)
         self._design = (
-            make_nominal_car(self.nominal),
+            self._bicycle,
             make_reference_params(self.nominal),
             REFERENCES.index(self.reference),
             self.pole,
@@ -251,3 +290,148 @@ class SlidingMode(Controller):
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
+
+
+ModelInputs = namedtuple(
+    "ModelInputs",
+    "wheel_left wheel_right steer_command beta_ref gamma_ref beta_hat gamma_hat d1_hat d2_hat",
+)
+"""Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
+ModelMemory = namedtuple("ModelMemory", "delta_f_sum N_z_sum driver known")
+"""The integrals of steering (rad) and yaw moment (N m), the driver's last steering command (rad),
+and whether there was one."""
+
+MODEL_IN = ModelInputs(*range(9))
+MODEL_LAST = ModelMemory(*range(4))
+
+
+def compute_feedback_gains(
+    vehicle: Vehicle, speed: float, bandwidth: Sequence[float] = MODEL_BANDWIDTH
+) -> tuple[Array, Array]:
+    """Compute P and I of C_fb = P + I / s, from errors of beta and gamma to delta_f and N_z.
+
+    (31) solved for C_fb gives P_n^-1 diag(K / s) = B^-1 diag(K) - B^-1 A diag(K) / s, a proper
+    PI. The closed loop is diag(K / (s + K)) and the poles of A, which the PI's zeros cancel: it is
+    internally stable where the nominal car is, below its critical speed. The printed (32) is this
+    for equal K only.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        bandwidth: K_beta and K_gamma (rad/s).
+
+    Returns:
+        P and I, each of shape (2, 2).
+    """
+    plant = _plant(Bicycle(*map(float, vehicle.lateral)), float(speed))
+    columns = np.diag(np.asarray(bandwidth, np.float64))
+    P = [_inputs(plant, *column) for column in columns]
+    I = [_inputs(plant, *(-x for x in _drift(plant, *column))) for column in columns]  # noqa: E741
+    return np.array(P).T, np.array(I).T
+
+
+@jit
+def _model_following_law(
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
+) -> None:
+    """Compute the actions from `ModelInputs` x and update the `ModelMemory` state.
+
+    max_share: largest yaw moment as a fraction of full scale (N,). design: nominal car, reference
+    parameters, index of the reference, K_beta and K_gamma (rad/s), 1 or 0 for (26), full scale
+    (N m), authority (rad), control period (s).
+    """
+    car, target, kind, K, rejection, full_scale, authority, dt = design
+    for n in range(len(x)):
+        v = maximum(0.5 * (x[n, MODEL_IN.wheel_left] + x[n, MODEL_IN.wheel_right]), _MIN_SPEED)
+        driver = x[n, MODEL_IN.steer_command]
+        beta_ref, gamma_ref = x[n, MODEL_IN.beta_ref], x[n, MODEL_IN.gamma_ref]
+        plant = _compute_plant(car, v)
+        last_driver = state[n, MODEL_LAST.driver] if state[n, MODEL_LAST.known] > 0.0 else driver
+        old = compute_reference(last_driver, v, target, kind)
+        new = compute_reference(driver, v, target, kind)
+        reference_rates = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
+        if kind == LAGGED:
+            approach = (1.0 - target.rest) / TICK
+            reference_rates = (approach * (new[0] - beta_ref), approach * (new[1] - gamma_ref))
+        if kind == ZERO_SLIP:  # the yaw rate is free: the one that keeps beta_ref
+            gamma_ref = _compute_steady_yaw_rate(plant, beta_ref, driver)
+            last_gamma_ref = _compute_steady_yaw_rate(plant, beta_ref, last_driver)
+            reference_rates = (reference_rates[0], (gamma_ref - last_gamma_ref) / dt)
+        drift_rates = _compute_drift(plant, beta_ref, gamma_ref)
+        p_beta = K[0] * (beta_ref - x[n, MODEL_IN.beta_hat])
+        p_gamma = K[1] * (gamma_ref - x[n, MODEL_IN.gamma_hat])
+        # (28) by the references' derivatives, P of (31), and (26) at once: B^-1 is linear
+        delta_f, N_z = _solve_inputs(
+            plant,
+            reference_rates[0] - drift_rates[0] + p_beta - rejection * x[n, MODEL_IN.d1_hat],
+            reference_rates[1] - drift_rates[1] + p_gamma - rejection * x[n, MODEL_IN.d2_hat],
+        )
+        delta_f_sum, N_z_sum = state[n, MODEL_LAST.delta_f_sum], state[n, MODEL_LAST.N_z_sum]
+        delta_f, N_z = delta_f + delta_f_sum, N_z + N_z_sum  # (33)
+        steer = min(max(delta_f, driver - authority), driver + authority)
+        limit = max_share[n] * full_scale
+        moment = min(max(N_z, -limit), limit)
+        drift_rates = _compute_drift(plant, p_beta, p_gamma)
+        # I of (31), forward Euler
+        steps = _solve_inputs(plant, -drift_rates[0] * dt, -drift_rates[1] * dt)
+        delta_f_sum = integrate_antiwindup(delta_f_sum, steps[0], delta_f, steer)
+        N_z_sum = integrate_antiwindup(N_z_sum, steps[1], N_z, moment)
+        state[n, MODEL_LAST.delta_f_sum], state[n, MODEL_LAST.N_z_sum] = delta_f_sum, N_z_sum
+        state[n, MODEL_LAST.driver], state[n, MODEL_LAST.known] = driver, 1.0
+        action[n, 0] = moment / full_scale
+        action[n, 1] = (steer - driver) / authority
+
+
+class ModelFollowing(Controller):
+    """Steering and yaw moment by dakf-stability (33), for an env whose action has both.
+
+    The yaw rate is gamma_hat where the observation has it, else the gyro's. The references are the
+    env's, but "zero-slip" takes the yaw rate that keeps beta_ref. Derivatives follow the steering
+    at one speed, as the speed's noise would drown a difference. "lagged" has those of its lag.
+
+    Anti-windup is conditional integration of each input: an integral holds while its input is at
+    the limit (yaw moment: full scale; steering: the authority around the driver's) and the error
+    would push it further out.
+
+    Args:
+        env: Env of the controller, whose action steers.
+        bandwidth: K_beta and K_gamma (rad/s).
+        rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
+        grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
+    """
+
+    memory = len(ModelMemory._fields)
+
+    def __init__(
+        self,
+        env: AnyEnv,
+        bandwidth: Sequence[float] = MODEL_BANDWIDTH,
+        rejection: bool = True,
+        grip: float | None = None,
+    ) -> None:
+        substitutes = {} if "gamma_hat" in get_env_facts(env).names else {"gamma_hat": "gyro"}
+        if not rejection:  # whatever stands there is multiplied by zero
+            substitutes |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
+        self.needs = tuple(substitutes.get(name, name) for name in ModelInputs._fields)
+        super().__init__(env, grip)
+        if self.width != 2:
+            raise ValueError("ModelFollowing needs an env whose action steers (steering=True)")
+        K = [float(value) for value in bandwidth]
+        if len(K) != 2 or not all(0.0 < value < math.inf for value in K):
+            raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
+        self._design = (
+            self._bicycle,
+            make_reference_params(self.nominal),
+            REFERENCES.index(self.reference),
+            np.array(K),
+            float(rejection),
+            self.full_scale,
+            self.authority,
+            self.control_period * TICK,
+        )
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        _model_following_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -1,14 +1,13 @@
 """Gauss-Newton on plans of `prediction`: gradients by differences, steps by trial, in lanes."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import count_lanes
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
-from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
+from .prediction import N_RESIDUALS, N_TERMINAL, PlanBatch, PredictionTask, simulate_plans
 
 # A variable of a plan is a fraction of the full yaw moment or of the steering's authority, which is
 # added to the regulator's action.
@@ -20,45 +19,25 @@ _MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first candidate; later 
 _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
-class _PlanBatch(NamedTuple):
-    """Plans side by side and their results, one column for each."""
-
-    plans: Matrix  # variables: fractions of the inputs' full scale, shape (variables, count)
-    perturbations: Matrix  # offsets behind the limits, in a variable's unit, shape as `plans`
-    limits: Matrix  # 1 or -1 where a block starts at a limit, shape (variables, count)
-    residuals: Matrix  # residuals, whose squares sum to J, shape (residuals, count)
-    first: Matrix  # first yaw moment (of full scale) and added steering (rad), shape (2, count)
-
-
 @jit
-def _make_plan_batch(variables: int, blocks: Vector, count: int) -> _PlanBatch:
+def _make_plan_batch(variables: int, blocks: Vector, count: int) -> PlanBatch:
     """Make a batch of so many plans of zeros, with one column for each."""
     shape, n_residuals = (variables, count), N_RESIDUALS * blocks.sum() + N_TERMINAL
     plans, perturbations, limits = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     residuals, first = np.zeros((n_residuals, count)), np.zeros((2, count))
-    return _PlanBatch(plans, perturbations, limits, residuals, first)
+    return PlanBatch(plans, perturbations, limits, residuals, first)
 
 
 @jit
-def _simulate_batch(
-    model: PredictionModel,
-    start: PredictionStart,
-    K: Matrix,
-    terminal: Matrix,
-    blocks: Vector,
-    batch: _PlanBatch,
-) -> None:
-    """Simulate any number of plans, as many at a time as there are lanes, as `update_plan`."""
+def _simulate_batch(task: PredictionTask, batch: PlanBatch) -> None:
+    """Simulate any number of plans, as many at a time as there are lanes."""
     width, (variables, count) = count_lanes(), batch.plans.shape
-    chunk = _make_plan_batch(variables, blocks, width)
+    chunk = _make_plan_batch(variables, task.blocks, width)
     for c in range(0, count, width):
         n = min(width, count - c)
         chunk.plans[:, :n] = batch.plans[:, c : c + n]
         chunk.perturbations[:, :n] = batch.perturbations[:, c : c + n]
-        simulate_plans(
-            model, start, K, terminal, blocks,
-            chunk.plans, chunk.perturbations, chunk.residuals, chunk.limits, chunk.first,
-        )  # fmt: skip
+        simulate_plans(task, chunk)
         batch.residuals[:, c : c + n] = chunk.residuals[:, :n]
         batch.limits[:, c : c + n] = chunk.limits[:, :n]
         batch.first[:, c : c + n] = chunk.first[:, :n]
@@ -74,7 +53,7 @@ def _sum_squares(residuals: Matrix, J: Vector) -> None:
 
 
 @jit
-def _compute_normal_equations(batch: _PlanBatch, A: Matrix, g: Vector) -> None:
+def _compute_normal_equations(batch: PlanBatch, A: Matrix, g: Vector) -> None:
     """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences.
 
     Column 0 of the batch is the plan itself; in column i + 1 its variable i is perturbed.
@@ -126,7 +105,7 @@ def _solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vecto
 
 
 @jit
-def _fill_perturbations(plan: Vector, batch: _PlanBatch) -> None:
+def _fill_perturbations(plan: Vector, batch: PlanBatch) -> None:
     """Fill every column with the plan; a column perturbs one variable, the first none."""
     for i in range(len(plan)):
         batch.plans[i, :] = plan[i]
@@ -149,24 +128,14 @@ def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
 
 @jit
 def update_plan(
-    model: PredictionModel,
-    start: PredictionStart,
-    K: Matrix,
-    terminal: Matrix,
-    blocks: Vector,
-    plan: Vector,
-    iterations: int,
+    task: PredictionTask, plan: Vector, iterations: int
 ) -> tuple[Scalar, Scalar, Scalar]:
     """Improve a plan by Gauss-Newton iterations.
 
     The plan is never costlier, as predicted, than it was or than zeros.
 
     Args:
-        model: Numbers that all predictions share.
-        start: Start of the prediction.
-        K: Gains of the regulator on the nine states of `prediction`, shape (m, 9).
-        terminal: T of the terminal cost |T x|^2 in the same states, shape (4, 9).
-        blocks: Steps of each block, shape (blocks,).
+        task: Model, start, regulator and blocks.
         plan: Plan, shape (variables,), improved in place.
         iterations: Number of iterations.
 
@@ -174,16 +143,16 @@ def update_plan(
         Cost J of the improved plan, not finite where no plan's was and the plan is unchanged; its
         first yaw moment (fraction of full scale) and added steering (rad).
     """
-    n, batch = len(plan), _make_plan_batch(len(plan), blocks, _N_CANDIDATES)
+    n, batch = len(plan), _make_plan_batch(len(plan), task.blocks, _N_CANDIDATES)
     A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):
         _fill_perturbations(plan, batch)
-        _simulate_batch(model, start, K, terminal, blocks, batch)
+        _simulate_batch(task, batch)
         _compute_normal_equations(batch, A, g)
         _fill_candidates(plan, A, g, batch.plans)
         batch.perturbations[:] = 0.0
-        _simulate_batch(model, start, K, terminal, blocks, batch)
+        _simulate_batch(task, batch)
         _sum_squares(batch.residuals, J)
         best, min_cost = 0, math.inf
         for c in range(_N_CANDIDATES):

@@ -1,19 +1,14 @@
-"""The nominal car in compiled laws, and the PI on its sideslip angle of tie-vision section V.
+"""The PI on the sideslip angle of tie-vision section V.
 
 The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.packed import make_offsets
-from ...envs.numerics.primitives import Scalar, Vector
-from ...envs.record import Array
-from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
+from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
@@ -130,98 +125,3 @@ def sample_pi(
         k_p = continuous * factor
     k_p = _limit_gain(vehicle, float(k_p))
     return PI(k_p, k_p * (1.0 - a_1) / period)
-
-
-CAR, _ = make_offsets(Bicycle)
-"""Indices in the array by which laws read a vehicle: SI units, stiffness per tyre."""
-
-
-class BicyclePlant(NamedTuple):
-    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
-
-    a11: Scalar  # effect of beta on beta' (1/s)
-    a12: Scalar  # effect of gamma on beta'
-    a21: Scalar  # effect of beta on gamma' (1/s^2)
-    a22: Scalar  # effect of gamma on gamma' (1/s)
-    b11: Scalar  # effect of the steering angle on beta' (1/s)
-    b21: Scalar  # effect of the steering angle on gamma' (1/s^2)
-    b22: Scalar  # effect of the yaw moment on gamma' (1/(kg m^2))
-
-
-def make_nominal_car(vehicle: Vehicle) -> Array:
-    """Make the numbers of a nominal car at `CAR` in SI units.
-
-    Args:
-        vehicle: Nominal vehicle.
-
-    Returns:
-        Numbers, shape (6,).
-    """
-    return np.array(vehicle.lateral)
-
-
-@jit
-def compute_plant(car: Vector, V: Scalar) -> BicyclePlant:
-    """Compute the bicycle plant at a speed.
-
-    Args:
-        car: Numbers at `CAR`, shape (6,).
-        V: Speed (m/s).
-
-    Returns:
-        `BicyclePlant` of the car.
-    """
-    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
-        car[CAR.m], car[CAR.I], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r], V
-    )
-    return BicyclePlant(a11, a12, a21, a22, b11, b21, b22)
-
-
-compute_plant_python = as_python(compute_plant)
-"""`compute_plant` for designs, in Python."""
-
-
-@jit
-def compute_drift(plant: BicyclePlant, beta: Scalar, gamma: Scalar) -> tuple[Scalar, Scalar]:
-    """Compute A [beta, gamma], the rates without inputs.
-
-    Args:
-        plant: `BicyclePlant` at the speed.
-        beta: Sideslip angle (rad).
-        gamma: Yaw rate (rad/s).
-
-    Returns:
-        Rates beta' (rad/s) and gamma' (rad/s^2).
-    """
-    return plant.a11 * beta + plant.a12 * gamma, plant.a21 * beta + plant.a22 * gamma
-
-
-@jit
-def compute_steady_yaw_rate(plant: BicyclePlant, beta: Scalar, delta: Scalar) -> Scalar:
-    """Compute the yaw rate that keeps a sideslip angle constant.
-
-    Args:
-        plant: `BicyclePlant` at the speed.
-        beta: Sideslip angle (rad).
-        delta: Steering angle (rad).
-
-    Returns:
-        Yaw rate (rad/s).
-    """
-    return -(plant.a11 * beta + plant.b11 * delta) / plant.a12
-
-
-@jit
-def solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> tuple[Scalar, Scalar]:
-    """Solve B u = [first, second] for the inputs: dakf-stability (26).
-
-    Args:
-        plant: `BicyclePlant` at the speed.
-        first: Effect on beta' (rad/s).
-        second: Effect on gamma' (rad/s^2).
-
-    Returns:
-        Steering angle (rad) and yaw moment (N m).
-    """
-    delta_f = first / plant.b11
-    return delta_f, (second - plant.b21 * delta_f) / plant.b22

@@ -14,12 +14,20 @@ from typing import NamedTuple
 import numpy as np
 
 from ...envs.engine.config import make_car
-from ...envs.engine.tick import StepVariant, compute_lagged_load
-from ...envs.numerics.jit import inline, jit, noinline
+from ...envs.engine.layout import StepVariant
+from ...envs.engine.tick import compute_lagged_load
+from ...envs.numerics.jit import inline, noinline
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select
-from ...envs.record import Array
-from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
+from ...envs.task import (
+    BETA_SCALE,
+    EFFORT_WEIGHT,
+    GAMMA_SCALE,
+    LAGGED,
+    STEER_SCALE,
+    ZERO_SLIP,
+    ReferenceParams,
+)  # fmt: skip
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import (
     Lag,
@@ -39,6 +47,9 @@ from ...envs.vehicle.dynamics import (
     rk4,
 )
 from ...envs.vehicle.parameters import Vehicle
+from ...envs.vehicle.tyres import FIALA, MAGIC_FORMULA, TYRE_LAWS, has_load_shift
+from ..env_info import PlantKind
+from .sampled_model import DesignSpec
 
 
 class PredictionModel(NamedTuple):
@@ -82,6 +93,28 @@ class PredictionStart(NamedTuple):
     max_moment: Scalar  # largest yaw moment as a fraction of full scale
 
 
+class PredictionTask(NamedTuple):
+    """All that the plans of a decision are simulated from."""
+
+    model: PredictionModel
+    start: PredictionStart
+    K: Matrix  # gains of the regulator on its nine states, (m, 9)
+    terminal: Matrix  # T of the terminal cost |T x|^2, (4, 9)
+    blocks: Vector  # steps of each block
+
+
+class PlanBatch(NamedTuple):
+    """Plans side by side and their results, one column for each."""
+
+    # fractions of the inputs' full scale, for every block that of the yaw moment and, where the car
+    # steers, that of the authority; shape (variables, count)
+    plans: Matrix
+    perturbations: Matrix  # added to commands behind their limits, for differences; likewise
+    limits: Matrix  # 1 or -1 where a block starts at a limit, (variables, count)
+    residuals: Matrix  # their squares sum to J and the terminal cost, (residuals, count)
+    first: Matrix  # first yaw moment (of full scale) and added steering (rad), (2, count)
+
+
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
     """Compute mean and standard deviation, over a step's ticks, of a lag's remaining fraction.
 
@@ -94,36 +127,31 @@ def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float
 
 
 def make_prediction_model(
-    vehicle: Vehicle,
-    kind: StepVariant,
-    ticks: int,
-    lags: bool,
-    disturbance_time: float,
-    ref_tick_decay: float,
-    steer_weight: float,
-    full_scale: float,
-    authority: float,
-    yaw_first: bool,
+    vehicle: Vehicle, plant: PlantKind, spec: DesignSpec, target: ReferenceParams, authority: float
 ) -> PredictionModel:
-    """Make the model of a car in steps of some ticks, with the cost of `sampled_model`.
+    """Make the model of a car in a design's periods, with its cost.
 
     Args:
         vehicle: Vehicle of the predictions.
-        kind: Variant of the plant.
-        ticks: Ticks of a step.
-        lags: Whether the actuators lag.
-        disturbance_time: Time in which disturbances decay (s).
-        ref_tick_decay: Fraction of a lagged reference's deviation that a tick leaves.
-        steer_weight: Factor on the cost of added steering.
-        full_scale: Yaw moment at an action of 1 (N m).
+        plant: Kind of the plant.
+        spec: Parameters of the design.
+        target: Parameters of the reference.
         authority: Added steering at an action of 1 (rad).
-        yaw_first: Whether the yaw moment comes before the drive torque.
 
     Returns:
         Numbers that all predictions share.
     """
+    law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
+    law = FIALA if law == MAGIC_FORMULA else law  # plans know no relaxation: see `fit_fiala`
+    kind = StepVariant(
+        small, law, spec.kind, roll, has_driver=0, lag=2,
+        has_load_shift=has_load_shift(small, law, roll), road=0, has_errors=0,
+    )  # fmt: skip
+    ticks, disturbance_time = spec.period, math.inf
+    if spec.disturbances == "forces":
+        disturbance_time = spec.disturbance_time
     step = ticks * TICK
-    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
+    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if plant.lags else (0.0, 0.0)
     return PredictionModel(
         make_car(vehicle),
         RoadParams(0.0, 0.0, 1.0),
@@ -133,50 +161,18 @@ def make_prediction_model(
         _compute_lag_moments(motor, ticks),
         _compute_lag_moments(steering, ticks),
         step,
-        full_scale,
+        spec.full_scale,
         authority,
         vehicle.steering_rate * step,
         vehicle.steering_stop,
-        float(yaw_first),
+        float(plant.yaw_first),
         math.exp(-step / disturbance_time),
-        ref_tick_decay**ticks,
+        target.rest**ticks if spec.kind == LAGGED else 1.0,
         1.0 / BETA_SCALE,
         0.0 if kind.reference == ZERO_SLIP else 1.0 / GAMMA_SCALE,
         math.sqrt(EFFORT_WEIGHT),
-        math.sqrt(steer_weight * EFFORT_WEIGHT) / STEER_SCALE,
+        math.sqrt(spec.steer_weight * EFFORT_WEIGHT) / STEER_SCALE,
     )
-
-
-def make_blocks(steps: int, count: int) -> Array:
-    """Make lengths of at most `count` blocks that grow towards the end of a horizon.
-
-    Args:
-        steps: Steps of the horizon.
-        count: Maximum of blocks.
-
-    Returns:
-        Steps of each block, shape (blocks,).
-    """
-    ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
-    return np.diff(ends, prepend=0)
-
-
-@jit
-def replace_tyres(car: CarParams, C_f: Scalar, C_r: Scalar, mu: Scalar) -> CarParams:
-    """Replace stiffnesses and friction of a car.
-
-    Args:
-        car: `CarParams` of the car.
-        C_f: Front cornering stiffness of a tyre (N/rad).
-        C_r: Rear cornering stiffness of a tyre (N/rad).
-        mu: Friction of the road, under all wheels.
-
-    Returns:
-        `CarParams` with the new numbers.
-    """
-    # C_f and C_r are the fields 4 and 5, mu of the left wheels is 10, mu_r of the right ones 19
-    tyres, left, right = (C_f, C_r), (mu,), (mu,)
-    return CarParams(*(car[:4] + tyres + car[6:10] + left + car[11:19] + right + car[20:]))
 
 
 N_RESIDUALS = 6
@@ -293,7 +289,7 @@ def _predict_step(
         compute_lagged_load(angles[2], T_l, T_r, state, motor.end, car, kind),
     )
     push, road = DisturbanceForces(state.F_d, state.N_d, 0.0), model.road
-    motion = rk4(state.motion, loads, push, car, road, h, kind.small_angle, kind.law, kind.roll)
+    motion = rk4(state.motion, loads, push, car, road, h, kind)
     per_torque = 0.5 * car.d_r / car.r / model.full_scale
     target_share, share_before = per_torque * (T_r - T_l), per_torque * (state.T_r - state.T_l)
     added_before = state.delta_f - driver
@@ -318,42 +314,20 @@ def _predict_step(
 
 
 @noinline
-def simulate_plans(
-    model: PredictionModel,
-    start: PredictionStart,
-    K: Matrix,
-    terminal: Matrix,
-    blocks: Vector,
-    plans: Matrix,
-    perturbations: Matrix,
-    residuals: Matrix,
-    limits: Matrix,
-    first: Vector,
-) -> None:
-    """Simulate plans: fill their residuals and first commands.
-
-    The squares of the residuals sum to J and the terminal cost. The variables of a plan are, for
-    every block, the fraction of the yaw moment and, where the car steers, that of the authority.
+def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
+    """Simulate as many plans as there are lanes; fill their limits, residuals and first commands.
 
     Args:
-        model: Numbers that all predictions share.
-        start: Start of the prediction.
-        K: Gains of the regulator, shape (m, 9).
-        terminal: T of the terminal cost |T x|^2, shape (4, 9).
-        blocks: Steps of each block, shape (blocks,).
-        plans: Plans, shape (variables, lanes).
-        perturbations: Offsets added to the commands after they are limited, for finite differences,
-            shape (variables, lanes).
-        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled.
-        limits: 1 or -1 where a block starts at a limit, shape (variables, lanes), filled.
-        first: First yaw moment (fraction of full scale) and added steering (rad), shape
-            (2, lanes), filled.
+        task: Model, start, regulator and blocks.
+        batch: Plans, of which each is one lane.
     """
+    model, start, K, terminal, blocks = task
+    plans, perturbations, limits, residuals, first = batch
     zero, m, start_motion = 0.0 * load_element(plans, 0), len(K), start.motion
     motion = Motion(
         start_motion.v_x + zero, start_motion.v_y + zero, start_motion.gamma + zero, zero, zero,
         zero, zero, zero, zero,
-        start_motion.phi + zero, start_motion.phi_dot + zero,
+        start_motion.phi + zero, start_motion.phi_dot + zero, zero, zero,
     )  # fmt: skip
     state = _PredictionState(
         motion,

@@ -54,6 +54,16 @@ class DesignSpec:
         return DYNAMIC + _HELD + _DISTURBANCES[self.disturbances]
 
     @property
+    def cost_weights(self) -> tuple[float, ...]:
+        """Weights of sideslip angle, yaw rate, yaw moment and added steering in the cost."""
+        return (
+            1.0 / BETA_SCALE**2,
+            0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
+            EFFORT_WEIGHT,
+            self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0,
+        )
+
+    @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs: fraction of the yaw moment, and added steering (rad)."""
         return ("N_z", "delta_f") if self.steers else ("N_z",)
@@ -61,17 +71,41 @@ class DesignSpec:
 
 @dataclass(frozen=True)
 class DesignModel:
-    """The model x+ = G x + H u over a period, with the cost x'Qx + u'Ru + 2 x'Nu in units of J.
-
-    The inputs move the first len(DYNAMIC) states; the others move by themselves alone.
-    """
+    """The model x+ = G x + H u over a period, with the cost x'Qx + u'Ru + 2 x'Nu."""
 
     G: Array  # transition of the states, shape (n, n)
     H: Array  # effect of the inputs, shape (n, m)
     Q: Array  # weight of the states, shape (n, n)
     R: Array  # weight of the inputs, shape (m, m)
     N: Array  # cross weight, shape (n, m)
-    design_spec: DesignSpec  # parameters that name states and inputs
+    states: tuple[str, ...]  # names
+    n_moved: int = len(DYNAMIC)  # states that inputs move; the others move by themselves alone
+
+    def solve(self) -> tuple[Array, Array]:
+        """Solve for the regulator u = -K x of least cost, and its cost to go x'Vx.
+
+        The states that inputs move have the gains of `control.dlqr`. The others need not decay;
+        their optimal gains follow from a linear equation for their part of the cost to go.
+
+        Returns:
+            K (m, n) and V (n, n), but for a part that no input changes.
+        """
+        from scipy.linalg import solve, solve_discrete_are
+
+        G, H, Q, R, N, d = self.G, self.H, self.Q, self.R, self.N, self.n_moved
+        A, B, W = G[:d, :d], H[:d], G[d:, d:]
+        P = solve_discrete_are(A, B, Q[:d, :d], R, s=N[:d])
+        whole = np.array(B)  # a view's products differ in the last bit
+        K = solve(whole.T @ P @ whole + R, whole.T @ P @ np.array(A) + N[:d].T)
+        A12, N2 = G[:d, d:], N[d:]
+        closed = A - B @ K
+        # P12 = Q12 - K'N2' + (A - BK)'(P A12 + P12 W), stacked by columns
+        right = Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
+        lhs = np.eye(right.size) - np.kron(W.T, closed.T)
+        P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
+        held_gain = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
+        V = np.block([[P, P12], [P12.T, np.zeros_like(W)]])
+        return np.asarray(np.hstack([K, held_gain]), np.float64), V
 
 
 def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
@@ -87,7 +121,7 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
     """
     G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
-    W = TICK * np.diag(compute_cost_weights(design_spec))
+    W = TICK * np.diag(design_spec.cost_weights)
     step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
     cost_matrix = np.zeros((n + m, n + m))
     for _ in range(design_spec.period):
@@ -97,7 +131,7 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
         G, H = np.split(step @ transition, [n], axis=1)
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
     Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
-    return DesignModel(G, H, Q, R, N, design_spec)
+    return DesignModel(G, H, Q, R, N, design_spec.states)
 
 
 def make_tick_model(
@@ -164,75 +198,6 @@ def _discretise_plane(
     return np.hstack([G[:2], H[:2, :2]]), H[:2, 2:]
 
 
-def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
-    """Compute the weights of the cost's four outputs: docs/ARCHITECTURE.md, "Cost and score".
-
-    Args:
-        design_spec: Parameters of the design.
-
-    Returns:
-        Weights of sideslip angle, yaw rate, yaw moment and added steering, in this order.
-    """
-    return (
-        1.0 / BETA_SCALE**2,
-        0.0 if design_spec.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
-        EFFORT_WEIGHT,
-        design_spec.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if design_spec.steers else 0.0,
-    )
-
-
-def _compute_input_cost(model: DesignModel, V: Array) -> Array:
-    """Compute S = R + H'V H (m, m): another input costs (u + K x)'S(u + K x) more in one period."""
-    return model.R + model.H.T @ V @ model.H
-
-
-def compute_cost_to_go(model: DesignModel) -> tuple[Array, Array]:
-    """Compute the regulator u = -K x of least cost, and its cost to go x'Vx.
-
-    Args:
-        model: Design model.
-
-    Returns:
-        K (m, n) and V (n, n), but for a part that no input changes.
-    """
-    return solve_lqr(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
-
-
-def solve_lqr(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
-    """Solve the regulator of a model whose inputs move its first `moved` states alone.
-
-    These have the gains of `control.dlqr`. The others move by themselves and need not decay; their
-    optimal gains follow from a linear equation for their part of the cost to go.
-
-    Args:
-        G: Transition of the states, shape (n, n).
-        H: Effect of the inputs, shape (n, m).
-        Q: Weight of the states, shape (n, n).
-        R: Weight of the inputs, shape (m, m).
-        N: Cross weight, shape (n, m).
-        moved: Number of the states that inputs move.
-
-    Returns:
-        K (m, n) and V (n, n), as for `compute_cost_to_go`.
-    """
-    from scipy.linalg import solve, solve_discrete_are
-
-    d = moved
-    A, B, W = G[:d, :d], H[:d], G[d:, d:]
-    P = solve_discrete_are(A, B, Q[:d, :d], R, s=N[:d])
-    whole = np.array(B)  # a view's products differ in the last bit
-    K = solve(whole.T @ P @ whole + R, whole.T @ P @ np.array(A) + N[:d].T)
-    A12, N2 = G[:d, d:], N[d:]
-    closed = A - B @ K
-    # P12 = Q12 - K'N2' + (A - BK)'(P A12 + P12 W), stacked by columns
-    right = Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
-    lhs = np.eye(right.size) - np.kron(W.T, closed.T)
-    P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
-    held_gain = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
-    V = np.block([[P, P12], [P12.T, np.zeros_like(W)]])
-    return np.asarray(np.hstack([K, held_gain]), np.float64), V
-
-
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 """Speeds of the designs (m/s); gains are interpolated between and held beyond."""
 
@@ -283,13 +248,13 @@ def interpolate_gains(
 
 
 class GainTables(NamedTuple):
-    """The regulators on a grid, shape (speeds, fronts, rears, ...): `compute_cost_to_go`."""
+    """The regulators on a grid, shape (speeds, fronts, rears, ...): `DesignModel.solve`."""
 
     gains: Array  # [K S], (..., m, n + m)
     terminal: Array  # T, (..., d, n): what is to come costs |T x|^2, but for what no input changes
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=128)  # a table has at most 0.3 MB; a matrix comes back to a car often
 def make_gain_table(
     vehicle: Vehicle,
     design_spec: DesignSpec,
@@ -315,8 +280,9 @@ def make_gain_table(
     for speed, front, rear in itertools.product(speeds, *stiffnesses):
         car = vehicle.replace(front_stiffness=front, rear_stiffness=rear)
         model = make_design_model(car, speed, design_spec)
-        K, V = compute_cost_to_go(model)
-        gains.append(np.hstack([K, _compute_input_cost(model, V)]))
+        K, V = model.solve()
+        # in one period another input costs (u + K x)'S(u + K x) more
+        gains.append(np.hstack([K, model.R + model.H.T @ V @ model.H]))
         terminal.append(_factor_cost(V))
     tables = (np.array(parts).reshape(*shape, *parts[0].shape) for parts in (gains, terminal))
     return GainTables(*tables)

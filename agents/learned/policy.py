@@ -23,8 +23,6 @@ from ...estimators.learned.network import (
     NO_MEMORY,
     Network,
     build_network,
-    collect_tensors,
-    describe_network,
     parse_json_object,
     read_tensors,
 )
@@ -189,7 +187,7 @@ class Policy:
     def salt(self) -> str:
         """Hexadecimal hash of the network, from which its test seeds are made."""
         digest = hashlib.sha256()
-        for name, values in collect_tensors(self.network).items():
+        for name, values in self.network.tensors.items():
             digest.update(name.encode() + values.tobytes())
         return digest.hexdigest()[:16]
 
@@ -244,8 +242,8 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
             f"the card's observation has {len(card.observation)} entries, "
             f"the network takes {network.inputs}"
         )
-    metadata = {"format": str(FORMAT), "card": card.to_json(network=describe_network(network))}
-    write_atomic(target, save(collect_tensors(network), metadata))
+    metadata = {"format": str(FORMAT), "card": card.to_json(network=network.description)}
+    write_atomic(target, save(network.tensors, metadata))
 
 
 def load_policy(path: str | Path) -> Policy:

@@ -10,6 +10,8 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -17,9 +19,8 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
+from ...envs.engine.layout import FLAGS, STATE_WIDTH, EpisodeArrays, P, Z
 from ...envs.engine.outputs import observe, update_newest
-from ...envs.engine.workspace import EpisodeArrays
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
 from ...envs.record import FAST, FAST_WIDTH, Array
@@ -28,8 +29,7 @@ from ...envs.ticks import NEVER
 from ...estimators.estimator import Estimator
 from ...estimators.protocol import compute_std
 from ...estimators.wrappers.estimate import EstimateObservation
-from ...estimators.wrappers.kernel import compile_observe
-from ...estimators.wrappers.outputs import write_outputs
+from ...estimators.wrappers.outputs import Observed, StepRecord, compile_observe, write_outputs
 from ..env_info import get_env_facts
 from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
 
@@ -165,16 +165,16 @@ class OnboardController:
         obs = np.empty(self._bounds.shape[1], np.float32)
         self._z[Z.clock.tick] = number
         switches, report = self._switches, np.zeros(len(REPORT))
-        row = EpisodeArrays(self._p, self._z, switches, obs, self._rows, packets, report)
-        observe(row, shown, len(packets), self._refs, self._bounds)
+        numbers = self._p, self._z, switches, obs, self._rows, packets, report, self._bounds
+        observe(EpisodeArrays(*numbers, np.empty((0, 0))), shown, len(packets), self._refs)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
         # the true beta and gamma (0.0) serve the summary of errors alone, which nobody reads here
-        trailing = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
+        observed = Observed(obs, outputs.table, 0.0, 0.0, out, np.zeros(3))
         if self._is_native:  # `take` has given it all: no rows and no packets here
-            record = self._rows, 0, NO_PACKETS, 0, 0
-            compile_observe()(estimator.filters, estimator.gains, *record, obs, *trailing)
+            record = StepRecord(self._rows, 0, NO_PACKETS, 0)
+            compile_observe()(estimator.filters, estimator.gains, record, 0, observed)
         else:
-            write_outputs(estimator, obs, *trailing)
+            write_outputs(estimator, observed)
         return out
 
 
@@ -236,54 +236,6 @@ class _SessionBlock(NamedTuple):
     digest: int
 
 
-def read_setup(path: Path | str) -> dict[str, Any]:
-    """Read the setup of a session.
-
-    Args:
-        path: File of the session.
-
-    Returns:
-        Setup as JSON types.
-
-    Raises:
-        ValueError: The file is no session, or its setup is incomplete.
-    """
-    with open(path, "rb") as file:
-        setup = _read_header(path, file)
-    wrong = [name for name, kind in _SETUP.items() if not isinstance(setup.get(name, ...), kind)]
-    if wrong:
-        raise ValueError(f"{path}: its setup lacks {', '.join(wrong)}, or has it of another type")
-    return setup
-
-
-def _read_header(path: Path | str, file: BinaryIO) -> dict[str, Any]:
-    if file.read(len(MAGIC)) == MAGIC:
-        with suppress(ValueError, RecursionError, struct.error):
-            setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
-            if isinstance(setup, dict):
-                return setup
-    raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
-
-
-def read_blocks(path: Path | str) -> Iterator[_SessionBlock]:
-    """Read the blocks of a session up to its end, or to where it was cut or damaged.
-
-    Args:
-        path: File of the session.
-    """
-    with open(path, "rb") as file:
-        _read_header(path, file)
-        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
-            magic, count, size, check, digest = _BLOCK.unpack(head)
-            data = file.read(size) if magic == _BLOCK_MAGIC and count <= MAX_BATCHES else b""
-            if magic != _BLOCK_MAGIC or len(data) != size or zlib.crc32(data) != check:
-                return
-            batches = _parse_batches(data, count)
-            if batches is None:
-                return
-            yield _SessionBlock(batches, digest)
-
-
 def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     """Parse the datagrams of each batch; None for data that no recorder wrote."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
@@ -306,27 +258,67 @@ class _SessionReplay(NamedTuple):
     same: bool  # whether every block's checksum of the estimates is the session's
 
 
-def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> _SessionReplay:
-    """Replay a session.
+@dataclass(frozen=True)
+class Session:
+    """A recorded session on disk; ValueError for a file that is none."""
 
-    Args:
-        path: File of the session.
-        onboard: On-board controller made from the session's setup.
-        patience: Batches without a fast row before the last row is held; None: no limit.
+    path: Path | str
 
-    Returns:
-        Ticks, estimates and deviations, and whether they agree with the session's checksums.
-    """
-    synchroniser, digest, same = StreamSynchroniser(patience), 0, True
-    ticks: list[int] = []
-    estimates: list[Array] = []
-    for block in read_blocks(path):
-        for batch in block.batches:
-            for tick in synchroniser.take(batch):
+    def _read_header(self, file: BinaryIO) -> dict[str, Any]:
+        if file.read(len(MAGIC)) == MAGIC:
+            with suppress(ValueError, RecursionError, struct.error):
+                setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
+                if isinstance(setup, dict):
+                    return setup
+        what = "no session of `sideslip live --record`, or only its beginning"
+        raise ValueError(f"{self.path} is {what}")
+
+    @property
+    def setup(self) -> dict[str, Any]:
+        """The setup in JSON types; ValueError for an incomplete one."""
+        with open(self.path, "rb") as file:
+            setup = self._read_header(file)
+        wrong = [name for name, x in _SETUP.items() if not isinstance(setup.get(name, ...), x)]
+        if wrong:
+            text = f"its setup lacks {', '.join(wrong)}, or has it of another type"
+            raise ValueError(f"{self.path}: {text}")
+        return setup
+
+    @property
+    def blocks(self) -> Iterator[_SessionBlock]:
+        """The blocks up to the session's end, or to where it was cut or damaged."""
+        with open(self.path, "rb") as file:
+            self._read_header(file)
+            while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+                magic, count, size, check, digest = _BLOCK.unpack(head)
+                is_sound = magic == _BLOCK_MAGIC and count <= MAX_BATCHES
+                data = file.read(size) if is_sound else b""
+                if not is_sound or len(data) != size or zlib.crc32(data) != check:
+                    return
+                batches = _parse_batches(data, count)
+                if batches is None:
+                    return
+                yield _SessionBlock(batches, digest)
+
+    def replay(self, onboard: OnboardController, patience: int | None) -> _SessionReplay:
+        """Replay the session.
+
+        Args:
+            onboard: On-board controller made from the session's setup.
+            patience: Batches without a fast row before the last row is held; None: no limit.
+
+        Returns:
+            Ticks, estimates and deviations, and whether they agree with the session's checksums.
+        """
+        synchroniser, digest, same = StreamSynchroniser(patience), 0, True
+        ticks: list[int] = []
+        estimates: list[Array] = []
+        for block in self.blocks:
+            for tick in chain.from_iterable(map(synchroniser.take, block.batches)):
                 onboard.take(tick)
                 digest = _update_digest(onboard, digest)
                 ticks.append(tick.number)
                 estimates.append(np.stack([onboard.x, onboard.std]))
-        same = same and digest == block.digest
-    x, std = np.array(estimates).reshape(-1, 2, len(onboard.names)).swapaxes(0, 1)
-    return _SessionReplay(np.array(ticks, np.int64), x, std, same)
+            same = same and digest == block.digest
+        x, std = np.array(estimates).reshape(-1, 2, len(onboard.names)).swapaxes(0, 1)
+        return _SessionReplay(np.array(ticks, np.int64), x, std, same)

@@ -20,10 +20,10 @@ from .messages import (
     Arrival,
     DatagramKind,
     LoopStatus,
+    Message,
     RejectReason,
     StreamSynchroniser,
     Tick,
-    encode,
 )
 
 LOOPBACK = "127.0.0.1"
@@ -99,7 +99,7 @@ class Port(AbstractContextManager["Port"]):
         kind: DatagramKind,
         stamp: int,
         values: Sequence[float] = (),
-        names: Sequence[str] = (),
+        names: tuple[str, ...] = (),
     ) -> None:
         """Send a message.
 
@@ -112,7 +112,7 @@ class Port(AbstractContextManager["Port"]):
         """
         number = self._sent[kind] = self._sent.get(kind, -1) + 1
         with suppress(OSError):  # the network takes no datagram now
-            self._socket.sendto(encode(kind, number, stamp, values, names), to)
+            self._socket.sendto(Message(kind, number, stamp, values, names).encode(), to)
 
     def _receive_available(self, batch: list[Arrival]) -> list[Arrival]:
         """Append the datagrams that have arrived to a batch, up to `MAX_BATCH`."""

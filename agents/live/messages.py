@@ -107,30 +107,17 @@ class Message(NamedTuple):
     """The content of a valid datagram."""
 
     kind: int
-    sequence: int
+    sequence: int  # of a datagram modulo 2^32
     stamp: int  # us
-    values: tuple[float, ...]
-    names: tuple[str, ...] = ()
+    values: Sequence[float]  # of `FIELDS`, in SI units
+    names: tuple[str, ...] = ()  # of states, for estimates
 
-
-def encode(
-    kind: int, sequence: int, stamp: int, values: Sequence[float], names: Sequence[str] = ()
-) -> bytes:
-    """Encode a message.
-
-    Args:
-        kind: Kind of the datagram.
-        sequence: Sequence number, taken modulo 2^32.
-        stamp: Time stamp (us).
-        values: Values of `FIELDS`, in SI units.
-        names: Names of states, for estimates.
-
-    Returns:
-        Bytes of the datagram.
-    """
-    count = len(values)
-    head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)
-    return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
+    def encode(self) -> bytes:
+        """Encode the message as a datagram."""
+        kind, sequence, stamp, values, names = self
+        count = len(values)
+        head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)
+        return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
 
 
 def decode(data: bytes) -> Message | RejectReason:

@@ -9,11 +9,9 @@ Where a training starts from a policy, each drive is weighted by 1 over that pol
 """
 
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,21 +22,19 @@ from ...envs.io import atomic_file, write_atomic
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from .. import zoo
-from ..learned.policy import Card, Policy, save_policy
+from ..learned.policy import Card, save_policy
 from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
-from ..vec_env import make_native_env, make_vec_env
-from .config import TrainingTask, get_algorithm, make_model, make_model_options
+from ..vec_env import make_native_env
+from .config import TrainingTask
 from .export import convert_sb3_policy
-from .normalise import RewardScale, RewardScaleWrapper, measure_reward_scale, measure_scaling
-from .warm_start import PolicyWarmStart, load_warm_start, read_warm_start
+from .normalise import StandardisedArguments
+from .warm_start import WarmStart
 
 with require_extra("train", "training needs {}"):
     import torch
     from safetensors import SafetensorError, safe_open
     from safetensors.torch import save
-    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import get_device
 
 Checkpoint = Mapping[str, Any]
@@ -49,14 +45,10 @@ _FORMAT = 3  # of a checkpoint
 _VARIABLES = "variables"  # tensors of no module, such as the logarithm of an entropy's weight
 _STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
 """Keys of a resumed training's state, besides the tensors."""
-_SCALING_ENVS = 64  # environments whose observations make the scaling
-_UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
 _WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
 _MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
 
-# Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
-_WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
-_SEEDS_PER_TRAINING = 2**40  # a run's first one is the training's first plus its steps so far
+_WEIGHT_SEEDS, _EVALUATION_SEEDS = 2**63, 2**64  # `TrainingTask` has those of its drives
 
 
 def _make_evaluation_seeds(episodes: int) -> list[int]:
@@ -126,109 +118,51 @@ class RunRecord:
 
 
 class EvalCallback(BaseCallback):
-    """Build the model, evaluate it between rollouts, and save what a resumed training needs.
+    """Evaluate the policy between rollouts, and save what a resumed training needs.
 
     Args:
         task: Task of the training.
         folder: Folder of the training.
-        checkpoint: State of a checkpoint, None for a new training.
         run_options: Options of this run.
         steps: Steps of the whole training.
-        initial_policy: Policy that the training starts from; its costs weigh the drives.
+        warm_start: What the training starts from; a policy's costs weigh the drives.
+        state: State of a checkpoint, None for a new training.
     """
 
     def __init__(
         self,
         task: TrainingTask,
         folder: Path,
-        checkpoint: Checkpoint | None,
         run_options: RunOptions,
-        steps: int = 0,
-        initial_policy: Policy | None = None,
+        steps: int,
+        warm_start: WarmStart | None = None,
+        state: Checkpoint | None = None,
     ) -> None:
         super().__init__()
         self.task, self.folder, self.run_options = task, folder, run_options
-        name = "" if initial_policy is None else initial_policy.name
+        self.warm_start, self.policy = warm_start, warm_start.policy if warm_start else None
+        name = self.policy.name if self.policy else ""
         self.run_record = RunRecord(steps, run_options.eval_freq, run_options.command, name)
         self.seeds = _make_evaluation_seeds(task.n_eval_envs)
-        self.eval_env = task.vector_env(task.n_eval_envs)
-        self.initial_policy, self.warm_start = initial_policy, None
-        if initial_policy is not None:
-            seed = _SCALING_SEEDS + task.seed
-            self.warm_start = PolicyWarmStart(initial_policy, task, self.eval_env, seed)
-            self.eval_env = self.warm_start.wrap_env(self.eval_env)
-        base: Any = self.eval_env.unwrapped
-        self.period: float = base.control_period * base.dt  # s
-        self.checkpoint = checkpoint or {}
-        self.evaluations = [Evaluation(*row) for row in self.checkpoint.get("evaluations", [])]
-        uncontrolled = self._average_scenarios(evaluate_costs(self.eval_env, None, self.seeds))
+        self.env = warm_start.env if warm_start else task.vector_env(task.n_eval_envs)
+        self.evaluations = [Evaluation(*row) for row in (state or {}).get("evaluations", [])]
+        self.scaling: StandardisedArguments | None = None
+        uncontrolled = self._average_scenarios(evaluate_costs(self.env, None, self.seeds))
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
-        self.weights = np.ones(1)
-        if not initial_policy:
-            self.weights = _compute_scenario_weights(task, _WEIGHT_SEEDS)
-        driver = self.warm_start.driver if self.warm_start else None
-        self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
-        self.scaling: Any = self.checkpoint.get("scaling")
+        self.weights = np.ones(1) if self.policy else _compute_scenario_weights(task)
+        driver = warm_start.driver if warm_start else None
+        self.initial_costs = evaluate_costs(self.env, driver, self.seeds) if driver else None
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
-    def build(self, trained_agent: str | Path | None = None, trust: bool = False) -> BaseAlgorithm:
-        """Build the model, new or from a checkpoint, a zip or a policy, with its environments.
-
-        Args:
-            trained_agent: Zip of a model to start from, None for none.
-            trust: Whether a pickle of VecNormalize beside the zip may be read.
-
-        Returns:
-            Model, ready to learn.
-        """
-        task, run_options = self.task, self.run_options
-        start = self.warm_start.start if self.warm_start and not self.checkpoint else None
-        if trained_agent is not None:
-            width = (self.eval_env.single_observation_space.shape or (0,))[0]
-            start = read_warm_start(trained_agent, width, trust)
-        if start is not None:
-            self.scaling = start.scaling
-        on_tensors = get_algorithm(task.algo).on_tensors
-        if self.scaling is None:
-            kwargs, seed = task.settings.get("policy_kwargs", {}), _SCALING_SEEDS + task.seed
-            spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
-            scaling_env = task.vector_env(_SCALING_ENVS)
-            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, on_tensors)
-        options = dict[str, Any](estimator=task.estimator_kwargs)
-        options["env_kwargs"] = task.options(task.num_envs)
-        options["wrapper_class"] = self.warm_start.wrap_env if self.warm_start else None
-        env = make_vec_env(task.env_id, task.num_envs, **options)
-        steps = int(self.checkpoint.get("steps", 0))
-        seed = (task.seed + steps) % 2**32
-        first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
-        if self.warm_start is not None:
-            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
-            scales = measure_reward_scale(self.warm_start.driver, env, first, n_steps)
-        else:
-            scales = (np.resize(self.weights, env.num_envs) / self.period)[:, None].tolist()
-        scaled_env = RewardScaleWrapper(env, RewardScale(scales))
-        log, device = run_options.tensorboard_log, run_options.device
-        further = dict[str, Any](device=device, tensorboard_log=log)
-        if on_tensors:
-            from .gradient import make_source
-
-            further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
-        setup = scaled_env, self.period, self.scaling, seed
-        model = make_model(task.algo, task.settings, *setup, **further)
-        if self.checkpoint:
-            _load_parameters(self.folder / CHECKPOINT, model)
-            if isinstance(model, OffPolicyAlgorithm):
-                model.learning_starts += steps  # its buffer begins empty
-        if start is not None:
-            load_warm_start(start, model)
-        model.num_timesteps = steps
-        env.seed(first)
-        self.init_callback(model)
-        return model
+    @property
+    def period(self) -> float:
+        """Control period (s)."""
+        base: Any = self.env.unwrapped
+        return float(base.control_period * base.dt)
 
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""
@@ -263,56 +197,46 @@ class EvalCallback(BaseCallback):
         """Evaluate the policy, and write the checkpoint and the best policy so far."""
         self.check()
         self.spent += time.process_time() - self.since
-        costs, lengths = evaluate_episodes(self.eval_env, self.model, self.seeds)
+        costs, lengths = evaluate_episodes(self.env, self.model, self.seeds)
         cost, ratio = float(np.mean(self._average_scenarios(costs) * self.equal_weights)), None
         if self.initial_costs is not None:
             ratio = float(np.exp(np.log(compute_cost_ratios(costs, self.initial_costs)).mean()))
         spent, of_none = round(self.spent, 3), cost / self.uncontrolled_cost
         current = Evaluation(self.model.num_timesteps, spent, cost, of_none, ratio)
         if all(current.criterion < evaluation.criterion for evaluation in self.evaluations):
-            self._keep_best(current)
+            self._save_best(current)
         self.evaluations.append(current)
         self.logger.record("eval/mean_reward", -cost)
         self.logger.dump(self.model.num_timesteps)
-        checkpoint = {
-            "sideslip": __version__,
-            "task": asdict(self.task),
-            "steps": self.model.num_timesteps,
-            "aim": asdict(self.run_record),
-            "scaling": self.scaling,
-            "evaluations": self.evaluations,
-        }
-        _save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
+        self._save_checkpoint()
         lines = "".join(json.dumps(evaluation._asdict()) + "\n" for evaluation in self.evaluations)
         write_atomic(self.folder / CURVE, lines.encode())
         zoo.write_evaluation(self.folder, self.task.env_id, self.model, costs, lengths)
         self.since = time.process_time()
 
-    def _keep_best(self, current: Evaluation) -> None:
+    def _save_best(self, current: Evaluation) -> None:
         """Write the policy's file with its card, and the model's zip."""
         task = self.task
-        algorithm_options = make_model_options(task.algo, task.settings, self.period, task.num_envs)
-        algorithm_options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
-        algorithm_options |= {"reads": task.reads} if task.reads else {}
-        if self.initial_policy is not None:
-            before = self.initial_policy.card.algorithm_options
-            algorithm_options |= {"begun_with": self.initial_policy.name}
-            if "class" in before and task.scenarios:
-                algorithm_options |= {"class": before["class"]}
-        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
-        if task.scenarios and self.initial_policy is None:
-            mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
-        first_seed = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING
+        options = task.make_model_options(self.period)
+        options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
+        options |= {"reads": task.reads} if task.reads else {}
+        if self.policy is not None:
+            before = self.policy.card.algorithm_options
+            options |= {"begun_with": self.policy.name}
+            options |= {"class": before["class"]} if "class" in before and task.scenarios else {}
+        options |= {"scenarios": task.scenarios} if task.scenarios else {}
+        if task.scenarios and self.policy is None:
+            options |= {"weights": self.weights.round(3).tolist()}
         card = Card.from_env_id(
             task.env_id,
             task.env_options | first,
             task.estimator,
             task.estimator_options,
             algorithm=task.algo,
-            algorithm_options=algorithm_options | mixture,
+            algorithm_options=options,
             command=self.run_options.command,
-            seeds={"training": task.seed, "from": first_seed},
+            seeds={"training": task.seed, "from": task.first_seed},
             steps=current.steps,
             cpu_seconds=current.cpu_seconds,
         )
@@ -321,6 +245,55 @@ class EvalCallback(BaseCallback):
         save_policy(self.folder / POLICY, network, card)
         with atomic_file(self.folder / BEST) as file:
             self.model.save(file)
+
+    def _save_checkpoint(self) -> None:
+        """Save the model's parameters and optimisers, and the rest of the training's state."""
+        tensors: dict[str, torch.Tensor] = {}
+        groups: dict[str, Any] = {}
+        for part, state in self.model.get_parameters().items():
+            if "param_groups" in state:  # an optimiser's
+                groups[part] = state["param_groups"]
+                for i, values in state["state"].items():
+                    tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
+            else:
+                tensors |= {f"{part}/{name}": value for name, value in state.items()}
+        tensors |= {f"{_VARIABLES}/{k}": value for k, value in self._get_variables().items()}
+        content = {
+            "format": _FORMAT,
+            "groups": groups,
+            "sideslip": __version__,
+            "task": asdict(self.task),
+            "steps": self.model.num_timesteps,
+            "aim": asdict(self.run_record),
+            "scaling": self.scaling,
+            "evaluations": self.evaluations,
+        }
+        plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
+        text = json.dumps(content, allow_nan=False)
+        write_atomic(self.folder / CHECKPOINT, save(plain, {"checkpoint": text}))
+
+    def _get_variables(self) -> dict[str, torch.Tensor]:
+        """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
+        names = self.model._get_torch_save_params()[1]
+        return {name: getattr(self.model, name) for name in names}
+
+    def load_parameters(self) -> None:
+        """Load the parameters and optimisers of the folder's checkpoint into the model."""
+        path, variables = self.folder / CHECKPOINT, self._get_variables()
+        parts: dict[str, Any] = {part: {} for part in self.model.get_parameters()}
+        groups = read_state(path)["groups"]
+        parts |= {part: {"param_groups": group, "state": {}} for part, group in groups.items()}
+        with safe_open(path, "pt") as file:
+            for name in file.keys():  # noqa: SIM118  it is no mapping
+                part, key = name.split("/", 1)
+                if part == _VARIABLES:
+                    variables[key].data.copy_(file.get_tensor(name))
+                elif part in groups:
+                    i, key = key.split("/", 1)
+                    parts[part]["state"].setdefault(int(i), {})[key] = file.get_tensor(name)
+                else:
+                    parts[part][key] = file.get_tensor(name)
+        self.model.set_parameters(parts, device=self.model.device)
 
 
 def read_state(path: Path) -> Checkpoint:
@@ -352,54 +325,12 @@ def read_state(path: Path) -> Checkpoint:
     return state
 
 
-def _save_checkpoint(path: Path, model: BaseAlgorithm, rest: Checkpoint) -> None:
-    """Save a model's parameters and optimisers, and the rest of the training's state."""
-    tensors: dict[str, torch.Tensor] = {}
-    groups: dict[str, Any] = {}
-    for part, state in model.get_parameters().items():
-        if "param_groups" in state:  # an optimiser's
-            groups[part] = state["param_groups"]
-            for i, values in state["state"].items():
-                tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
-        else:
-            tensors |= {f"{part}/{name}": value for name, value in state.items()}
-    tensors |= {f"{_VARIABLES}/{name}": value for name, value in _get_variables(model).items()}
-    plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
-    content = json.dumps({"format": _FORMAT, "groups": groups, **rest}, allow_nan=False)
-    write_atomic(path, save(plain, {"checkpoint": content}))
-
-
-def _get_variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
-    """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
-    return {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
-
-
-def _load_parameters(path: Path, model: BaseAlgorithm) -> None:
-    """Load a checkpoint's parameters and optimisers into a model."""
-    groups = read_state(path)["groups"]
-    parts: dict[str, Any] = {part: {} for part in model.get_parameters()}
-    variables = _get_variables(model)
-    for part, group in groups.items():
-        parts[part] = {"param_groups": group, "state": {}}
-    with safe_open(path, "pt") as file:
-        for name in file.keys():  # noqa: SIM118  it is no mapping
-            part, key = name.split("/", 1)
-            if part == _VARIABLES:
-                variables[key].data.copy_(file.get_tensor(name))
-            elif part in groups:
-                i, key = key.split("/", 1)
-                parts[part]["state"].setdefault(int(i), {})[key] = file.get_tensor(name)
-            else:
-                parts[part][key] = file.get_tensor(name)
-    model.set_parameters(parts, device=model.device)
-
-
 def _compute_equal_weights(costs: Array) -> Array:
     """Compute weights (k,) by 1 over scenarios' mean costs (k,), or over 5 % of their mean."""
     return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
 
 
-def _compute_scenario_weights(task: TrainingTask, first: int) -> Array:
+def _compute_scenario_weights(task: TrainingTask, first: int = _WEIGHT_SEEDS) -> Array:
     """Compute each scenario's weight by the uncontrolled cost of a control period, from a seed on.
 
     The weight is 1, shape (1,), for a task without a mixture.
@@ -410,5 +341,6 @@ def _compute_scenario_weights(task: TrainingTask, first: int) -> Array:
     rows = _WEIGHT_DRIVES * k
     env = make_native_env(task.env_id, rows, None, task.options(rows))
     costs, steps = evaluate_episodes(env, None, range(first, first + rows))
-    rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
-    return _compute_equal_weights(np.array(rates))
+    return _compute_equal_weights(
+        np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
+    )

@@ -34,11 +34,13 @@ PERIOD = 0.01  # s, control period for which the files give `gamma`
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
 WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
 
+# Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
+_SCALING_SEEDS, _TRAINING_SEEDS, _SEEDS_PER_TRAINING = 2**65, 2**66, 2**40
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")  # no arguments of the class
 _SCHEDULED = ("learning_rate", "clip_range")  # may fall to zero, `_make_schedule`
 _LOG_ARGUMENTS = {"verbose", "tensorboard_log", "stats_window_size"}
 # arguments that a file of settings may not have: the training gives them
-_MANAGED_ARGUMENTS = {"env", "seed", "device", "source"} | _LOG_ARGUMENTS
+_MANAGED_ARGUMENTS = {"env", "seed", "device", "source", "options"} | _LOG_ARGUMENTS
 
 
 @dataclass(frozen=True)
@@ -140,68 +142,6 @@ def _check_settings(algo: str, settings: object) -> None:
         raise ValueError(f"no {', '.join(missing)}")
 
 
-def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
-    """Make the arguments of an algorithm's class, in JSON types.
-
-    `gamma` discounts as much in a second as in the file, and a batch divides a rollout.
-
-    Args:
-        algo: Name of the algorithm.
-        settings: Settings of `read_settings`.
-        seconds: Control period (s).
-        num_envs: Number of environments.
-
-    Returns:
-        Arguments by name.
-    """
-    options = {name: value for name, value in settings.items() if name not in _TRAINING_SETTINGS}
-    if "gamma" in options:
-        options["gamma"] = options["gamma"] ** (seconds / PERIOD)
-    kind: Any = get_algorithm(algo).load()
-    rolls_out = issubclass(kind, OnPolicyAlgorithm)  # elsewhere n_steps counts those of a return
-    if rolls_out and "n_steps" in options and "batch_size" in options:
-        rollout = num_envs * options["n_steps"]
-        max_size = min(options["batch_size"], rollout)
-        options["batch_size"] = max(n for n in range(1, max_size + 1) if rollout % n == 0)
-    return options
-
-
-def make_model(
-    algo: str,
-    settings: Settings,
-    env: VecEnv,
-    seconds: float,
-    scaling: StandardisedArguments,
-    seed: int,
-    **rest: Any,
-) -> BaseAlgorithm:
-    """Make an untrained model.
-
-    Args:
-        algo: Name of the algorithm.
-        settings: Settings of `read_settings`.
-        env: Environments of the training.
-        seconds: Control period (s).
-        scaling: Scaling of `Standardised`.
-        seed: Seed of the model.
-        rest: Further arguments of the class, such as its device.
-
-    Returns:
-        Model on the environments.
-    """
-    options = make_model_options(algo, settings, seconds, env.num_envs)
-    options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}
-    policy_kwargs = dict(options.get("policy_kwargs", {}))
-    if "activation_fn" in policy_kwargs:
-        policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
-    policy_kwargs["features_extractor_class"] = Standardised
-    extractor_names = "mean", "scale", "clip", "mixing"
-    policy_kwargs["features_extractor_kwargs"] = dict(zip(extractor_names, scaling, strict=True))
-    options["policy_kwargs"], window = policy_kwargs, env.num_envs
-    kind = get_algorithm(algo).load()
-    return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
-
-
 def _make_schedule(name: str, value: object) -> LinearSchedule | float:
     """Make a schedule that falls to zero of "lin_NUMBER", and a float of a number."""
     word, _, number = str(value).rpartition("_")
@@ -244,7 +184,7 @@ class TrainingTask:
         for name in ("num_envs", "n_eval_envs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
-        if self.estimator and get_algorithm(self.algo).on_tensors:
+        if self.estimator and self.algorithm.on_tensors:
             raise ValueError(f"{self.algo} reads sensors alone: no estimator runs on tensors")
         if self.estimator_options and not self.estimator:
             raise ValueError("options of an estimator need an estimator")
@@ -259,6 +199,21 @@ class TrainingTask:
                 make_scenario(scenario)
             except (TypeError, ValueError) as error:
                 raise ValueError(f"scenario {i} of the mixture: {error}") from None
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """Algorithm of the training."""
+        return get_algorithm(self.algo)
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first drive; a run's own is that plus its steps so far."""
+        return _TRAINING_SEEDS + self.seed * _SEEDS_PER_TRAINING
+
+    @property
+    def scaling_seed(self) -> int:
+        """Seed of the drives whose observations are scaled."""
+        return _SCALING_SEEDS + self.seed
 
     @property
     def estimator_kwargs(self) -> dict[str, Any] | None:
@@ -291,6 +246,52 @@ class TrainingTask:
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
 
+    def make_model_options(self, seconds: float) -> Settings:
+        """Make the arguments of the algorithm's class, in JSON types.
+
+        `gamma` discounts as much in a second as in the file, and a batch divides a rollout.
+
+        Args:
+            seconds: Control period (s).
+
+        Returns:
+            Arguments by name.
+        """
+        options = {k: value for k, value in self.settings.items() if k not in _TRAINING_SETTINGS}
+        if "gamma" in options:
+            options["gamma"] = options["gamma"] ** (seconds / PERIOD)
+        kind: Any = self.algorithm.load()
+        rolls_out = issubclass(kind, OnPolicyAlgorithm)  # else n_steps are those of a return
+        if rolls_out and "n_steps" in options and "batch_size" in options:
+            rollout = self.num_envs * options["n_steps"]
+            max_size = min(options["batch_size"], rollout)
+            options["batch_size"] = max(n for n in range(1, max_size + 1) if rollout % n == 0)
+        return options
+
+    def make_model(
+        self, env: VecEnv, seconds: float, scaling: StandardisedArguments, **rest: Any
+    ) -> BaseAlgorithm:
+        """Make an untrained model.
+
+        Args:
+            env: Environments of the training.
+            seconds: Control period (s).
+            scaling: Scaling of `Standardised`.
+            **rest: Further arguments of the class, such as its seed.
+
+        Returns:
+            Model on the environments.
+        """
+        options = self.make_model_options(seconds)
+        options |= {key: _make_schedule(key, options[key]) for key in _SCHEDULED if key in options}
+        policy_kwargs = dict(options.get("policy_kwargs", {}))
+        if "activation_fn" in policy_kwargs:
+            policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
+        policy_kwargs["features_extractor_class"] = Standardised
+        policy_kwargs["features_extractor_kwargs"] = scaling._asdict()
+        options |= {"policy_kwargs": policy_kwargs, "stats_window_size": env.num_envs}
+        return self.algorithm.load()(self.settings["policy"], env, **options, **rest)
+
     def find_zoo_folder(self, logs: Path) -> Path:
         """Find the folder that rl-baselines3-zoo would use for the next training of this kind.
 
@@ -303,10 +304,9 @@ class TrainingTask:
         Raises:
             ValueError: The zoo does not have the algorithm.
         """
-        algorithm = get_algorithm(self.algo)
-        if algorithm.on_tensors:
+        if self.algorithm.on_tensors:
             raise ValueError(f"rl-baselines3-zoo has no {self.algo}: its folder is no use")
-        return zoo.find_next_folder(logs, algorithm.zoo, self.env_id)
+        return zoo.find_next_folder(logs, self.algorithm.zoo, self.env_id)
 
     def describe_for_zoo(self, folder: Path, steps: int, eval_freq: int) -> None:
         """Make a folder of `find_zoo_folder` with the files of the zoo's `enjoy`.
@@ -317,7 +317,7 @@ class TrainingTask:
             eval_freq: Steps between two evaluations.
         """
         first = {"scenario": self.scenarios[0]} if self.scenarios else {}
-        arguments = dict[str, Any](algo=get_algorithm(self.algo).zoo, env=self.env_id)
+        arguments = dict[str, Any](algo=self.algorithm.zoo, env=self.env_id)
         arguments |= {"env_kwargs": self.env_options | first, "eval_freq": eval_freq}
         arguments |= {"n_eval_envs": self.n_eval_envs, "n_timesteps": steps, "seed": self.seed}
         settings = self.settings | {"n_envs": self.num_envs}

@@ -22,14 +22,7 @@ import numpy as np
 from ..controllers.lqr import Lqr
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from .student import (
-    Demonstrations,
-    DistillConfig,
-    Scaling,
-    Student,
-    compute_scale,
-    normalise_inputs,
-)
+from .student import Demonstrations, DistillConfig, Scaling, Student, compute_scale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
@@ -115,10 +108,9 @@ def imitate(
             if weight is None:
                 max_costs = [float(np.median(demo.costs)) for demo in new_drives]
             privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
-            middle, scale = privileged.mean(0), compute_scale(privileged.std(0))
+            standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))
         for demo in new_drives:
-            standard = normalise_inputs(demo.privileged, middle, scale)
-            drives.append(demo._replace(privileged=standard))
+            drives.append(demo._replace(privileged=standard.mix_inputs(demo.privileged)))
         epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
         loss = _fit_model(model, drives, scaling, config, epochs)
         mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
@@ -184,20 +176,13 @@ def _list_privileged_columns(task: DistillTask) -> list[int]:
     return [names.index(name) for name in task.teacher.needs if name not in known]
 
 
-class _DistillResult(NamedTuple):
-    """The policy, and the result of each round."""
-
-    policy: Policy
-    rounds: tuple[RoundResult, ...]
-
-
 def distill(
     card: Card,
     tasks: Sequence[DistillTask],
     config: DistillConfig,
     path: str | Path,
     report: Callable[[RoundResult], None] = lambda _: None,
-) -> _DistillResult:
+) -> Policy:
     """Train a policy on all tasks and write it to a file after every round.
 
     Args:
@@ -208,20 +193,19 @@ def distill(
         report: Function that is called after each round.
 
     Returns:
-        Policy of the last round, and all rounds' results: equal bits for equal arguments.
+        Policy of the last round: equal bits for equal arguments.
 
     Raises:
-        ValueError: There is no task, or `config.told` where the student sees all that matters.
+        ValueError: There is no task, or `auxiliary_weight` where the student sees everything.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")
     n_privileged = len(_list_privileged_columns(tasks[0]))
-    if config.told and not n_privileged:
+    if config.auxiliary_weight and not n_privileged:
         raise ValueError("nothing is left to be told: the student sees all that its teacher reads")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
-    rounds = list[RoundResult]()
     width = cars.single_action_space.shape[0]
     model = Student(len(cars.layout), width, config, n_privileged)
 
@@ -230,11 +214,10 @@ def distill(
         numbers = replace(card, steps=result.steps, cpu_seconds=cpu_seconds)
         policy = Policy(target.stem, model.network(scaling), numbers)
         save_policy(target, policy.network, policy.card)
-        rounds.append(result)
         report(result)
         return policy
 
-    return _DistillResult(imitate(model, tasks, config, save_round), tuple(rounds))
+    return imitate(model, tasks, config, save_round)
 
 
 class _EpisodeBatches:
@@ -316,9 +299,12 @@ def _fit_model(
             error = out[..., : y.shape[-1]] - y
             added_cost = torch.einsum("bti,bij,btj->bt", error, S, error) * w
             loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # by episode
-            if config.told:
+            if config.auxiliary_weight:
                 auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
-                loss = loss / zero_loss + config.told * auxiliary_error / valid.sum().clamp(min=1)
+                loss = (
+                    loss / zero_loss
+                    + config.auxiliary_weight * auxiliary_error / valid.sum().clamp(min=1)
+                )
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)

@@ -140,12 +140,11 @@ def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
         return []
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
         raise ValueError(f"recurrent layers with further arguments are not known: {module}")
-    names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    cells = []
-    for i in range(module.num_layers):
-        weights = (_to_array(getattr(module, f"{name}_l{i}")) for name in names)
-        cells.append(RecurrentCell(module.mode.lower(), *weights))
-    return cells
+    kind, names = module.mode.lower(), ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+    return [
+        RecurrentCell(kind, *(_to_array(getattr(module, f"{name}_l{i}")) for name in names))
+        for i in range(module.num_layers)
+    ]
 
 
 def _to_array(parameter: "Tensor") -> Array:
@@ -160,9 +159,7 @@ def list_activations() -> dict[str, type]:
     return dict(zip(ACTIVATIONS, kinds, strict=True))
 
 
-def _convert_dense(
-    layers: list["nn.Module"],
-) -> tuple[list[Array], list[Array], list[str], str]:
+def _convert_dense(layers: list["nn.Module"]) -> tuple[list[Array], list[Array], list[str], str]:
     """Convert linear layers to weights, biases, activations between them, and the output's."""
     from torch import nn
 
@@ -232,11 +229,10 @@ def export_zip(
     target: str | Path,
     env_id: str,
     env_options: Mapping[str, Any] | None = None,
-    estimator: str = "",
     *,
     trust: bool = False,
     normalise: str | Path | None = None,
-    command: str = "",
+    **about: Any,
 ) -> Policy:
     """Export a zip's actor to a policy's file, which runs no code where it is read.
 
@@ -245,10 +241,9 @@ def export_zip(
         target: Path of the policy's file.
         env_id: Id of the training's env.
         env_options: Arguments of `gym.make` for that env.
-        estimator: Estimator of the training, "" for none.
         trust: Whether code in the zip may run.
         normalise: Pickle of VecNormalize, as for `policy_from_zip`.
-        command: Command line, for the card.
+        **about: Other fields of the policy's `Card`, such as the estimator of the training.
 
     Returns:
         Policy as it is in the file.
@@ -259,11 +254,10 @@ def export_zip(
     check_trusted(Path(path), trust)
     if Path(target).suffix != SUFFIX:
         raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
-    options = dict(env_options or {})
-    env: CarEnv = gym.make(env_id, **options)
-    if estimator:
-        env = EstimateObservation(env, estimator)
-    about = {"env_id": env_id, "env_options": options, "estimator": estimator, "command": command}
+    about |= {"env_id": env_id, "env_options": dict(env_options or {})}
+    env: CarEnv = gym.make(env_id, **about["env_options"])
+    if about.get("estimator"):
+        env = EstimateObservation(env, about["estimator"])
     policy = policy_from_zip(path, env, trust=trust, normalise=normalise, **about)
     env.close()
     save_policy(target, policy.network, policy.card)

@@ -5,14 +5,12 @@ propagated back through all of it to the weights: truncated back-propagation thr
 the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from ...envs.device import make_device_env
-from .config import TrainingTask
 from .normalise import RewardScale, Standardised
 from .student import make_dense_layers
 
@@ -20,7 +18,6 @@ import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # isort: skip
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # isort: skip
 from torch import nn  # isort: skip
 
 _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
@@ -34,31 +31,6 @@ class TrainingSource(NamedTuple):
     reward_scale: RewardScale  # factor of each car's reward
 
 
-def make_source(
-    task: TrainingTask,
-    first: int,
-    reward_scale: RewardScale,
-    device: str | torch.device,
-    compile: bool,
-) -> TrainingSource:
-    """Make a task's environments on tensors.
-
-    Args:
-        task: Task of the training.
-        first: Seed of row 0.
-        reward_scale: Factor of each car's reward.
-        device: torch's device.
-        compile: Whether to compile the step, as for `DeviceVectorEnv`.
-
-    Returns:
-        Environments with the seeds and reward factors of their rows.
-    """
-    options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
-    options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
-    cars = make_device_env(task.env_id, task.num_envs, **options)
-    return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
-
-
 class GruPolicy(BasePolicy):
     """A GRU on standardised observations, and dense layers behind it.
 
@@ -68,9 +40,7 @@ class GruPolicy(BasePolicy):
         lr_schedule: Learning rate by the remaining fraction of the training.
         cells: Hidden units of the GRU.
         net_arch: Sizes of the dense layers.
-        features_extractor_class: Class before the GRU.
-        features_extractor_kwargs: Arguments of that class.
-        normalize_images: As in stable-baselines3; there are no images.
+        **options: Arguments of `BasePolicy`, such as the class before the GRU.
     """
 
     def __init__(
@@ -80,12 +50,10 @@ class GruPolicy(BasePolicy):
         lr_schedule: Schedule,
         cells: int = 64,
         net_arch: Sequence[int] = (64, 64),
-        features_extractor_class: type[BaseFeaturesExtractor] = Standardised,
-        features_extractor_kwargs: Mapping[str, Any] | None = None,
-        normalize_images: bool = True,
+        **options: Any,
     ) -> None:
-        further = dict(features_extractor_kwargs or {}), None, normalize_images
-        super().__init__(observation_space, action_space, features_extractor_class, *further)
+        options = {"features_extractor_class": Standardised} | options
+        super().__init__(observation_space, action_space, **options)
         self.features_extractor = self.make_features_extractor()
         self.cell = nn.GRU(self.features_extractor.features_dim, cells)
         self.layers = make_dense_layers(cells, *net_arch, action_space.shape[0])
@@ -140,7 +108,7 @@ class GruPolicy(BasePolicy):
             before = torch.where(is_start[:, None], 0.0, before)
         with torch.no_grad():
             actions, after = self(obs_tensor, before)
-        clipped = actions.clamp(-1.0, 1.0).cpu().numpy()
+        clipped: Any = actions.clamp(-1.0, 1.0).cpu().numpy()
         return clipped[0] if is_single else clipped, (after,)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
@@ -165,13 +133,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         n_steps: Control periods of a window.
         compile: Whether to compile the step, as for `DeviceVectorEnv`.
         source: Function of `device` and `compile` that makes the cars; None to load a zip.
-        stats_window_size: As in stable-baselines3.
-        tensorboard_log: As in stable-baselines3.
         policy_kwargs: Arguments of the policy.
-        verbose: As in stable-baselines3.
-        seed: Seed of weights.
-        device: torch's device.
         _init_setup_model: As in stable-baselines3.
+        **options: Arguments of `BaseAlgorithm`, such as the seed of the weights.
 
     Raises:
         ValueError: `n_steps` is below 1.
@@ -187,20 +151,15 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         n_steps: int = 16,
         compile: bool = True,
         source: Callable[..., TrainingSource] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
+        **options: Any,
     ) -> None:
         if n_steps < 1:
             raise ValueError(f"n_steps is at least 1, got {n_steps}")
         super().__init__(
-            policy, env, learning_rate, policy_kwargs, stats_window_size, tensorboard_log, verbose,
-            device, support_multi_env=True, seed=seed,
-        )  # fmt: skip
+            policy, env, learning_rate, policy_kwargs, support_multi_env=True, **options
+        )
         self.n_steps, self.compile, self.source = n_steps, compile, source
         if _init_setup_model:
             self._setup_model()
@@ -252,9 +211,8 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         is_running, windows = True, 0
         while is_running and self.num_timesteps < total:
             callback.on_rollout_start()
-            mean_cost, obs, state = _unroll_window(
-                policy, cars, obs, state, reward_scale, self.n_steps
-            )
+            window = policy, cars, obs, state, reward_scale, self.n_steps
+            mean_cost, obs, state = _unroll_window(*window)
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
             self._update_weights(mean_cost)

@@ -29,7 +29,6 @@ from .student import (
     compute_scaling,
     compute_whitening,
     make_dense_layers,
-    normalise_inputs,
 )
 
 with require_extra("train", "memories need torch"):
@@ -121,6 +120,10 @@ class CompactObservation(VectorObservationWrapper[Single, Single, Single, npt.ND
         return rate
 
 
+_State = Tensor | None
+_Output = tuple[Tensor, _State]
+
+
 class _MemoryNetwork(nn.Module):
     """Whitened inputs, a memory and layers for the action.
 
@@ -142,9 +145,7 @@ class _MemoryNetwork(nn.Module):
         """Build the memory, and return the width of the output of `_update_memory`."""
         return 0
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         """Compute memory (B, T, m) and next state by inputs (B, T, k) and arrivals (B, T, 1)."""
         return z[..., :0], state
 
@@ -155,13 +156,14 @@ class _MemoryNetwork(nn.Module):
         needs: Sequence[str],
     ) -> Scaling:
         """Fit the scaling and whitening on drives, as `Student.fit_scaling` but for the mixing."""
-        mean, scale, _ = compute_scaling(drives, layout, needs, usual_ages=False)
-        inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
+        mixed = compute_scaling(drives, layout, needs, usual_ages=False)
+        scaling = mixed._replace(mixing=None)  # memories mix by themselves
+        inputs = np.concatenate([scaling.mix_inputs(demo.obs) for demo in drives])
         whitening = compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2)
         self.mix.copy_(torch.from_numpy(whitening))
-        return Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
+        return scaling
 
-    def forward(self, z: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+    def forward(self, z: Tensor, state: _State = None) -> _Output:
         """Compute actions (B, T, 1) and the next state of normalised observations (B, T, k)."""
         arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
         known, state = self._update_memory(z, arrived, state)
@@ -182,9 +184,7 @@ class _FrameStack(_MemoryNetwork):
     def _build_memory(self) -> int:
         return (self.count - 1) * self.inputs
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         before = z.new_zeros(len(z), self.count - 1, self.inputs) if state is None else state
         frames = torch.cat([before, z], 1)
         past = frames[:, :-1].unfold(1, self.count - 1, 1).flatten(2)
@@ -200,9 +200,7 @@ class _Gru(_MemoryNetwork):
         self.cell = nn.GRU(self.inputs, self.size, batch_first=True)
         return self.size
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         known, state = self.cell(z, None if state is None else state[None])
         return known, state[0]
 
@@ -230,9 +228,7 @@ class _LinearRnn(_MemoryNetwork):
         unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
         return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         steps = z.shape[1]
         powers, ages = self._compute_powers(steps + 1), torch.arange(steps)
         past = ages[:, None] - ages
@@ -266,9 +262,7 @@ class _Kalman(_LinearRnn):
         self.gains = nn.Parameter(0.1 * torch.randn(2, self.outputs, width))
         return width
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         n, delay_steps, steps = self.size, self.delay_steps, z.shape[1]
         if state is None:
             state = z.new_zeros(len(z), 2 + delay_steps, n, dtype=torch.complex64)
@@ -309,9 +303,7 @@ class _Transformer(_MemoryNetwork):
         self.bias = nn.Parameter(torch.zeros(self.layers, self.heads, self.window))
         return width
 
-    def _update_memory(
-        self, z: Tensor, arrived: Tensor, state: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
+    def _update_memory(self, z: Tensor, arrived: Tensor, state: _State) -> _Output:
         batch, steps, _ = z.shape
         before, width = self.window - 1, self.width
         if state is None:
@@ -347,18 +339,18 @@ MEMORIES: dict[str, type[_MemoryNetwork]] = {
 class _MemoryAgent:
     """A memory as an agent on plain observations."""
 
-    def __init__(self, model: _MemoryNetwork, mean: Array, scale: Array) -> None:
-        self.model, self.mean, self.scale = model, mean, scale
+    def __init__(self, model: _MemoryNetwork, scaling: Scaling) -> None:
+        self.model, self.scaling = model, scaling
 
     def predict(
         self,
         observation: Single,
-        state: Tensor | None = None,
+        state: _State = None,
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Single, Tensor | None]:
+    ) -> tuple[Single, _State]:
         """Compute actions and the next state, with the signature of stable-baselines3."""
-        z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
+        z = torch.from_numpy(self.scaling.mix_inputs(observation))[:, None]
         if state is not None and episode_start is not None and np.any(episode_start):
             state = state.clone()
             state[torch.from_numpy(np.asarray(episode_start))] = 0.0
@@ -403,6 +395,6 @@ def train_memory(
 
     def make_agent(scaling: Scaling, result: RoundResult) -> _MemoryAgent:
         report(result)
-        return _MemoryAgent(model, scaling.mean, scaling.scale)
+        return _MemoryAgent(model, scaling)
 
     return imitate(model, [task], config, make_agent, weight)

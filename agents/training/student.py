@@ -27,6 +27,7 @@ Single = npt.NDArray[np.float32]
 _CLIP = 8.0  # limit of a normalised input (standard deviations)
 _UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
+_MIN_SPREAD = 1e-9  # standard deviation below which an input counts as constant
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
 _MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
@@ -37,17 +38,16 @@ _BLOCK = 50  # steps whose means are one product of matrices
 _MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
 
 
-def compute_scale(spread: Array, minimum: float = 1e-9) -> Array:
+def compute_scale(spread: Array) -> Array:
     """Compute the inverse of each standard deviation, zero where nothing varies.
 
     Args:
         spread: Standard deviations, shape (k,).
-        minimum: Deviation below which an input counts as constant.
 
     Returns:
         Factors, shape (k,).
     """
-    return np.where(spread > minimum, 1.0 / np.maximum(spread, minimum), 0.0)
+    return np.where(spread > _MIN_SPREAD, 1.0 / np.maximum(spread, _MIN_SPREAD), 0.0)
 
 
 def compute_whitening(z: npt.NDArray[np.floating], minimum: float) -> Array:
@@ -90,10 +90,11 @@ class Scaling(NamedTuple):
 
     mean: Array  # shape (k,)
     scale: Array  # factors, shape (k,), zero for an entry that is not read
-    mixing: Array  # symmetric whitening, shape (k, k): it scales up small differences
+    mixing: Array | None = None
+    """Symmetric whitening, shape (k, k), which scales up small differences; None for none."""
 
     def mix_inputs(self, obs: Single) -> Single:
-        """Compute a `Student`'s inputs.
+        """Compute the inputs of a network.
 
         Args:
             obs: Observations, shape (..., k).
@@ -101,8 +102,9 @@ class Scaling(NamedTuple):
         Returns:
             Inputs, shape (..., k).
         """
-        mixing = self.mixing.astype(np.float32)
-        return normalise_inputs(obs, self.mean, self.scale) @ mixing
+        mean, scale = self.mean.astype(np.float32), self.scale.astype(np.float32)
+        z: Single = np.clip((obs - mean) * scale, -_CLIP, _CLIP)
+        return z if self.mixing is None else z @ self.mixing.astype(np.float32)
 
 
 def compute_scaling(
@@ -134,22 +136,8 @@ def compute_scaling(
             early, median = np.percentile(x[:, i], (_EARLY, _MEDIAN))
             if median > early:
                 mean[i], spread[i] = median, median - early
-    scale = np.where(is_read, compute_scale(spread), 0.0)
-    return Scaling(mean, scale, compute_whitening(normalise_inputs(x, mean, scale), _MIN_VARIANCE))
-
-
-def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
-    """Normalise observations: clip((x - mean) scale).
-
-    Args:
-        obs: Observations, shape (..., k).
-        mean: Means, shape (k,).
-        scale: Factors, shape (k,).
-
-    Returns:
-        Normalised observations, shape (..., k).
-    """
-    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -_CLIP, _CLIP)
+    plain = Scaling(mean, np.where(is_read, compute_scale(spread), 0.0))
+    return plain._replace(mixing=compute_whitening(plain.mix_inputs(x), _MIN_VARIANCE))
 
 
 @dataclass(frozen=True)
@@ -171,7 +159,7 @@ class DistillConfig:
     noise: float = 0.02  # largest standard deviation of the noise on the teacher's actions
     seed: int = 0  # of weights and episodes
     batch: int = 16  # episodes of a batch, for a student with memory
-    told: float = 0.0  # weight of the auxiliary loss: predict the teacher's inputs it cannot see
+    auxiliary_weight: float = 0.0  # weight of predicting the teacher's inputs it cannot see
     traces: int = 0  # SiLU units in front of the moving averages; 0: no averages
 
     def __post_init__(self) -> None:
@@ -179,16 +167,17 @@ class DistillConfig:
         if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
             rule = "rounds, epochs and sizes are 1 at least, cells, traces and seed 0"
             raise ValueError(f"{rule}: {self}")
-        if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
+        if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.auxiliary_weight >= 0.0):
             raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
         if self.cells and self.traces:
             raise ValueError(f"a student has cells or traces, got {self.cells} and {self.traces}")
-        if self.told and not (self.cells or self.traces):
+        if self.auxiliary_weight and not (self.cells or self.traces):
             raise ValueError("a student without memory has nothing to say: told is for those with")
 
     def describe(self) -> dict[str, object]:
-        """Collect all numbers but the seed, in JSON types."""
+        """Collect all numbers but the seed, in JSON types; cards call `auxiliary_weight` told."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
+        numbers["told"] = numbers.pop("auxiliary_weight")
         return {name: value for name, value in numbers.items() if name != "seed"}
 
 
@@ -323,7 +312,9 @@ class Student(nn.Module):
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         head_inputs = config.cells or sizes[-2]
-        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if config.told else None
+        self.auxiliary_head = (
+            nn.Linear(head_inputs, n_privileged) if config.auxiliary_weight else None
+        )
         self.recurrent = bool(memory_size)
 
     def forward(
@@ -379,18 +370,18 @@ class Student(nn.Module):
         Returns:
             Network of the actions, by NumPy.
         """
+        mean, scale, mixing = scaling
+        mixing = np.eye(len(mean)) if mixing is None else mixing
         numbers = [_to_array(parameter) for parameter in self.dense.parameters()]
-        weights, biases = numbers[::2], numbers[1::2]
-        cells: list[MemoryLayer] = []
+        weights, biases, cells = numbers[::2], numbers[1::2], list[MemoryLayer]()
         if self.traces:
-            cells.append(self.traces.cell(scaling.mixing))
+            cells.append(self.traces.cell(mixing))
             weights[0], biases[0] = self.traces.convert_weights(weights[0], biases[0])
         elif self.cell:  # weights of the inputs and of the state, then both biases
             weight_in, *rest = map(_to_array, self.cell.parameters())
-            cells.append(RecurrentCell("gru", weight_in @ scaling.mixing, *rest))
+            cells.append(RecurrentCell("gru", weight_in @ mixing, *rest))
         else:
-            weights[0] = weights[0] @ scaling.mixing
-        mean, scale, _ = scaling
+            weights[0] = weights[0] @ mixing
         return Network(mean, scale, weights, biases, "silu", clip=_CLIP, cells=cells)
 
 

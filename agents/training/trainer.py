@@ -6,15 +6,23 @@ stable-baselines3's format), `curve.jsonl` (the evaluations), and `begun_with.sa
 started from a policy.
 """
 
-from dataclasses import asdict, fields, replace
+import math
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from ... import __version__
 from ...envs.io import from_json
+from ...envs.record import Array
+from ..env_info import CarVectorEnv, get_layout
 from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
+from ..rollout import COST_FLOOR
+from ..vec_env import make_vec_env
 from .callbacks import (
     BEST,
     CHECKPOINT,
@@ -31,16 +39,31 @@ from .callbacks import (
 )
 from .config import TrainingTask
 from .export import check_zip
+from .normalise import CLIP, RewardScale, RewardScaleWrapper, StandardisedArguments
+from .student import compute_whitening
+from .warm_start import WarmStart
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+from stable_baselines3.common.vec_env import VecEnv  # isort: skip
+
+if TYPE_CHECKING:
+    from .. import Agent
+    from .gradient import TrainingSource
 
 __all__ = [
     "BEST", "CHECKPOINT", "CURVE", "POLICY", "EvalCallback", "Progress", "RunOptions", "RunRecord",
-    "TrainResult", "TrainingTask", "read_task", "train",
+    "TrainResult", "Trainer", "TrainingTask", "read_training",
 ]  # fmt: skip
+_SCALING_ENVS = 64  # environments whose observations make the scaling
+_WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
+_CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
+_MIN_VARIANCE = 1e-3  # least variance of a mixture of standardised entries
+_CONSTANT = 1e-9  # standard deviation, in an entry's unit, up to which it is not read
+_UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
 
 
 class TrainResult(NamedTuple):
@@ -55,122 +78,272 @@ class TrainResult(NamedTuple):
         return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
 
-def train(
-    task: TrainingTask,
-    steps: int,
-    folder: str | Path,
-    resume: bool = False,
-    run_options: RunOptions | None = None,
-    trained_agent: str | Path | Policy | None = None,
-    trust: bool = False,
-) -> TrainResult:
-    """Train up to a number of steps in a folder.
+class SavedTraining(NamedTuple):
+    """A training as its folder has it."""
+
+    folder: Path
+    task: TrainingTask
+    record: RunRecord
+    state: Checkpoint  # of its checkpoint
+
+    def load_initial_policy(self) -> Policy | None:
+        """Load the policy that it started from, under its own name; None for another training."""
+        name, file = self.record.begun_with, self.folder / WARM_START_FILE
+        if not name:
+            return None
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
+        return replace(load_policy(file), name=name)
+
+
+def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
+    """Read a folder's training from its checkpoint.
+
+    Args:
+        folder: Folder of the training.
+        **arguments: Fields of the task that must agree with it.
+
+    Returns:
+        The training.
+
+    Raises:
+        FileNotFoundError: There is no checkpoint.
+        ValueError: A field differs, or the checkpoint is of another version.
+    """
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
+    state = read_state(path)
+    saved, version = state["task"], state["sideslip"]
+    if version != __version__:
+        raise ValueError(
+            f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
+            "may be others: train anew, in another folder"
+        )
+    names = [item.name for item in fields(TrainingTask)]  # a default for none of them
+    missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
+    if missing:
+        raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
+    task = from_json(TrainingTask, saved, f"{path}: the task")
+    try:
+        check_names_no_code(task.env_id, task.estimator, task.estimator_options)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    for name, value in arguments.items():
+        if value != getattr(task, name):
+            raise ValueError(
+                f"{path} is of {name} {getattr(task, name)!r}, not {value!r}: train that in "
+                "another folder"
+            )
+    record = from_json(RunRecord, state["aim"], f"{path}: the aim")
+    return SavedTraining(Path(folder), task, record, state)
+
+
+@dataclass
+class Trainer:
+    """A training in a folder.
 
     A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
     and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
     actions before weights change.
 
-    Args:
-        task: Task of the training.
-        steps: Number of steps, rounded up to whole rollouts.
-        folder: Folder of the training.
-        resume: Whether to resume from the folder's checkpoint.
-        run_options: Options of this run.
-        trained_agent: Zip of stable-baselines3 with the first weights; or, for `ppo` and
-            `gradient`, a `Policy` or its name, whose costs weigh the drives.
-        trust: Whether a pickle of VecNormalize beside the zip may be read.
-
-    Returns:
-        Model and its evaluations.
-
     Raises:
         ValueError: The folder holds another training, or arguments contradict each other.
         ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
     """
-    chosen_options = run_options or RunOptions()
-    if steps < 1:
-        raise ValueError(f"steps is at least 1, got {steps}")
-    if trained_agent is not None:
-        if resume:
+
+    task: TrainingTask
+    steps: int  # rounded up to whole rollouts
+    folder: str | Path
+    resume: bool = False  # whether to resume from the folder's checkpoint
+    run_options: RunOptions = field(default_factory=RunOptions)
+    trained_agent: str | Path | Policy | None = None
+    """Zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy` or
+    its name, whose costs weigh the drives."""
+    trust: bool = False  # whether a pickle of VecNormalize beside the zip may be read
+
+    def __post_init__(self) -> None:
+        agent, self._folder = self.trained_agent, Path(self.folder)
+        if self.steps < 1:
+            raise ValueError(f"steps is at least 1, got {self.steps}")
+        if agent is not None and self.resume:
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
-        if task.reads:
+        if agent is not None and self.task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if not isinstance(trained_agent, Policy) and is_policy(str(trained_agent)):
-            trained_agent = load_policy(trained_agent)
-        elif not isinstance(trained_agent, Policy):
-            check_zip(Path(trained_agent))
-    if chosen_options.tensorboard_log is not None and find_spec("tensorboard") is None:
-        raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-    tracker = None
-    if chosen_options.track:
-        project, name = chosen_options.track, Path(folder).name
-        tracker = _WandbCallback(project=project, name=name, config=asdict(task))
-    torch.set_num_threads(1)  # on small matrices threads only wait for each other
-    folder_path = Path(folder)
-    checkpoint = _prepare_folder(task, folder_path, resume)
-    initial_policy = _resolve_initial_policy(folder_path, resume, trained_agent)
-    zip_path = None if isinstance(trained_agent, Policy) else trained_agent
-    callback = EvalCallback(task, folder_path, checkpoint, chosen_options, steps, initial_policy)
-    callbacks: list[BaseCallback] = [callback] if tracker is None else [tracker, callback]
-    model = callback.build(zip_path, trust)
-    done = model.num_timesteps
-    if done < steps:
-        log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=task.algo)
-        try:
-            model.learn(steps - done, callback=callbacks, **log)
-            callback.evaluate()
-        except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
-            callback.check()
-            raise
-        finally:
-            if tracker is not None:
-                tracker.finish()
-    return TrainResult(model, tuple(callback.evaluations))
+        if agent is not None and not isinstance(agent, Policy):
+            if is_policy(str(agent)):
+                self.trained_agent = load_policy(agent)
+            else:
+                check_zip(Path(agent))
+        if self.run_options.tensorboard_log is not None and find_spec("tensorboard") is None:
+            raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
+        self._trackers = list[_WandbCallback]()
+        if project := self.run_options.track:
+            name, config = self._folder.name, asdict(self.task)
+            self._trackers.append(_WandbCallback(project=project, name=name, config=config))
+        torch.set_num_threads(1)  # on small matrices threads only wait for each other
+        self._state: Checkpoint | None = None
+        if self.resume:
+            saved = read_training(self._folder, **asdict(self.task))
+            self._state, self.trained_agent = saved.state, saved.load_initial_policy()
+        elif (self._folder / CHECKPOINT).exists():
+            raise ValueError(
+                f"{self._folder} holds a training already: go on with it (resume), or take another "
+                "folder"
+            )
+        else:
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+    def train(self) -> TrainResult:
+        """Train up to the number of steps; the model and its evaluations."""
+        callback, is_new = self.build(), self._state is None
+        if is_new:
+            (self._folder / WARM_START_FILE).unlink(missing_ok=True)  # of one without a checkpoint
+        if is_new and callback.policy is not None:
+            save_policy(
+                self._folder / WARM_START_FILE, callback.policy.network, callback.policy.card
+            )
+        model, callbacks = callback.model, [*self._trackers, callback]
+        done = model.num_timesteps
+        if done < self.steps:
+            log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=self.task.algo)
+            try:
+                model.learn(self.steps - done, callback=callbacks, **log)
+                callback.evaluate()
+            except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
+                callback.check()
+                raise
+            finally:
+                for tracker in self._trackers:
+                    tracker.finish()
+        return TrainResult(model, tuple(callback.evaluations))
+
+    def build(self) -> EvalCallback:
+        """Build the callback with its model, new or from a checkpoint, a zip or a policy."""
+        task, agent, state = self.task, self.trained_agent, self._state
+        start = None if agent is None else WarmStart(agent, task, self.trust)
+        callback = EvalCallback(task, self._folder, self.run_options, self.steps, start, state)
+        steps = int(state["steps"]) if state else 0
+        if state and state["scaling"] is not None:
+            callback.scaling = StandardisedArguments(*state["scaling"])
+        else:
+            callback.scaling = start.scaling if start and not state else _measure_scaling(task)
+        options = dict[str, Any](estimator=task.estimator_kwargs)
+        options["env_kwargs"] = task.options(task.num_envs)
+        options["wrapper_class"] = start.wrap_env if start else None
+        env = make_vec_env(task.env_id, task.num_envs, **options)
+        first, period = task.first_seed + steps, callback.period
+        if start and start.driver:
+            n_steps = -(-(self.steps - steps) // env.num_envs)
+            scales = _measure_reward_scale(start.driver, env, first, n_steps)
+        else:
+            scales = (np.resize(callback.weights, env.num_envs) / period)[:, None].tolist()
+        scaled_env = RewardScaleWrapper(env, RewardScale(scales))
+        log, device = self.run_options.tensorboard_log, self.run_options.device
+        further = dict[str, Any](
+            device=device, tensorboard_log=log, seed=(task.seed + steps) % 2**32
+        )
+        if task.algorithm.on_tensors:
+            further["source"] = partial(_make_source, task, first, scaled_env.reward_scale)
+        model = task.make_model(scaled_env, period, callback.scaling, **further)
+        callback.init_callback(model)
+        if state:
+            callback.load_parameters()
+            if isinstance(model, OffPolicyAlgorithm):
+                model.learning_starts += steps  # its buffer begins empty
+        elif start:
+            start.load(model)
+        model.num_timesteps = steps
+        env.seed(first)
+        return callback
 
 
-def load_initial_policy(folder: str | Path) -> Policy | None:
-    """Load the policy that a folder's training started from, None for another training.
+def _make_source(
+    task: TrainingTask,
+    first: int,
+    reward_scale: RewardScale,
+    device: str | torch.device,
+    compile: bool,
+) -> "TrainingSource":
+    """Make a task's environments on tensors, whose rows have seeds from the first one on."""
+    from ...envs.device import make_device_env
+    from .gradient import TrainingSource
 
-    Args:
-        folder: Folder of the training.
+    options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
+    options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
+    cars = make_device_env(task.env_id, task.num_envs, **options)
+    return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
 
-    Returns:
-        Policy under its own name.
 
-    Raises:
-        FileNotFoundError: The copy of the policy is missing.
+def _measure_scaling(task: TrainingTask) -> StandardisedArguments:
+    """Measure the scaling of each entry under random actions.
+
+    An algorithm that follows gradients whitens the entries under actions that are correlated in
+    time.
     """
-    name, file = read_run_record(folder).begun_with, Path(folder) / WARM_START_FILE
-    if not name:
-        return None
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
-    return replace(load_policy(file), name=name)
+    kwargs, env = task.settings.get("policy_kwargs", {}), task.vector_env(_SCALING_ENVS)
+    spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
+    names = [entry.name for entry in get_layout(env)]  # nominal cars may differ
+    unknown = [name for name in task.reads if name not in names]
+    if unknown:
+        lacking, available = ", ".join(unknown), ", ".join(names)
+        raise ValueError(f"the observation has no {lacking} to read; it has {available}")
+    samples = _collect_observations(env, spread, task.scaling_seed)
+    deviation = samples.std(axis=0)
+    varies = deviation > _CONSTANT
+    if task.reads:
+        varies &= np.isin(names, task.reads)
+    if not varies.any():
+        raise ValueError(f"nothing of what the network reads varies within {_DURATION:g} s")
+    scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+    mean, mixing = samples.mean(axis=0), None
+    if task.algorithm.on_tensors:
+        correlated = _collect_observations(env, spread, task.scaling_seed, _CORRELATION_TIME)
+        standard = np.clip((correlated - mean) * scale, -CLIP, CLIP)
+        mixing = compute_whitening(standard, _MIN_VARIANCE).tolist()
+    return StandardisedArguments(mean.tolist(), scale.tolist(), CLIP, mixing)
 
 
-def _resolve_initial_policy(folder: Path, resume: bool, agent: Any) -> Policy | None:
-    """Resolve the policy that a training starts from, and save a copy in the folder."""
-    if resume:
-        return load_initial_policy(folder)
-    if not isinstance(agent, Policy):
-        (folder / WARM_START_FILE).unlink(missing_ok=True)  # of one that had no evaluation yet
-        return None
-    save_policy(folder / WARM_START_FILE, agent.network, agent.card)
-    return agent
+def _collect_observations(
+    env: CarVectorEnv, spread: float, seed: int, correlation_time: float = 0.0
+) -> Array:
+    """Collect observations (n, k) under noise that fades to 1/e in a time (s)."""
+    base: Any = env.unwrapped
+    period = base.control_period * base.dt
+    decay = math.exp(-period / correlation_time) if correlation_time else 0.0
+    rng, observations = np.random.default_rng(seed), []
+    noise = np.zeros(env.action_space.shape or ())
+    env.reset(seed=seed)
+    for step in range(round(_DURATION / period)):
+        noise = decay * noise + (1.0 - decay**2) ** 0.5 * rng.standard_normal(noise.shape)
+        obs, *_ = env.step((spread * noise).astype(np.float32))
+        if step >= round(_WARM_UP / period):
+            observations.append(obs)
+    return np.concatenate(observations).astype(np.float64)
 
 
-def read_run_record(folder: str | Path) -> RunRecord:
-    """Read the run's record from a folder's checkpoint.
+def _measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) -> list[list[float]]:
+    """Measure the factors with which an agent's mean reward is -1, for each drive of each car.
 
-    Args:
-        folder: Folder of the training.
-
-    Returns:
-        Record of the run.
+    `seed` is that of car 0, `steps` are those of each car. Behind a car's factors stands their
+    median, for all further drives.
     """
-    read_task(folder)
-    path = Path(folder) / CHECKPOINT
-    return from_json(RunRecord, read_state(path)["aim"], f"{path}: the aim")
+    scales: list[list[float]] = [[] for _ in range(env.num_envs)]
+    costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
+    env.seed(seed)
+    obs, state, start = env.reset(), None, np.ones(env.num_envs, np.bool_)
+    for _ in range(steps):
+        actions, state = agent.predict(obs, state, start, deterministic=True)
+        obs, rewards, start, _ = env.step(actions)
+        costs -= rewards
+        lengths += 1.0
+        for i in np.flatnonzero(start).tolist():
+            scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
+            costs[i] = lengths[i] = 0.0
+    open_scales = lengths / (costs + COST_FLOOR)
+    for car_scales, open_scale in zip(scales, open_scales, strict=True):
+        car_scales.append(float(np.median(car_scales or [open_scale])))
+    return scales
 
 
 class _WandbCallback(BaseCallback, KVWriter):
@@ -201,58 +374,3 @@ class _WandbCallback(BaseCallback, KVWriter):
     def finish(self) -> None:
         if self._run is not None:
             self._run.finish()
-
-
-def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
-    """Read the task of a folder's checkpoint.
-
-    Args:
-        folder: Folder of the training.
-        arguments: Fields of the task that must agree with it.
-
-    Returns:
-        The task.
-
-    Raises:
-        FileNotFoundError: There is no checkpoint.
-        ValueError: A field differs, or the checkpoint is of another version.
-    """
-    path = Path(folder) / CHECKPOINT
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
-    state = read_state(path)
-    saved, version = state["task"], state["sideslip"]
-    if version != __version__:
-        raise ValueError(
-            f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
-            "may be others: train anew, in another folder"
-        )
-    names = [task_field.name for task_field in fields(TrainingTask)]  # a default for none of them
-    missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
-    if missing:
-        raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
-    task = from_json(TrainingTask, saved, f"{path}: the task")
-    try:
-        check_names_no_code(task.env_id, task.estimator, task.estimator_options)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    for name, value in arguments.items():
-        if value != getattr(task, name):
-            raise ValueError(
-                f"{path} is of {name} {getattr(task, name)!r}, not {value!r}: train that in "
-                "another folder"
-            )
-    return task
-
-
-def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> Checkpoint | None:
-    """Return the checkpoint's state, or prepare the folder of a new training and return None."""
-    if resume:
-        read_task(folder, **asdict(task))
-        return read_state(folder / CHECKPOINT)
-    if (folder / CHECKPOINT).exists():
-        raise ValueError(
-            f"{folder} holds a training already: go on with it (resume), or take another folder"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    return None

@@ -5,10 +5,9 @@ A policy's moving averages become part of the environments, for algorithms witho
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,52 +44,6 @@ if TYPE_CHECKING:
 
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _MIN_VARIANCE = 1e-4  # least variance of a mixture of memory features, for `compute_whitening`
-
-
-class _WarmStart(NamedTuple):
-    """The tensors of a zip or policy for a new model."""
-
-    name: str  # path of the zip or name of the policy
-    parameters: dict[str, Any]  # weights and optimisers by their names in `get_parameters`
-    variables: dict[str, Any]  # further tensors of a zip
-    scaling: StandardisedArguments  # of the observations
-    partial: bool = False  # whether the rest of the model stays unchanged
-
-
-def read_warm_start(path: str | Path, width: int, trust: bool = False) -> _WarmStart:
-    """Read the tensors of a zip without running code from it.
-
-    Args:
-        path: Path of the zip.
-        width: Entries of the observation.
-        trust: Whether a pickle of VecNormalize beside the zip may be read.
-
-    Returns:
-        Tensors of the model, and its scaling.
-
-    Raises:
-        PermissionError: There is such a pickle and no trust.
-        ValueError: The zip cannot be read, or as `check_zip`.
-    """
-    file = Path(path)
-    check_zip(file)
-    try:
-        _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
-        parameters: dict[str, Any] = loaded
-        policy = parameters["policy"]
-    except Exception as error:  # torch raises many for one that is cut short
-        raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    inner = [name for name in policy if "features_extractor." in name]
-    buffers = {name.rpartition(".")[2]: policy[name] for name in inner}
-    if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
-        bound = float(buffers["clip"])
-        mixing = buffers["mixing"].tolist() if "mixing" in buffers else None
-        mean_scale = buffers["mean"].tolist(), buffers["scale"].tolist()
-        inner_scaling = (*mean_scale, bound if bound < math.inf else None, mixing)
-        return _WarmStart(str(file), parameters, variables or {}, inner_scaling)
-    mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
-    scaling = mean.tolist(), scale.tolist(), clip, None
-    return _WarmStart(str(file), parameters, variables or {}, scaling)
 
 
 def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
@@ -165,60 +118,156 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     return {"net_arch": list(network.hidden), "activation_fn": network.activation}
 
 
-def _make_warm_start(
-    policy: Policy, task: TrainingTask, layout: Sequence[ObservationEntry]
-) -> _WarmStart:
-    """Make the warm start of a task's actor from a policy; a critic stays unchanged."""
-    network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
-    names = [entry.name for entry in layout]
-    if policy_entries != names:
-        known, available = ", ".join(policy_entries), ", ".join(names)
-        raise ValueError(f"{policy.name} reads {known}; here there is {available}")
-    form = _get_policy_form(policy, task.algo)
-    policy_kwargs = task.settings.get("policy_kwargs", {})
-    if policy_kwargs != policy_kwargs | form:
-        contrast = f"{form}, and the settings say {policy_kwargs}"
-        raise ValueError(f"{policy.name} is a network of {contrast}")
-    on_tensors = get_algorithm(task.algo).on_tensors
-    if on_tensors:
-        cell = network.cells[0]
-        arrays = dict(zip(_GRU, (getattr(cell, part) for part in CELL_WEIGHTS), strict=True))
-        layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
-    else:
-        arrays, hidden = {}, range(len(network.hidden))
-        layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in hidden), "action_net"]
-    for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
-        arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
-    tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
-    read = network if on_tensors else network.dense
-    scaling = read.mean.tolist(), read.scale.tolist(), read.clip, None
-    return _WarmStart(policy.name, {"policy": tensors}, {}, scaling, partial=True)
+class WarmStart:
+    """The start of a training from a zip of stable-baselines3 or from a policy.
 
-
-def load_warm_start(start: _WarmStart, model: "BaseAlgorithm") -> None:
-    """Load a warm start into a model.
+    PPO has no memory: a policy's moving averages stay unchanged as part of its environments,
+    whitened by the policy's own drives.
 
     Args:
-        start: Tensors to load.
-        model: Model of stable-baselines3.
+        agent: Path of the zip, or policy.
+        task: Task of the training.
+        trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+    Attributes:
+        policy: The policy, None for a zip.
+        driver: Agent that drives as the policy does, None for a zip.
+        env: Vector env of the task's evaluations, with the model's observation.
+        scaling: Scaling of the model's observations.
 
     Raises:
-        ValueError: The tensors are of another network.
+        PermissionError: There is such a pickle and no trust.
+        ValueError: The zip cannot be read, or the task trains no such policy.
     """
-    policy = dict(model.get_parameters()["policy"])
-    if not start.partial:  # a zip from elsewhere has its features extractor outside
-        policy = {name: x for name, x in policy.items() if "features_extractor." in name}
-    policy |= start.parameters["policy"]
-    parameters = {**model.get_parameters(), **start.parameters, "policy": policy}
-    try:
-        model.set_parameters(parameters, device=model.device)
-        for name, tensor in start.variables.items():
-            getattr(model, name).data.copy_(tensor)
-    except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{start.name} holds other networks than this training's {type(model).__name__} (its "
-            f"settings say which): {' '.join(str(error).split())[:300]}"
-        ) from error
+
+    def __init__(self, agent: str | Path | Policy, task: TrainingTask, trust: bool = False) -> None:
+        self.policy = agent if isinstance(agent, Policy) else None
+        self.driver: _NetworkAgent | None = None
+        self.env = task.vector_env(task.n_eval_envs)
+        self._whitening: tuple[Array, Array] | None = None
+        self._variables: dict[str, Any] = {}  # a zip's tensors of no module
+        if isinstance(agent, Policy):
+            self._read_policy(agent, task)
+        else:
+            self._read_zip(Path(agent), trust)
+
+    def _read_zip(self, file: Path, trust: bool) -> None:
+        """Read the tensors of a zip without running code from it."""
+        check_zip(file)
+        try:
+            _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
+            self._name, self._parameters = str(file), dict[str, Any](loaded)
+            self._variables, policy = variables or {}, self._parameters["policy"]
+        except Exception as error:  # torch raises many for one that is cut short
+            raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+        inner = [name for name in policy if "features_extractor." in name]
+        buffers = {name.rpartition(".")[2]: policy[name] for name in inner}
+        if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
+            bound, mixing = float(buffers["clip"]), buffers.get("mixing")
+            self.scaling = StandardisedArguments(
+                buffers["mean"].tolist(),
+                buffers["scale"].tolist(),
+                bound if bound < math.inf else None,
+                None if mixing is None else mixing.tolist(),
+            )
+            return
+        width = (self.env.single_observation_space.shape or (0,))[0]
+        mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
+        self.scaling = StandardisedArguments(mean.tolist(), scale.tolist(), clip)
+
+    def _read_policy(self, policy: Policy, task: TrainingTask) -> None:
+        """Read the actor's tensors of a policy, which the task's observation and form must fit."""
+        network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
+        names = [entry.name for entry in get_layout(self.env)]
+        if policy_entries != names:
+            known, available = ", ".join(policy_entries), ", ".join(names)
+            raise ValueError(f"{policy.name} reads {known}; here there is {available}")
+        form, on_tensors = _get_policy_form(policy, task.algo), task.algorithm.on_tensors
+        policy_kwargs = task.settings.get("policy_kwargs", {})
+        if policy_kwargs != policy_kwargs | form:
+            contrast = f"{form}, and the settings say {policy_kwargs}"
+            raise ValueError(f"{policy.name} is a network of {contrast}")
+        if network.cells and not on_tensors:
+            self._whitening = _measure_whitening(self.env, network, task.scaling_seed)
+            self.env = self.wrap_env(self.env)
+            mean, mixing = self._whitening
+            first, bias = network.weights[0], network.biases[0]
+            first, bias = first @ np.linalg.inv(mixing), bias + first @ mean
+            network = _replace_first_layer(network, first, bias).dense
+        if on_tensors:
+            cell = network.cells[0]
+            arrays = dict(zip(_GRU, (getattr(cell, part) for part in CELL_WEIGHTS), strict=True))
+            layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
+        else:
+            arrays, hidden = {}, range(len(network.hidden))
+            layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in hidden), "action_net"]
+        for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
+            arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
+        tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
+        self._name, self._parameters = policy.name, {"policy": tensors}
+        self.driver = _NetworkAgent(network)
+        scaling = network.mean.tolist(), network.scale.tolist(), network.clip
+        self.scaling = StandardisedArguments(*scaling)
+
+    def wrap_env(self, env: CarVectorEnv) -> CarVectorEnv:
+        """Wrap a vector env so that it has the model's observation.
+
+        Args:
+            env: Vector env of the task.
+
+        Returns:
+            Wrapped env; `env` itself where a policy has no memory.
+        """
+        if self.policy is None or self._whitening is None:
+            return env
+        return _MemoryObservation(env, self.policy.network, self._whitening)
+
+    def merge_network(self, network: Network) -> Network:
+        """Merge a model's network with the policy's memory, for plain observations.
+
+        Args:
+            network: Network of the model.
+
+        Returns:
+            Network of plain observations.
+        """
+        if self.policy is None or self._whitening is None:
+            return network
+        mean, mixing = self._whitening
+        first = network.weights[0] @ mixing
+        plain = _replace_first_layer(network, first, network.biases[0] - first @ mean)
+        names = ("weights", "biases", "activation", "output")
+        return replace(self.policy.network, **{name: getattr(plain, name) for name in names})
+
+    def load(self, model: "BaseAlgorithm") -> None:
+        """Load the tensors into a model; of a policy those of the actor alone.
+
+        Args:
+            model: Model of stable-baselines3.
+
+        Raises:
+            ValueError: The tensors are of another network.
+        """
+        policy = dict(model.get_parameters()["policy"])
+        if self.policy is None:  # a zip from elsewhere has its features extractor outside
+            policy = {name: x for name, x in policy.items() if "features_extractor." in name}
+        policy |= self._parameters["policy"]
+        parameters = {**model.get_parameters(), **self._parameters, "policy": policy}
+        try:
+            model.set_parameters(parameters, device=model.device)
+            for name, tensor in self._variables.items():
+                getattr(model, name).data.copy_(tensor)
+        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"{self._name} holds other networks than this training's {type(model).__name__} "
+                f"(its settings say which): {' '.join(str(error).split())[:300]}"
+            ) from error
+
+
+def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
+    """Replace weights (m, k) and biases (m,) of a network's first dense layer."""
+    all_weights, all_biases = [weights, *network.weights[1:]], [biases, *network.biases[1:]]
+    return replace(network, weights=all_weights, biases=all_biases)
 
 
 class _NetworkAgent:
@@ -244,63 +293,33 @@ class _NetworkAgent:
         return np.clip(actions, -1.0, 1.0).astype(np.float32), memory
 
 
-class _Mixing(NamedTuple):
-    """The whitening of memory features x: (x - mean) mixing."""
-
-    mean: Array  # shape (k,)
-    mixing: Array  # symmetric matrix, shape (k, k)
-
-    def adapt_to_mixed(self, network: Network) -> Network:
-        """Adapt a network of plain x to mixed x."""
-        first = network.weights[0] @ np.linalg.inv(self.mixing)
-        bias = network.biases[0] + network.weights[0] @ self.mean
-        return _replace_first_layer(network, first, bias)
-
-    def adapt_to_plain(self, network: Network) -> Network:
-        """Adapt a network of mixed x to plain x."""
-        first = network.weights[0] @ self.mixing
-        return _replace_first_layer(network, first, network.biases[0] - first @ self.mean)
-
-
-def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
-    """Replace weights (m, k) and biases (m,) of a network's first dense layer."""
-    all_weights, all_biases = [weights, *network.weights[1:]], [biases, *network.biases[1:]]
-    return replace(network, weights=all_weights, biases=all_biases)
-
-
-class MemoryObservation(
+class _MemoryObservation(
     VectorWrapper[Observations, Observations, Observations, Observations, npt.NDArray[Any]]
 ):
     """A vector env whose observations (N, k) are the inputs of a network's dense layers.
 
-    Args:
-        env: Vector env that resets a row in the step that ends it, with the network's observation.
-        network: Network with memory.
-        mixing: Whitening of the observations, None for none.
+    The inner env, with the network's observation, resets a row in the step that ends it. Of
+    `whitening` the first, shape (k,), is subtracted; the second multiplies, shape (k, k).
     """
 
-    def __init__(self, env: CarVectorEnv, network: Network, mixing: _Mixing | None = None) -> None:
+    transparent = True  # its layout says how it changes the observation
+
+    def __init__(
+        self, env: CarVectorEnv, network: Network, whitening: tuple[Array, Array] | None = None
+    ) -> None:
         super().__init__(env)
         names = [f"memory_{i}" for i in range(network.dense.inputs)]
         self.layout = tuple(ObservationEntry(name, "-", -np.inf, np.inf) for name in names)
         self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
-        self._mixing = mixing and _Mixing(mixing.mean, mixing.mixing.astype(np.float32))
+        self._whitening = whitening and (whitening[0], whitening[1].astype(np.float32))
         self._last = np.zeros(self.observation_space.shape or (), np.float32)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows; those that a `reset_mask` leaves out keep their memory and observation.
-
-        Args:
-            seed: Seeds of the inner env.
-            options: Options of the inner env.
-
-        Returns:
-            Observations of all rows, and infos.
-        """
+        """Reset the rows; those that a `reset_mask` leaves out keep memory and observation."""
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         obs, infos = self.env.reset(seed=seed, options=options)
         new_state, updated = np.zeros_like(self._state[mask]), self._last.copy()
@@ -309,14 +328,7 @@ class MemoryObservation(
         return updated.copy(), infos
 
     def step(self, actions: Observations) -> Any:
-        """Step the inner env and compute the observations, `final_obs` of the infos too.
-
-        Args:
-            actions: Actions, shape (N, width).
-
-        Returns:
-            Observations, rewards, terminated, truncated and infos.
-        """
+        """Step the inner env and compute the observations, `final_obs` of the infos too."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         over = terminated | truncated
         if over.any():
@@ -332,67 +344,21 @@ class MemoryObservation(
     def _read(self, obs: Observations, state: Array) -> Observations:
         """Compute observations (N, k), float32; the state (N, memory) is updated."""
         x = self._network.compute_features(obs.astype(np.float64), state)
-        if self._mixing is None:
+        if self._whitening is None:
             return x.astype(np.float32)
-        whitened = (x - self._mixing.mean).astype(np.float32) @ self._mixing.mixing
-        return np.asarray(whitened, np.float32)
+        mean, mixing = self._whitening
+        return np.asarray((x - mean).astype(np.float32) @ mixing)
 
 
-def _measure_mixing(env: CarVectorEnv, network: Network, seed: int) -> _Mixing:
-    """Measure the whitening in a network's own drives, one episode of each row from a seed on."""
+def _measure_whitening(env: CarVectorEnv, network: Network, seed: int) -> tuple[Array, Array]:
+    """Measure mean and whitening of what a network remembers in its own drives.
+
+    They are one episode of each row from a seed on.
+    """
     collected, agent = [], _NetworkAgent(network.dense)
-    drive = iterate_steps(MemoryObservation(env, network), agent, seed)
+    drive = iterate_steps(_MemoryObservation(env, network), agent, seed)
     for step in itertools.islice(drive, 0, None, SAMPLE_STRIDE):
         over = np.logical_or(step.terminated, step.truncated)
         collected.append(step.obs[step.running & ~over])
     x = np.concatenate(collected).astype(np.float64)
-    return _Mixing(x.mean(0), compute_whitening(x, _MIN_VARIANCE))
-
-
-class PolicyWarmStart:
-    """The warm start of a training from a policy.
-
-    PPO has no memory: moving averages stay unchanged as part of its environments, whitened by the
-    policy's own drives.
-
-    Args:
-        policy: Policy to train further.
-        task: Task of the training.
-        env: Vector env of the task, without moving averages.
-        seed: Seed of the drives.
-    """
-
-    def __init__(self, policy: Policy, task: TrainingTask, env: CarVectorEnv, seed: int) -> None:
-        layout, self._network = get_layout(env), policy.network
-        self.start = _make_warm_start(policy, task, layout)
-        self.driver = _NetworkAgent(policy.network)  # drives as the policy does
-        self._mixing = None
-        if policy.network.cells and not get_algorithm(task.algo).on_tensors:
-            self._mixing = _measure_mixing(env, policy.network, seed)
-            mixed = self._mixing.adapt_to_mixed(policy.network)
-            self.start = _make_warm_start(replace(policy, network=mixed), task, layout)
-            self.driver = _NetworkAgent(mixed.dense)
-
-    def wrap_env(self, env: CarVectorEnv) -> CarVectorEnv:
-        """Wrap a vector env so that it has the model's observation.
-
-        Args:
-            env: Vector env of the task.
-
-        Returns:
-            Wrapped env; `env` itself for a policy without memory.
-        """
-        return MemoryObservation(env, self._network, self._mixing) if self._mixing else env
-
-    def merge_network(self, network: Network) -> Network:
-        """Merge a model's network with the policy's memory, for plain observations.
-
-        Args:
-            network: Network of the model.
-
-        Returns:
-            Network of plain observations.
-        """
-        if not self._mixing:
-            return network
-        return self._network.replace_dense(self._mixing.adapt_to_plain(network))
+    return x.mean(0), compute_whitening(x, _MIN_VARIANCE)

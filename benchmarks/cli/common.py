@@ -15,7 +15,7 @@ from typer import Exit
 
 from ... import __version__
 from ...envs.io import atomic_file
-from ..harness.results import Suite, check_writable, write_json, write_parquet, write_text
+from ..harness.results import Suite, write_json, write_parquet, write_text
 from ..report.terminal import print_run, print_suite
 from .names import check_env
 from .options import parse_options
@@ -25,20 +25,6 @@ if TYPE_CHECKING:
     from ...agents.env_info import CarEnv
     from ...agents.rollout import Rollout
 
-_SUFFIXES = {
-    "correction": (".safetensors",),
-    "film": (".mp4", ".avi"),
-    "html": (".html", ".htm"),
-    "image": (".png", ".jpg", ".jpeg"),
-    "json": (".json",),
-    "kml": (".kml",),
-    "page": (".md",),
-    "parquet": (".parquet",),
-    "picture": (".png", ".pdf", ".svg"),
-    "plot": (".png", ".pdf", ".svg"),
-    "policy": (".safetensors",),
-    "toml": (".toml",),
-}
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")  # named in reports
 _DEFAULT_ENVS = ("sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0")
 
@@ -46,19 +32,6 @@ _DEFAULT_ENVS = ("sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0")
 def get_command_line() -> str:
     """Get the command line of this process."""
     return shlex.join(["sideslip", *sys.argv[1:]])
-
-
-def check_files(**paths: Path | None) -> None:
-    """Check before the work that files have their kind's suffix and can be written.
-
-    Args:
-        paths: Files by kind, None for none.
-    """
-    for kind, path in paths.items():
-        known = _SUFFIXES[kind]
-        if path and path.suffix.lower() not in known and not path.is_char_device():
-            raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
-    check_writable(*paths.values())
 
 
 def announce_torch() -> None:
@@ -81,23 +54,19 @@ def handle_interrupt(how: str) -> Iterator[None]:
         raise Exit(130) from None
 
 
-def print_written(console: Console, path: Path) -> None:
-    """Print that a file was written.
+def print_written(console: Console, *paths: Path | None) -> None:
+    """Print that files were written.
 
     Args:
         console: Console that prints.
-        path: File that was written.
+        *paths: Files that were written, None for none.
     """
-    console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
+    for path in filter(None, paths):
+        console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
 
 
 def show_episode(
-    console: Console,
-    drive: "Rollout",
-    driver: str,
-    plot: Path | None = None,
-    parquet: Path | None = None,
-    kml: Path | None = None,
+    console: Console, drive: "Rollout", driver: str, files: Mapping[str, Path | None] | None = None
 ) -> None:
     """Print an episode's score, and write its picture, signals and track.
 
@@ -105,9 +74,7 @@ def show_episode(
         console: Console that prints.
         drive: Record of the episode.
         driver: Name of the track.
-        plot: File of the picture, None for none.
-        parquet: File of all signals, None for none.
-        kml: File of the track for a map, None for none.
+        files: Files of the picture (plot), all signals (parquet) and the track (kml), if wanted.
     """
     from ..report.film import make_track_kml
 
@@ -118,36 +85,35 @@ def show_episode(
         f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else "")
     )
     console.print(text, soft_wrap=True, markup=False, highlight=False)
+    plot, parquet, kml = ((files or {}).get(name) for name in ("plot", "parquet", "kml"))
     if plot is not None:
         with atomic_file(plot) as file:
             drive.plot().savefig(file, format=plot.suffix[1:] or "png", dpi=120)
-        print_written(console, plot)
     if parquet is not None:
         drive.to_parquet(parquet)
-        print_written(console, parquet)
     if kml is not None:
         write_text(kml, make_track_kml(drive.log.name, {driver: (drive["X"], drive["Y"])}))
-        print_written(console, kml)
+    print_written(console, plot, parquet, kml)
 
 
 def write_output(
-    console: Console, suites: Sequence[Suite], files: Mapping[str, Path | None], brief: bool = False
+    console: Console, suites: Sequence[Suite], options: Mapping[str, Any], brief: bool = False
 ) -> None:
     """Print suites, and write their report and rows to files.
 
     Args:
         console: Console that prints.
         suites: Results to print and write.
-        files: Files of the report (html) and the rows (json, parquet), None for none.
+        options: With files of the report (html) and the rows (json, parquet), None for none.
         brief: Whether verdicts and a table are printed instead of all tables.
     """
-    html = files["html"]
+    html = options["html"]
     if brief:
         print_run(console, suites, html is not None)
     for suite in () if brief else suites:
         print_suite(console, suite)
     rows = [row for suite in suites for row in suite.rows]
-    for path, write in ((files["json"], write_json), (files["parquet"], write_parquet)):
+    for path, write in ((options["json"], write_json), (options["parquet"], write_parquet)):
         if path is not None:
             write(path, rows)
             print_written(console, path)
@@ -210,7 +176,7 @@ def _make_driver(setup: Mapping[str, Any], env_id: str, trust: bool) -> "tuple[C
     from ...agents import make_agent
     from ...agents.env_info import make_env
     from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
-    from ..control.entries import list_outputs
+    from ..control.entries import Entry
     from ..harness.drives import call_quietly
 
     agent, estimator, filter_options = (
@@ -219,7 +185,7 @@ def _make_driver(setup: Mapping[str, Any], env_id: str, trust: bool) -> "tuple[C
     env = make_env(env_id, setup["options"])
     sensors = env.get_wrapper_attr("slow_sensors")
     if estimator is not None:
-        arguments = env, estimator, list_outputs(estimator)
+        arguments = env, estimator, Entry(agent, estimator).outputs
         env = call_quietly(EstimateObservation, *arguments, options=filter_options or None)
     elif filter_options:
         raise ValueError("--estimator-option needs --estimator")

@@ -18,19 +18,29 @@ from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
-from .common import check_files, print_written, write_output
+from .common import print_written, write_output
 from .names import complete
-from .options import File, Text, Texts, parse_option, parse_options, register, take, take_argument
+from .options import (
+    File,
+    Text,
+    Texts,
+    check_file,
+    parse_options,
+    register,
+    take,
+    take_argument,
+)
 
 if TYPE_CHECKING:
-    from ...envs.sensors.camera.films import Film
     from ...envs.sensors.camera.images import Image
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
+    from ...envs.sensors.camera.pictures import Film
     from ...envs.sensors.camera.pinhole import Pinhole
     from ..recorded.wires import SignalCalibration
 
 _MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
 _MAX_PIXELS = 2**26  # of a picture; a small file may hold many more
+_console = Console(soft_wrap=True, highlight=False)
 
 
 def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "SignalCalibration":
@@ -45,21 +55,11 @@ def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "Signa
     return known._replace(latency=late, **overrides).check()
 
 
-def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
-    """Parse options by estimator, such as {"joint": {"members": 4}} from "joint.members=4".
-
-    Args:
-        texts: ESTIMATOR.NAME=VALUE each, None for none.
-
-    Returns:
-        Values by estimator and name.
-
-    Raises:
-        ValueError: A text has another form.
-    """
+def _parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
+    """Parse options by estimator, such as {"joint": {"members": 4}} from "joint.members=4"."""
     options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
-        key, value = parse_option(text)
+        ((key, value),) = parse_options([text]).items()
         name, dot, option = key.partition(".")
         if not (name and dot and option):
             raise ValueError(f"an estimator's option is ESTIMATOR.NAME=VALUE, got {text!r}")
@@ -94,26 +94,24 @@ class _Replay:
     html: File
     json: File
     parquet: File
-    plot: File = take("Draw a receiver's track: PNG, PDF, SVG.")
-    kml: File = take("Write a receiver's track for a map.")
+    plot: File = take("Draw a receiver's track: PNG, PDF, SVG.", ends=".png .pdf .svg")
+    kml: File = take("Write a receiver's track for a map.", ends=".kml")
 
     def run(self) -> None:
         from ...envs.recordings.sources import is_nmea
         from ..recorded.replay import replay_file
 
         console, log = Console(), self.log
-        files = {"html": self.html, "json": self.json, "parquet": self.parquet}
-        check_files(**files, plot=self.plot, kml=self.kml)
         if is_nmea(log):
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log, self.vehicle, self.mapping)
-            write_output(console, [make_receiver_suite(received)], files)
+            write_output(console, [make_receiver_suite(received)], vars(self))
             for path, write in ((self.plot, draw), (self.kml, write_kml)):
                 if path is not None:
                     write(path, received)
-                    print_written(console, path)
+            print_written(console, self.plot, self.kml)
             return
         if self.plot or self.kml:
             raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
@@ -127,14 +125,14 @@ class _Replay:
                 nominal=self.nominal,
                 until=self.until,
                 estimators=self.estimator,
-                options=parse_estimator_options(self.estimator_option),
+                options=_parse_estimator_options(self.estimator_option),
                 course_rate=self.course_rate,
                 course_noise_deg=self.course_noise,
                 delay=self.course_delay,
                 bias_deg=self.course_bias,
                 gyro_bias_degps=self.gyro_bias,
             )
-        write_output(console, [suite], files)
+        write_output(console, [suite], vars(self))
 
 
 @register("identify", "Find the car of a recorded drive.")
@@ -150,7 +148,7 @@ class _Identify:
         autocompletion=complete("vehicles"),
     )
     mapping: Texts
-    out: File = take("Write the car and its wires as TOML.")
+    out: File = take("Write the car and its wires as TOML.", ends=".toml")
     until: float | None = take("s of the log that are used; the rest stays fresh.")
     tyres: Text = take(
         "linear: as stiff as in this drive; fiala: as at small slips; default: what predicts "
@@ -165,7 +163,6 @@ class _Identify:
         from ..recorded.wires import write_vehicle
 
         console, stated = Console(), (self.vehicle, self.mapping or ())
-        check_files(toml=self.out)
         wires = _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
             result, suite = identify_file(self.log, *stated, wires, self.tyres, self.until)
@@ -189,30 +186,26 @@ class _Lane:
     intrinsics: File = take("The camera: TOML or JSON with K, dist, size, perhaps height and tilt.")
     lane_width: float = take("m, from marking to marking.", 3.7)
     out: File = take("Write what was found on it.", None, "--out", "-o")
-    json: File = take("Write the numbers.")
+    json: File = take("Write the numbers.", ends=".json")
     calibrate: File = take("A folder of chessboards (9 x 6): find the intrinsics.")
 
     def run(self) -> None:
-        os.environ.setdefault(
-            "OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS)
-        )  # read where it is loaded
+        os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS))  # read when loaded
         with require_extra("vision", "the lane finder needs {}"):
             import cv2
-        from ...envs.sensors.camera.films import PICTURES, Film, read_picture
+        from ...envs.sensors.camera.pictures import PICTURES, Film, read_picture
 
-        console, source, out, json = Console(soft_wrap=True), self.source, self.out, self.json
-        check_files(json=json)
+        source, out = self.source, self.out
         if (source is None) == (self.calibrate is None):
             raise ValueError("expected a picture or a film, or --calibrate FOLDER")
-        if self.calibrate is not None:
-            _calibrate(self.calibrate, json or Path("intrinsics.json"), console)
+        if source is None:
+            self._calibrate_camera()
             return
-        assert source is not None
         if not 1.0 < self.lane_width < 10.0:
             raise ValueError(f"--lane-width is 1 to 10 m, got {self.lane_width}")
         cv2.setNumThreads(1)
         still = source.suffix.lower() in PICTURES
-        check_files(**{"image" if still else "film": out})
+        check_file(out, ".png .jpg .jpeg" if still else ".mp4 .avi")
         if still:
             try:
                 picture = read_picture(source)
@@ -220,81 +213,70 @@ class _Lane:
                 raise ValueError(
                     f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
                 ) from None
-            finder = _make_finder([picture], self.intrinsics, self.lane_width, source)
+            finder = self._make_finder([picture], source)
             lanes, seconds = _process_picture(picture, finder, out)
         else:
             film = Film(source)
-            finder = _make_finder(
-                film.read_head(_MAX_TRIES), self.intrinsics, self.lane_width, source
-            )
-            lanes, seconds = _process_film(film, finder, out, console)
-            if len(lanes) < film.frame_count:
-                console.print(
-                    f"the film ends after {len(lanes)} of the {film.frame_count} frames it promises"
-                )
-        _report(console, source, finder.camera, lanes, seconds)
-        if json is not None:
+            finder = self._make_finder(film.read_head(_MAX_TRIES), source)
+            lanes, seconds = _process_film(film, finder, out)
+            if (count := len(lanes)) < film.frame_count:
+                _console.print(f"the film ends after {count} of the {film.frame_count} frames it "
+                               "promises")  # fmt: skip
+        _report(source, finder.camera, lanes, seconds)
+        if self.json is not None:
             frames = [lane._asdict() for lane in lanes]
-            write_document(json, {"source": str(source), "frames": frames})
-        for path in (out, json):
-            if path is not None:
-                print_written(console, path)
+            write_document(self.json, {"source": str(source), "frames": frames})
+        print_written(_console, out, self.json)
 
+    def _calibrate_camera(self) -> None:
+        """Write the intrinsics that the chessboards of a folder's pictures give."""
+        from ...envs.sensors.camera.pictures import PICTURES, calibrate_camera
 
-def _calibrate(folder: Path, path: Path, console: Console) -> None:
-    """Write the intrinsics that the chessboards of a folder's pictures give."""
-    from ...envs.sensors.camera.calibration import calibrate_camera
-    from ...envs.sensors.camera.films import PICTURES
+        folder, path = self.calibrate, self.json or Path("intrinsics.json")
+        assert folder is not None
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: there is no such folder")
+        check_file(path, ".json")
+        boards = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+        camera, error = calibrate_camera(boards)
+        numbers = {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error}
+        write_document(path, numbers)
+        _console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures")
+        print_written(_console, path)
 
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: there is no such folder")
-    check_files(json=path)
-    boards = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
-    camera, error = calibrate_camera(boards)
-    write_document(path, {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error})
-    console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures", highlight=False)
-    print_written(console, path)
+    def _make_finder(self, pictures: "list[Image]", source: Path) -> "LaneFinder":
+        """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""
+        from ...envs.sensors.camera import pictures as calibration
+        from ...envs.sensors.camera.analytic import FieldOfView
+        from ...envs.sensors.camera.lane_finder import LaneFinder
+        from ...envs.sensors.camera.pinhole import Pinhole
 
-
-def _make_finder(
-    pictures: "list[Image]", intrinsics: Path | None, lane_width: float, source: Path
-) -> "LaneFinder":
-    """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""
-    from ...envs.sensors.camera.analytic import FieldOfView
-    from ...envs.sensors.camera.calibration import (
-        FAR,
-        HEADING,
-        NEAR,
-        estimate_mounting,
-        make_default_camera,
-    )
-    from ...envs.sensors.camera.lane_finder import LaneFinder
-    from ...envs.sensors.camera.pinhole import Pinhole
-
-    height, width = pictures[0].shape[:2]
-    known: Any = {}
-    if intrinsics is None:
-        camera = make_default_camera((width, height))
-    else:
-        try:
-            camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
-        except OverflowError as error:
-            raise ValueError(f"{intrinsics}: {error}") from None
-    if camera.size != (width, height):
-        raise ValueError(
-            f"{intrinsics}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
-            f"those of {source} {width} x {height}"
-        )
-    failed = None
-    for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
-        try:
-            camera, failed = estimate_mounting(camera, picture, lane_width), None
-            break
-        except ValueError as error:
-            failed = error
-    if failed is not None:
-        raise ValueError(f"{source}: {failed}")
-    return LaneFinder(camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width))
+        file, lane_width, known = self.intrinsics, self.lane_width, dict[str, object]()
+        height, width = pictures[0].shape[:2]
+        if file is None:
+            camera = calibration.make_default_camera((width, height))
+        else:
+            try:
+                camera, known = Pinhole.read(file), read_document(file, "camera")
+            except OverflowError as error:
+                raise ValueError(f"{file}: {error}") from None
+        if camera.size != (width, height):
+            raise ValueError(
+                f"{file}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
+                f"those of {source} {width} x {height}"
+            )
+        failed = None
+        for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
+            try:
+                camera = calibration.estimate_mounting(camera, picture, lane_width)
+                failed = None
+                break
+            except ValueError as error:
+                failed = error
+        if failed is not None:
+            raise ValueError(f"{source}: {failed}")
+        view = FieldOfView(calibration.HEADING, 0.5 * lane_width)
+        return LaneFinder(camera, lane_width, calibration.NEAR, calibration.FAR, view=view)
 
 
 def _process_picture(
@@ -303,7 +285,7 @@ def _process_picture(
     """Find the lane of a picture, draw it, and return it with the CPU seconds that it took."""
     import cv2
 
-    from ...envs.sensors.camera.films import draw_lane
+    from ...envs.sensors.camera.pictures import draw_lane
 
     lane, seconds = finder.find(picture), np.inf
     for _ in range(10):
@@ -317,15 +299,15 @@ def _process_picture(
 
 
 def _process_film(
-    film: "Film", finder: "LaneFinder", out: Path | None, console: Console
+    film: "Film", finder: "LaneFinder", out: Path | None
 ) -> tuple[list["Lane"], float]:
     """Find a film's lanes, draw them, and return them with the median CPU seconds of a frame."""
     import cv2
 
-    from ...envs.sensors.camera.films import draw_lane
+    from ...envs.sensors.camera.pictures import draw_lane
 
     lanes, times = [], []
-    with TemporaryDirectory() as folder, use_shared_bar(console, "lane", "pictures") as bar:
+    with TemporaryDirectory() as folder, use_shared_bar(_console, "lane", "pictures") as bar:
         part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
         writer = None
         if out is not None:
@@ -344,28 +326,23 @@ def _process_film(
     return lanes, float(np.median(times))
 
 
-def _report(
-    console: Console, source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
-) -> None:
+def _report(source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float) -> None:
     """Print the lanes, the camera's mounting and the frames per second."""
-    from ...envs.sensors.camera.films import describe_lane
-
-    detected = [lane for lane in lanes if lane.quality > 0.0]
+    shown = [lane for lane in lanes if lane.quality > 0.0]
+    lines = [f"{source.name}: a lane in {len(shown)} of {len(lanes)} frames"]
     if len(lanes) == 1:
-        lines = [f"{source.name}: {describe_lane(lanes[0])}"]
-    else:
-        lines = [f"{source.name}: a lane in {len(detected)} of {len(lanes)} frames"]
-        if detected:
-            psi = np.array([lane.psi for lane in detected])
-            offset = np.array([lane.y for lane in detected])
-            lines.append(
-                f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
-                f"{offset.mean():+.2f} m (sd {offset.std():.2f}), quality "
-                f"{np.mean([lane.quality for lane in detected]):.2f}"
-            )
+        lines = [f"{source.name}: {lanes[0].describe()}"]
+    elif shown:
+        psi, y, quality = (
+            np.array([getattr(x, k) for x in shown]) for k in ("psi", "y", "quality")
+        )
+        lines.append(
+            f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
+            f"{y.mean():+.2f} m (sd {y.std():.2f}), quality {np.mean(quality):.2f}"
+        )
     lines.append(
         f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "
         f"{1.0 / seconds:.0f} frames a second of one core"
     )
     for line in lines:
-        console.print(line, highlight=False, markup=False)
+        _console.print(line, markup=False)

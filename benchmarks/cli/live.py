@@ -18,7 +18,7 @@ from rich.markup import escape
 from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.verdict import format_verdict
-from .common import check_files, make_driver, make_setup, print_written, show_episode
+from .common import make_driver, make_setup, print_written, show_episode
 from .names import check_env, complete
 from .options import File, Text, Texts, register, take, take_argument
 
@@ -58,13 +58,12 @@ class _Live:
     duration: float = take("s, after which it ends.", float("inf"))
     record: File = take("Write the session to a new file.")
     replay: File = take("Take a session again.")
-    json: File = take("Write what was measured.")
+    json: File = take("Write what was measured.", ends=".json")
     trust: bool
 
     def run(self) -> None:
         from ...agents.live.loop import LOOPBACK, parse_address
 
-        check_files(json=self.json)
         target = parse_address(self.to) if self.to else (LOOPBACK, self.port)
         setup = make_setup(vars(self))
         if self.relay is not None:
@@ -161,10 +160,11 @@ class _Live:
         """Process a session again, and compare the estimates."""
         from ...agents import AGENTS
         from ...agents.learned.policy import check_names_no_code
-        from ...agents.live.controller import OnboardController, read_setup, replay
+        from ...agents.live.controller import OnboardController, Session
         from ...estimators.filters import FILTERS
 
-        setup = read_setup(path)
+        recorded = Session(path)
+        setup = recorded.setup
         for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
             if setup.get(kind) != requested[kind]:  # a file's text may not choose what code is run
                 name = f"{kind} in {path}, name it in the command to run it:"
@@ -172,7 +172,7 @@ class _Live:
         unasked = "" if setup["env"] == requested["env"] else setup["env"]
         check_names_no_code(unasked, "", setup["estimator_options"])
         onboard = OnboardController(*make_driver(requested | setup, self.trust), setup["seed"])
-        session = replay(path, onboard, setup["patience"])
+        session = recorded.replay(onboard, setup["patience"])
         same = "those of the session bit for bit" if session.same else "NOT those of the session"
         console.print(f"{len(session.ticks)} ticks; the estimates are {same}")
         self._write(setup | {"ticks": len(session.ticks), "same": session.same})

@@ -14,7 +14,6 @@ from ..report.html import check_page, write_page
 from ..suites import SUITES, Request, check_salt, run_suites
 from . import data, live, policies, train  # noqa: F401  # they register their commands
 from .common import (
-    check_files,
     handle_interrupt,
     make_driver,
     make_setup,
@@ -108,9 +107,9 @@ class _Run:
     estimator_option: Texts = take("NAME=VALUE of the estimator (q_beta=1e-4); repeatable.")
     seed: int = take("Seed of the episode.", 0)
     control_period: int
-    plot: File = take("Write a PNG, PDF or SVG.")
-    parquet: File = take("Write every signal.")
-    kml: File = take("Write the track for a map.")
+    plot: File = take("Write a PNG, PDF or SVG.", ends=".png .pdf .svg")
+    parquet: File = take("Write every signal.", ends=".parquet")
+    kml: File = take("Write the track for a map.", ends=".kml")
     video: File = take("Write a film, .mp4 or .gif.")
     beside: Text = take("Another agent, a ghost in the film.")
     trust: bool
@@ -119,14 +118,12 @@ class _Run:
         from ...agents.rollout import rollout
         from ..report.film import FilmDriver, check_film, write_drive_film
 
-        files = {"plot": self.plot, "parquet": self.parquet, "kml": self.kml}
-        check_files(**files)
         check_film(self.video)
         driver = FilmDriver(self.agent, *make_driver(make_setup(vars(self)), self.trust))
         if self.env is None and driver.env.spec is not None:
             console.print(f"on {driver.env.spec.id}", highlight=False)
         drive = rollout(driver.env, driver.agent, self.seed)
-        show_episode(console, drive, self.agent, **files)
+        show_episode(console, drive, self.agent, vars(self))
         write_drive_film(self.video, driver, self.beside, self.seed, console)
 
 
@@ -143,8 +140,8 @@ class _Bench:
     html: File
     json: File
     parquet: File
-    picture: File = take("The summary: PNG, PDF or SVG.")
-    page: File = take("Put the tables between this Markdown page's marks.")
+    picture: File = take("The summary: PNG, PDF or SVG.", ends=".png .pdf .svg")
+    page: File = take("Put the tables between this Markdown page's marks.", ends=".md")
     jobs: int | None
     episodes: int | None = take("A cell of control (256), or seeds of other suites.", min=4)
     keep: File = take("A folder for finished cases: a stopped run goes on.")
@@ -173,8 +170,6 @@ class _Bench:
         for name in names:
             check_choice("suite", name, SUITES)
         check_salt(self.salt, names)
-        files = {"html": self.html, "json": self.json, "parquet": self.parquet}
-        check_files(**files, picture=self.picture, page=self.page)
         check_page(self.page, names)
         done = []
         if self.log is not None:  # first: a log that cannot be read should not cost minutes
@@ -182,23 +177,21 @@ class _Bench:
 
             done.append(replay_file(self.log, self.vehicle, mapping=self.mapping))
         request = Request(
-            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant,
-            comparison, self.salt,
-        )  # fmt: skip
+            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.salt
+        )
         how = "the same command" if self.keep else "add --keep FOLDER, which keeps finished cases"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
-            done += run_suites(names, request)
+            done += run_suites(names, request, comparison)
         order = [*names, "replay"]
         done.sort(key=lambda suite: order.index(suite.name))
-        write_output(console, done, files, brief=True)
+        write_output(console, done, vars(self), brief=True)
         if self.picture is not None:
             from ..picture import write_picture
 
             write_picture(self.picture, done)
-            print_written(console, self.picture)
         if self.page is not None:
             write_page(self.page, done)
-            print_written(console, self.page)
+        print_written(console, self.picture, self.page)
 
     def _make_comparison(self, agents: list[str], filters: list[str]) -> "ComparisonRequest":
         """Make the request of a user's own entries."""

@@ -122,7 +122,7 @@ def _list_policies() -> dict[str, str]:
 def _list_suites() -> dict[str, str]:
     """List the suites with the first sentence of their modules, which are not imported."""
     lines = {}
-    for name, (module, _) in SUITES.items():
+    for name, module in SUITES.items():
         spec = find_spec(module, __package__.rpartition(".")[0])
         assert spec is not None and spec.origin is not None
         module_text = Path(spec.origin).read_text(encoding="utf-8")

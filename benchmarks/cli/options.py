@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from inspect import Parameter, Signature
@@ -11,6 +12,7 @@ from typing import Any, TypeVar
 import typer
 
 from ..harness.parallel import PROCESSES
+from ..harness.results import check_writable
 from .names import complete
 
 Text = str | None
@@ -26,6 +28,7 @@ def take(
     default: Any = None,
     *names: str,
     declare: Callable[..., Any] = typer.Option,
+    ends: str = "",
     **more: Any,
 ) -> Any:
     """Make the dataclass field of a command's option.
@@ -35,12 +38,13 @@ def take(
         default: Default value, `...` for a required one.
         names: Options that replace the field's name, such as "--jobs" and "-j".
         declare: Typer's function that declares the option.
+        ends: Suffixes of a file that is written, which is checked before the work: ".html .htm".
         more: Other arguments of `declare`.
 
     Returns:
         Field whose metadata hold typer's declaration.
     """
-    declared = {"typer": declare(default, *names, help=help, **more)}
+    declared = {"typer": declare(default, *names, help=help, **more), "ends": ends}
     return field(default=MISSING if default is ... else default, metadata=declared)
 
 
@@ -51,13 +55,13 @@ _SHARED: dict[str, Callable[[], Any]] = {
     "engine_name": partial(
         take, "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
     ),
-    "html": partial(take, "Write a self-contained report."),
+    "html": partial(take, "Write a self-contained report.", ends=".html .htm"),
     "jobs": partial(take, "Number of parallel processes.", None, "--jobs", "-j", min=1),
-    "json": partial(take, "Write the rows as JSON."),
+    "json": partial(take, "Write the rows as JSON.", ends=".json"),
     "mapping": partial(
         take, "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.", None, "--map"
     ),
-    "parquet": partial(take, "Write the rows as Parquet."),
+    "parquet": partial(take, "Write the rows as Parquet.", ends=".parquet"),
     "seed": partial(take, "Seed of the sampler; another on each machine of a study.", 0),
     "steering_offset": partial(take, "Offset that is added to the steering (deg at the wheels)."),
     "steering_ratio": partial(take, "Logged steering angle over the wheels' angle (15.2)."),
@@ -90,6 +94,9 @@ def register(name: str, line: str | None = None, to: typer.Typer = app) -> Calla
         record: Any = dataclass(frozen=True)(kind)
 
         def call(**values: Any) -> None:
+            for option in fields(record):
+                if ends := option.metadata["ends"]:
+                    check_file(values[option.name], ends)
             record(**values).run()
 
         call.__doc__ = kind.__doc__
@@ -104,34 +111,37 @@ def register(name: str, line: str | None = None, to: typer.Typer = app) -> Calla
     return register_class
 
 
-def parse_option(text: str) -> tuple[str, Any]:
-    """Parse an option to its name and value.
+def check_file(path: Path | None, ends: str) -> None:
+    """Check before the work that a file has a known suffix and can be written.
 
     Args:
-        text: NAME=VALUE; the value is JSON or a word.
-
-    Returns:
-        Name and value.
-
-    Raises:
-        ValueError: The text has another form.
+        path: File, None for none.
+        ends: Suffixes, such as ".html .htm".
     """
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
+    known = ends.split()
+    if path and path.suffix.lower() not in known and not path.is_char_device():
+        raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
+    check_writable(path)
 
 
 def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Parse options, as `parse_option` does.
+    """Parse options.
 
     Args:
-        texts: Texts such as NAME=VALUE, None for none.
+        texts: Texts such as NAME=VALUE, None for none; a value is JSON or a word.
 
     Returns:
         Values by name.
+
+    Raises:
+        ValueError: A text has another form.
     """
-    return dict(map(parse_option, texts or ()))
+    options: dict[str, Any] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+        options[name] = value
+        with suppress(json.JSONDecodeError):
+            options[name] = json.loads(value)
+    return options

@@ -18,14 +18,13 @@ from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
 from .common import (
     announce_torch,
-    check_files,
     get_command_line,
     print_written,
     show_episode,
     write_output,
 )
 from .names import complete
-from .options import File, Text, Texts, parse_options, register, take, take_argument
+from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
     from ...agents.learned.policy import Policy
@@ -52,9 +51,12 @@ class _Export:
 
         target = self.out or self.zipped.with_suffix(".safetensors")
         check_writable(target)
-        source = self.zipped, target, self.env, parse_options(self.option), self.estimator
         policy = export_zip(
-            *source, trust=self.trust, normalise=self.normalise, command=get_command_line()
+            *(self.zipped, target, self.env, parse_options(self.option)),
+            trust=self.trust,
+            normalise=self.normalise,
+            estimator=self.estimator,
+            command=get_command_line(),
         )
         scaled = find_normaliser(self.zipped, self.normalise) or "nothing"
         text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
@@ -100,20 +102,18 @@ class _Enjoy:
     html: File
     json: File
     parquet: File
-    plot: File = take("Write the first episode as a PNG.")
+    plot: File = take("Write the first episode as a PNG.", ends=".png .pdf .svg")
     video: File = take("Write it as a film, .mp4 or .gif, no control beside it.")
     card: bool = take("Show the policy's card, no more.", False, "--card")
     trust: bool
 
     def run(self) -> None:
         from ...agents.learned.policy import load_policy
-        from ..control.report import make_env_and_agent, run_entry
+        from ...agents.rollout import rollout
         from ..report.film import FilmDriver, check_film, write_film
-        from ..studies.policies import evaluate_policy, make_suite
+        from ..studies.policies import evaluate_policy
 
         console = Console()
-        files = {"html": self.html, "json": self.json, "parquet": self.parquet}
-        check_files(**files, plot=self.plot)
         check_film(self.video)
         with _export_policy(self.policy, self.env, self.trust) as path:
             if self.card:
@@ -123,13 +123,13 @@ class _Enjoy:
                 evaluation = evaluate_policy(
                     path, self.episodes, env_id=self.env, scenario=self.scenario, seed=self.seed
                 )
-            write_output(console, [make_suite(evaluation)], files)
-            name, seed = evaluation.policy.name, evaluation.seeds[0]
+            write_output(console, [evaluation.make_suite()], vars(self))
+            name, seed, task = evaluation.policy.name, evaluation.seeds[0], evaluation.task
             first = evaluation.entries[name]
-            show_episode(console, run_entry(first, seed), name, self.plot)
+            show_episode(console, rollout(*first.make(task), seed), name, {"plot": self.plot})
             if self.video is not None:
                 cars = (name, first), ("no control", evaluation.entries["none"])
-                drivers = [FilmDriver(driver, *make_env_and_agent(entry)) for driver, entry in cars]
+                drivers = [FilmDriver(driver, *entry.make(task)) for driver, entry in cars]
                 write_film(self.video, drivers, seed, console)
                 print_written(console, self.video)
 
@@ -194,7 +194,9 @@ class _Distill:
     batch: int = take("Episodes, with a GRU or traces.", 16)
     noise: float = take("That shakes the teacher, at most.", 0.02)
     traces: int = take("Bent units whose running means it reads, instead of a GRU.", 0, min=0)
-    told: float = take("Weight of what the teacher reads, as its GRU or traces tell it.", 0.0)
+    auxiliary_weight: float = take(
+        "Weight of what the teacher reads, as its GRU or traces tell it.", 0.0, "--told"
+    )
     option: Texts = take("NAME=VALUE of what is observed: with_map, fast; repeatable.")
     seed: int = take("Of weights and episodes.", 0)
     episodes: int = take("Episodes of each contest's test.", 32, min=2)
@@ -204,19 +206,21 @@ class _Distill:
         announce_torch()
         from ...agents.training.distill import RoundResult, distill
         from ...agents.training.student import DistillConfig
-        from ..studies.policies import make_card, make_lessons
+        from ..studies.policies import Lessons
 
         target, console = self.out or Path(f"{self.name}.safetensors"), Console()
-        check_files(policy=target)
-        names = ("rounds", "epochs", "cells", "noise", "seed", "batch", "told", "traces")
-        sizes = tuple(self.hidden or (64, 64))
-        config = DistillConfig(hidden=sizes, **{name: getattr(self, name) for name in names})
+        check_file(target, ".safetensors")
+        names = ("rounds", "epochs", "cells", "noise", "seed", "batch", "traces")
+        sizes, weight = tuple(self.hidden or (64, 64)), self.auxiliary_weight
+        numbers = {name: getattr(self, name) for name in names}
+        config = DistillConfig(hidden=sizes, auxiliary_weight=weight, **numbers)
         about: dict[str, object] = {"class": self.kind, "teacher": self.teacher}
         about |= {"cars": self.cars, "varied": self.varied} | config.describe()
         options = {"algorithm": "distill", "algorithm_options": about}
         options |= {"seeds": {"training": self.seed}, "command": get_command_line()}
-        observed = parse_options(self.option)
-        card = make_card(self.kind, self.estimator, self.teacher, observed, **options)
+        taught = self.estimator, self.teacher, self.cars, self.varied, self.seed
+        lessons = Lessons(self.kind, *taught, parse_options(self.option))
+        card = lessons.make_card(**options)
 
         def show(now: RoundResult) -> None:
             text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"
@@ -224,9 +228,7 @@ class _Distill:
             bar.advance(bar.task_ids[0])
 
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
-            entry = self.kind, self.teacher, self.estimator
-            lessons = make_lessons(*entry, self.cars, self.varied, self.seed, observed)
-            distill(card, lessons, config, target, show)
+            distill(card, lessons.make_tasks(), config, target, show)
         console.print(make_task_table(target, self.kind, self.episodes))
         print_written(console, target)
 
@@ -253,7 +255,7 @@ class _TrainEstimator:
         from ..control.tasks import YAW, list_scored_tasks
 
         target, console = self.out or Path(f"{self.name}.safetensors"), Console()
-        check_files(correction=target)
+        check_file(target, ".safetensors")
         tasks = list_scored_tasks()
         known = [item.scenario for item in tasks]
         wanted = dict.fromkeys(self.scenarios or known)

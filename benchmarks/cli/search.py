@@ -12,8 +12,8 @@ from ...envs.validation import check_choice
 from ..harness.parallel import use_engine
 from ..harness.results import check_writable
 from ..report.terminal import print_suite
-from .common import check_files, get_command_line, handle_interrupt, print_written
-from .options import File, Text, Texts, parse_options, register, take, take_argument
+from .common import get_command_line, handle_interrupt, print_written
+from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 tune_app = Typer(no_args_is_help=True)
 _SAID = ("scenario", "env", "target", "option", "search", "noise", "sampler")
@@ -58,17 +58,16 @@ class _TuneEstimator:
     seed: int
     storage: Text
     jobs: int | None
-    out: File = take("Write the entry to a tunings file.")
+    out: File = take("Write the entry to a tunings file.", ends=".toml")
     write: bool = take("Make it the shipped tuning.", False, "--write")
     note: str = take("A note for the entry.", "")
 
     def run(self) -> None:
         from ...estimators.design import options
-        from ..tuning.estimator import STORAGE, make_estimator_tuning, update
+        from ..tuning.estimator import STORAGE, SearchOptions, make_estimator_tuning, update
         from ..tuning.study import make_entry, run
 
         files = [*([self.out] if self.out else []), *([options.FILE] if self.write else [])]
-        check_files(toml=self.out)
         check_writable(*files)
         ranges, noises = (dict(map(_parse_range, x or [])) for x in (self.search, self.noise))
         held, env = parse_options(self.option), self.env or None
@@ -76,8 +75,8 @@ class _TuneEstimator:
         task = make_estimator_tuning(*chosen, self.seeds)
         if self.write and not all(key.startswith("q_") for key in task.search):
             raise ValueError("shipped tunings hold process noise alone: --out writes the others")
-        console, study = Console(), (self.storage or STORAGE, self.sampler, self.seed, self.jobs)
-        suite, result = run(task, self.trials, self.test_seeds, *study, console)
+        console, where = Console(), (self.storage or STORAGE, self.sampler, self.seed, self.jobs)
+        suite, result = run(task, SearchOptions(self.trials, *where, console), self.test_seeds)
         print_suite(console, suite)
         words = ["sideslip", "tune", "estimator", self.name]
         for name in (*_SAID, *_ALWAYS_SAID, "seed"):
@@ -108,7 +107,7 @@ class _TuneController:
     seed: int
     storage: Text
     jobs: int | None
-    out: File = take("Write the options to this TOML file.")
+    out: File = take("Write the options to this TOML file.", ends=".toml")
     log: File = take("A folder for every study's log.")
     write: bool = take("Put options and log into the package.", False, "--write")
     engine_name: str
@@ -118,17 +117,17 @@ class _TuneController:
         from ...agents.baselines import FILE
         from ..control.tasks import make_tuning_seeds
         from ..tuning import controllers
-        from ..tuning.estimator import STORAGE, write_tuned
+        from ..tuning.estimator import STORAGE, SearchOptions, write_tuned
 
-        check_files(toml=self.out)
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
-        study = self.storage or STORAGE, self.seed, self.jobs, console
+        where = self.storage or STORAGE, "tpe", self.seed, self.jobs, console
+        search = SearchOptions(self.trials, *where)
         for kind in self.kind or controllers.KINDS:
             seeds = make_tuning_seeds(self.seeds)
             task = controllers.make_controller_tuning(self.name, kind, seeds)
             try:
                 with use_engine(self.engine_name, self.address):
-                    result = controllers.tune(task, self.trials, *study)
+                    result = controllers.tune(task, search)
             except ValueError as error:
                 if self.kind:
                     raise
@@ -160,17 +159,18 @@ class _Calibrate:
     address: str
 
     def run(self) -> None:
-        from ..control.calibration import FILE, calibrate, make_cases, remove_cases, update
+        from ..control.calibration import FILE, Calibration, update
         from ..control.tasks import list_scored_tasks
 
         path, seeds = FILE if self.write else self.out, self.seeds
-        check_files(json=path)
+        check_file(path, ".json")
         known = {item.name: item for item in list_scored_tasks()}
         for name in self.contest or []:
             check_choice("contest", name, known)
         tasks = [known[name] for name in self.contest or known]
         console, folder = Console(), Path(f".{path.name}.cases").absolute()
-        cases = make_cases(tasks, folder, seeds)
+        calibration = Calibration(tasks, folder, seeds)
+        cases = calibration.cases
         remaining = sum(not item.path.exists() for item in cases)
         text = (
             f"{remaining} of {len(cases)} episodes are left; the same command goes on if stopped."
@@ -178,9 +178,9 @@ class _Calibrate:
         console.print(text, highlight=False)
         how = "run the same command in the same folder"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
-            records = calibrate(tasks, folder, seeds, get_command_line(), self.jobs, console)
+            records = calibration.run(get_command_line(), self.jobs, console)
         update(path, records)
-        remove_cases(cases)
+        calibration.remove_cases()
         table = Table("contest", "none", "clairvoyant", "a plan wins")
         for record in records:
             none = np.mean([episode.costs["none"] for episode in record.episodes])

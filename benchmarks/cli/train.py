@@ -72,7 +72,7 @@ class _Train:
         from ...agents.training.callbacks import CURVE, POLICY, RunOptions, RunRecord
         from ...agents.training.config import TrainingTask
         from ...agents.training.warm_start import resolve_settings
-        from ..studies.policies import prepare_start, record_evaluation, summarise_evaluation
+        from ..studies.policies import prepare_start, record_evaluation
 
         chosen = {item.name: getattr(self, item.name, None) for item in fields(TrainingTask)}
         for name in ("estimator_options", "env_options"):
@@ -91,15 +91,18 @@ class _Train:
         if logs is not None and isinstance(agent, Policy) and agent.network.memory:
             name = agent.name
             raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {name}: --out")
-        task = trainer.read_task(out) if resume and out else new(**options)
+        task = trainer.read_training(out).task if resume and out else new(**options)
         start = self.trained_agent.stem if self.trained_agent else ""
         folder = _choose_folder(task, start, out, logs)
         if self.conf_file is not None:
-            initial = trainer.load_initial_policy(folder) if resume else agent
+            initial = trainer.read_training(folder).load_initial_policy() if resume else agent
             options["settings"] = resolve_settings(self.conf_file, task.algo, task.env_id, initial)
-        task = trainer.read_task(folder, **options) if resume else new(**options)
-        record = RunRecord(int(task.settings["n_timesteps"]), RunOptions.eval_freq)
-        record = trainer.read_run_record(folder) if resume else record
+        if resume:
+            saved = trainer.read_training(folder, **options)
+            task, record = saved.task, saved.record
+        else:
+            task = new(**options)
+            record = RunRecord(int(task.settings["n_timesteps"]), RunOptions.eval_freq)
         steps = record.steps if self.steps is None else self.steps
         eval_freq = record.eval_freq if self.eval_freq is None else self.eval_freq
         if resume:
@@ -118,7 +121,8 @@ class _Train:
             if logs is not None:
                 task.describe_for_zoo(folder, steps, eval_freq)
             try:
-                trained = trainer.train(task, steps, folder, resume, run_options, agent, self.trust)
+                training = task, steps, folder, resume, run_options, agent, self.trust
+                trained = trainer.Trainer(*training).train()
             except Exception:
                 if logs is not None and not (folder / POLICY).exists():
                     shutil.rmtree(folder)  # it has nothing but the zoo's description
@@ -128,7 +132,7 @@ class _Train:
         if kind is not None:
             console.print(make_task_table(folder / POLICY, kind, _TASK_EPISODES))
         else:
-            costs = summarise_evaluation(record_evaluation(folder / POLICY, EPISODES))["cost"]
+            costs = record_evaluation(folder / POLICY, EPISODES).summarise()["cost"]
             shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
             where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
             text = f"mean cost on test seeds{where}: {shown}"

@@ -8,8 +8,9 @@ its version, its task, or what the uncontrolled car costs on its seeds.
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,32 +26,15 @@ from ...envs.record import Array
 from ...envs.validation import is_finite
 from ..harness.parallel import run_cases
 from ..harness.results import read_objects, write_text
-from .entries import ControlEntry
+from .entries import ControlCase, Entry
 from .run import Results, hash_sources, measure
-from .score import compute_log_ratios, survival_mask
+from .score import compute_log_ratios
 from .tasks import NOMINAL, STATE, ControlTask, TaskRecord, find_oracle
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
 _FIRST = 2**30  # tests and tunings count their seeds from 0
 _SAME = 1e-9  # of a cost
-
-
-@dataclass(frozen=True)
-class CalibrationCase:
-    """One episode of a contest."""
-
-    task: ControlTask
-    seed: int
-    folder: str  # of finished cases
-
-    @property
-    def path(self) -> Path:
-        """The file of the finished case; other sources or another question give another name."""
-        oracle = find_oracle(self.task)  # with which the search begins
-        key = [asdict(self.task), oracle, self.seed, hash_sources(), __version__]
-        digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()
-        return Path(self.folder) / f"{digest[:24]}.json"
 
 
 @dataclass(frozen=True)
@@ -78,6 +62,11 @@ class CalibrationRecord(TaskRecord):
         """Costs of the clairvoyant, shape (n,)."""
         return np.array([episode.cost for episode in self.episodes])
 
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds of the episodes."""
+        return [episode.seed for episode in self.episodes]
+
 
 def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     """Derive the seeds of a task's calibration; more of them begin with the same ones.
@@ -94,19 +83,39 @@ def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
-def solve(case: CalibrationCase) -> ClairvoyantEpisode:
-    """Solve from nominal's and the oracle's runs, or read the folder of finished cases.
+@dataclass(frozen=True)
+class _CalibrationCase:
+    """One episode of a task."""
 
-    Args:
-        case: Episode to solve.
+    task: ControlTask
+    seed: int
+    folder: Path  # of finished cases
 
-    Returns:
-        Costs of the plans.
-    """
+    @property
+    def path(self) -> Path:
+        """The file of the finished case; other sources or another question give another name."""
+        oracle = find_oracle(self.task)  # with which the search begins
+        key = [self.task.record, oracle, self.seed, hash_sources(), __version__]
+        digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()
+        return self.folder / f"{digest[:24]}.json"
+
+    def read_finished(self) -> ClairvoyantEpisode | None:
+        """The episode of the file; None where it is absent or damaged."""
+        try:
+            entry = json.loads(self.path.read_text(encoding="utf-8"))
+            episode = from_json(ClairvoyantEpisode, entry, str(self.path))
+        except (OSError, ValueError, RecursionError):
+            return None
+        costs = [episode.cost, episode.costs.get("none", math.nan), episode.seconds]
+        return episode if episode.seed == self.seed and all(map(is_finite, costs)) else None
+
+
+def _solve(case: _CalibrationCase) -> ClairvoyantEpisode:
+    """Solve from nominal's and the oracle's runs, or read the folder of finished cases."""
     from ...agents.baselines import make_oracle
     from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
 
-    done = _read_finished(case)
+    done = case.read_finished()
     if done is not None:
         return done
     task, starts = case.task, {}
@@ -121,82 +130,66 @@ def solve(case: CalibrationCase) -> ClairvoyantEpisode:
     return episode
 
 
-def _read_finished(case: CalibrationCase) -> ClairvoyantEpisode | None:
-    """The episode of the case's file; None where it is absent or damaged."""
-    try:
-        entry = json.loads(case.path.read_text(encoding="utf-8"))
-        episode = from_json(ClairvoyantEpisode, entry, str(case.path))
-    except (OSError, ValueError, RecursionError):
-        return None
-    costs = [episode.cost, episode.costs.get("none", math.nan), episode.seconds]
-    return episode if episode.seed == case.seed and all(map(is_finite, costs)) else None
+@dataclass(frozen=True)
+class Calibration:
+    """The calibration of tasks; a stopped run goes on from the folder of finished cases.
 
-
-def calibrate(
-    tasks: Sequence[ControlTask],
-    folder: Path,
-    seeds: int = SEEDS,
-    command: str = "",
-    jobs: int | None = None,
-    console: Console | None = None,
-) -> list[CalibrationRecord]:
-    """Calibrate each task; a stopped run goes on from the folder of finished cases.
-
-    Args:
+    Attributes:
         tasks: Tasks to calibrate.
         folder: Folder of finished cases.
         seeds: Seeds of a task.
-        command: Command line, for the records.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-
-    Returns:
-        Record of each task.
 
     Raises:
         ValueError: There are fewer than two seeds, so that there is no interval.
-        ModuleNotFoundError: CasADi or OSQP is not installed.
     """
-    if seeds < 2:
-        raise ValueError(f"an interval needs two seeds or more, got {seeds}")
-    with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
-        import casadi  # noqa: F401
-        import osqp  # noqa: F401
-    folder.mkdir(parents=True, exist_ok=True)
-    cases = make_cases(tasks, folder, seeds)
-    episodes = run_cases(solve, cases, "calibration", jobs, console)
-    parts = (tuple(episodes[i * seeds : (i + 1) * seeds]) for i in range(len(tasks)))
-    return [
-        CalibrationRecord(**asdict(task), env_version=__version__, command=command, episodes=part)
-        for task, part in zip(tasks, parts, strict=True)
-    ]
 
+    tasks: Sequence[ControlTask]
+    folder: Path
+    seeds: int = SEEDS
 
-def make_cases(tasks: Sequence[ControlTask], folder: Path, seeds: int) -> list[CalibrationCase]:
-    """Make the case of every episode, task by task.
+    def __post_init__(self) -> None:
+        if self.seeds < 2:
+            raise ValueError(f"an interval needs two seeds or more, got {self.seeds}")
 
-    Args:
-        tasks: Tasks to calibrate.
-        folder: Folder of finished cases.
-        seeds: Seeds of a task.
+    @cached_property
+    def cases(self) -> list[_CalibrationCase]:
+        """The case of every episode, task by task."""
+        pairs = ((task, seed) for task in self.tasks for seed in derive_seeds(task, self.seeds))
+        return [_CalibrationCase(*pair, self.folder) for pair in pairs]
 
-    Returns:
-        Cases.
-    """
-    return [CalibrationCase(c, seed, str(folder)) for c in tasks for seed in derive_seeds(c, seeds)]
+    def run(
+        self, command: str = "", jobs: int | None = None, console: Console | None = None
+    ) -> list[CalibrationRecord]:
+        """Solve every case that is not finished.
 
+        Args:
+            command: Command line, for the records.
+            jobs: Processes, None for all processors.
+            console: Where progress is shown.
 
-def remove_cases(cases: Sequence[CalibrationCase]) -> None:
-    """Remove finished cases once their entries are written; those of other runs stay.
+        Returns:
+            Record of each task.
 
-    Args:
-        cases: Cases of a run.
-    """
-    for case in cases:
-        case.path.unlink(missing_ok=True)
-    folder = Path(cases[0].folder)
-    if not any(folder.iterdir()):
-        folder.rmdir()
+        Raises:
+            ModuleNotFoundError: CasADi or OSQP is not installed.
+        """
+        with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
+            import casadi  # noqa: F401
+            import osqp  # noqa: F401
+        self.folder.mkdir(parents=True, exist_ok=True)
+        episodes = run_cases(_solve, self.cases, "calibration", jobs, console)
+        common = {"env_version": __version__, "command": command}
+        return [
+            CalibrationRecord(**task.record, **common, episodes=tuple(episodes[i : i + self.seeds]))
+            for task, i in zip(self.tasks, range(0, len(episodes), self.seeds), strict=True)
+        ]
+
+    def remove_cases(self) -> None:
+        """Remove finished cases once their entries are written; those of other runs stay."""
+        for case in self.cases:
+            case.path.unlink(missing_ok=True)
+        if not any(self.folder.iterdir()):
+            self.folder.rmdir()
 
 
 def read_calibration(
@@ -227,7 +220,7 @@ def read_calibration(
             for k, one in enumerate(episodes, 1)
         )
         record = from_json(CalibrationRecord, item | {"episodes": tuple(parsed)}, where)
-        seeds, why = [one.seed for one in record.episodes], ""
+        seeds, why = record.seeds, ""
         if record.env_version != __version__:
             why = f"of version {record.env_version}, not {__version__}"
         elif seeds != derive_seeds(record.task, len(seeds)):
@@ -252,65 +245,55 @@ def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
     write_text(path, json.dumps([asdict(record) for record in ordered], indent=1) + "\n")
 
 
-def check_current(
-    records: Mapping[ControlTask, CalibrationRecord], path: str | Path = FILE
-) -> None:
-    """Check that the uncontrolled car costs what it did.
+def read_current(
+    path: Path | None, tasks: Sequence[ControlTask]
+) -> dict[ControlTask, CalibrationRecord]:
+    """Read the records of tasks, and check that the uncontrolled car costs what it did.
 
     Args:
-        records: Records by task.
-        path: Their file.
+        path: File; None: the package's, if there is one.
+        tasks: Tasks.
+
+    Returns:
+        Records by task.
 
     Raises:
-        ValueError: It costs something else in a task.
+        ValueError: As `read_calibration`; or the car costs something else in a task.
     """
+    if path is None and not FILE.is_file():
+        return {}
+    path, none = path or FILE, Entry("none")
+    records = {task: record for task, record in read_calibration(path).items() if task in tasks}
     for task, record in records.items():
-        entry, seeds = ControlEntry(task, "", "none"), [one.seed for one in record.episodes]
-        now = measure([entry], seeds, jobs=1).outcomes[entry]
+        (now,) = measure([(task, none)], record.seeds, jobs=1).values()
         then = np.array([episode.costs["none"] for episode in record.episodes])
         if now.error or not np.allclose(now.costs, then, rtol=_SAME, atol=0.0):
             raise ValueError(
                 f"{path}: {task.name} is stale: the uncontrolled car costs {now.costs[0]:.6g} "
                 f"on its first seed, {then[0]:.6g} when it was calibrated; run sideslip calibrate"
             )
+    return records
 
 
-def measure_calibrated(
-    records: Mapping[ControlTask, CalibrationRecord],
-    control_entries: Sequence[ControlEntry],
-    **options: Any,
-) -> Results:
-    """Drive the entries of calibrated tasks on the clairvoyant's seeds.
+def measure_regrets(
+    records: Mapping[ControlTask, CalibrationRecord], cases: Iterable[ControlCase], **options: Any
+) -> tuple[dict[tuple[ControlTask, Entry], Array], Results]:
+    """Drive the cases of calibrated tasks on the clairvoyant's seeds.
 
     Args:
         records: Records by task.
-        control_entries: Entries, of other tasks too.
+        cases: Cases, of other tasks too.
         options: Options of `measure`.
 
     Returns:
-        Episodes by entry.
+        log(J / J_clairvoyant) on the seeds that an entry survives, shape (n,), by case; episodes.
     """
-    seeds = {task: [one.seed for one in record.episodes] for task, record in records.items()}
-    selected = [entry for task in records for entry in control_entries if entry.task == task]
+    selected = [case for task in records for case in cases if case.task == task]
     title = "control, the clairvoyant's seeds"
-    return measure(selected, seeds.__getitem__, title=title, **options)
-
-
-def compute_regrets(
-    records: Mapping[ControlTask, CalibrationRecord], results: Results
-) -> dict[ControlEntry, Array]:
-    """Compute the costs over the clairvoyant's on the seeds that an entry survives.
-
-    Args:
-        records: Records by task.
-        results: Episodes by entry.
-
-    Returns:
-        log(J / J_clairvoyant), shape (n,), by entry.
-    """
+    results = measure(selected, lambda task: records[task].seeds, title=title, **options)
     regrets = {}
-    for entry, result in results.outcomes.items():
-        if not result.error and survival_mask(result).any():
-            best = records[entry.task].costs[: len(result.costs)]
-            regrets[entry] = -compute_log_ratios(best, result)[survival_mask(result)]
-    return regrets
+    for (task, entry), result in results.items():
+        if not result.error and result.survived.any():
+            best = records[task].costs[: len(result.costs)]
+            regrets[task, entry] = -compute_log_ratios(best, result)[result.survived]
+    return regrets, results

@@ -1,117 +1,70 @@
 """The verdict of the control benchmark, and its figures, tracks and side-by-side views.
 
-`_Gains` are log(J_nominal / J) of an entry's episodes, shape (n,), by task (r in `score`);
-`foresight` everywhere is the log of oracle-state's cost over clairvoyant's in each calibrated task,
-shape (n,).
+`_Gains` are log(J_nominal / J) of an entry's episodes, shape (n,), by task (r in `score`).
 """
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ...agents import make_agent
-from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
 from ...envs.rendering.palette import find_colour
 from ...envs.vehicle.parameters import VEHICLES
-from ..harness.drives import make_env
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..harness.verdict import Explorer, Panel, describe_leader, format_verdict, summarise_names
 from ..report.film import make_track_kml
-from .baseline_gaps import DELAY_TASK, DELAYS, DelayCost, make_cost_lines
-from .entries import (
-    ADAPTIVE,
-    LEARNED,
-    ORACLE_NAMES,
-    REFERENCE_CONTROLLER,
-    REFERENCE_FILTER,
-    TRUTH,
-    ControlEntry,
-    get_filter_name,
-    make_agent_options,
-    make_estimate_options,
-)
-from .run import SIGNALS, Results
+from .baseline_gaps import DELAY_TASK, DELAYS
+from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, Entry
+from .run import SIGNALS
 from .score import Standing
+from .tables import Matrix
 from .tasks import NOMINAL, PARAMETERS, TITLES, ControlTask
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-_POLICIES = {pair for pairs in LEARNED.values() for pair in pairs}
-
 _Gains = dict[ControlTask, Array]
+_ByTier = Mapping[str, Sequence[Standing]]
 Driven = TypeVar("Driven", bound=Collection[Hashable])
 
 
-def compose_verdict(
-    by_tier: Mapping[str, Sequence[Standing]],
-    prices: Sequence[DelayCost] = (),
-    foresight: Mapping[ControlTask, Array] | None = None,
-) -> str:
+def compose_verdict(matrix: Matrix) -> str:
     """Compose the verdict over all tiers: the best controller, the best estimator, and why.
 
     Args:
-        by_tier: Entries by tier, the best first.
-        prices: Relative costs of entries at each delay of camera and GPS.
-        foresight: Log of oracle-state's cost over clairvoyant's by task, None without calibration.
+        matrix: Measurements.
 
     Returns:
         Text of the verdict, a statement a line.
     """
-    filters, controllers = _group_estimators(by_tier), _group_controllers(by_tier)
-    complete, none = select_complete(controllers), controllers.get("none", {})
-    best = _find_best_controller(by_tier)
-    ratio = _compute_cost_ratio(complete[best], none) if best not in ("", "none") and none else None
-    text = f", and {100.0 * ratio.value:.0f} % as much as no control" if ratio else ""
-    episodes = max((len(r) for gains in controllers.values() for r in gains.values()), default=0)
+    filters, agents = _group_filters(matrix.by_tier), _group_agents(matrix.by_tier)
+    complete, none, best = agents.complete, agents.gains.get("none", {}), agents.find_best()
+    text = ""
+    if best not in ("", "none") and none:
+        ratio = _compute_cost_ratio(complete.gains[best], none)
+        text = f", and {100.0 * ratio.value:.0f} % as much as no control"
+    episodes = max((len(r) for gains in agents.gains.values() for r in gains.values()), default=0)
     return format_verdict(
         "Controllers drive on what estimators infer; cost: squared error of slip and yaw rate.",
-        f"Of the controllers {_describe_first(complete)}{text}.",
-        f"Of the estimators, under one controller, {_describe_first(filters)}.",
-        _describe_reasons(by_tier, prices, foresight or {}),
-        f"{_describe_exceptions(by_tier)}Not covered: other cars and roads, and what "
+        f"Of the controllers {complete.describe_first()}{text}.",
+        f"Of the estimators, under one controller, {filters.describe_first()}.",
+        _describe_reasons(matrix),
+        f"{_describe_exceptions(matrix.by_tier)}Not covered: other cars and roads, and what "
         f"{episodes} episodes a contest are too few to show.",
     )
-
-
-def _compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
-    """Compute the cost over nominal's (%) of controllers with every task, the best first."""
-    complete = select_complete(_group_controllers(standings))
-    logs = {name: [-r for r in complete[name].values()] for name in _rank_entries(complete)}
-    return {
-        name: Estimate(*(100.0 * value for value in geometric_mean(*ratios)))
-        for name, ratios in logs.items()
-    }
-
-
-def is_default_filter(controller: str, estimator: str) -> bool:
-    """Whether an estimator is a controller's default: none, the reference or its own filter.
-
-    Args:
-        controller: Name of the controller.
-        estimator: Name of the estimator.
-
-    Returns:
-        Whether controllers are compared on this pair.
-    """
-    follows = ADAPTIVE.get(estimator) == controller
-    return estimator in ("", REFERENCE_FILTER) or follows or (estimator, controller) in _POLICIES
-
-
-def _find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """Find the best controller over all tiers among those with every task; "" without a score."""
-    return next(iter(_rank_entries(select_complete(_group_controllers(by_tier)))), "")
 
 
 def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
     """Select the names with every task that any name has: only they can be the best over all.
 
     Args:
-        by_name: Tasks of a controller, or a mapping from them, by the controller's name.
+        by_name: Tasks of an agent, or a mapping from them, by the agent's name.
 
     Returns:
         Selected names.
@@ -120,104 +73,131 @@ def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
     return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
 
 
-def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
-    """Collect the `_Gains` of each estimator under the reference controller, the truth left out."""
-    return _collect_gains(by_tier, "estimator", lambda entry: (
-        entry.controller == REFERENCE_CONTROLLER and entry.estimator != TRUTH))  # fmt: skip
-
-
-def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
-    """Collect the `_Gains` of each controller on its default filters, the oracles left out."""
-    return _collect_gains(by_tier, "controller", lambda entry: (
-        entry.controller not in ORACLE_NAMES and is_default_filter(entry.controller,
-                                                                   entry.estimator)))  # fmt: skip
-
-
-def _collect_gains(
-    by_tier: Mapping[str, Sequence[Standing]], attribute: str, among: Callable[[ControlEntry], bool]
-) -> dict[str, _Gains]:
-    by_name: dict[str, _Gains] = {}
-    for item in (item for standings in by_tier.values() for item in standings if among(item.entry)):
-        name = getattr(item.entry, attribute).replace(", ", " with ")  # in a list of names
-        gains = by_name.setdefault(name, {})
-        gains |= {task: r for task, (r, _) in item.pairs.items()}
-    return {name: item for name, item in by_name.items() if item}
-
-
 def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
     """Compute J / J_other on the tasks and seeds of both; NaN where there are none."""
     both = [(r, other[task]) for task, r in one.items() if task in other]
     return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
 
 
-def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate]]:
-    """Rank entries by fewest cheaper rivals; each name has its cost ratios over rivals."""
-    ratios = {
-        name: {rival: _compute_cost_ratio(x, by_name[rival]) for rival in by_name if rival != name}
-        for name, x in by_name.items()
-    }
-    losses = {name: sum(ratio.value > 1.0 for ratio in ratios[name].values()) for name in by_name}
-    gained = {name: np.mean([r.mean() for r in gains.values()]) for name, gains in by_name.items()}
-    order = sorted(by_name, key=lambda name: (losses[name], -gained[name]))
-    return {
-        name: dict(sorted(
-            ((other, ratio) for other, ratio in ratios[name].items() if np.isfinite(ratio.value)),
-            key=lambda rival: -rival[1].value,
-        ))
-        for name in order
-    }  # fmt: skip
+@dataclass(frozen=True)
+class _Ranking:
+    """Names that are compared by the cost of what they drove."""
+
+    gains: Mapping[str, _Gains]
+
+    @property
+    def complete(self) -> "_Ranking":
+        """The names with every task."""
+        return _Ranking(select_complete(self.gains))
+
+    @cached_property
+    def ranked(self) -> dict[str, dict[str, Estimate]]:
+        """Names by fewest cheaper rivals, each with its cost ratios over rivals, closest first."""
+        ratios = {
+            name: {x: _compute_cost_ratio(one, y) for x, y in self.gains.items() if x != name}
+            for name, one in self.gains.items()
+        }
+        losses = {name: sum(x.value > 1.0 for x in ratios[name].values()) for name in self.gains}
+        gained = {name: np.mean([r.mean() for r in x.values()]) for name, x in self.gains.items()}
+        order = sorted(self.gains, key=lambda name: (losses[name], -gained[name]))
+        known = {
+            name: [
+                (rival, ratio) for rival, ratio in ratios[name].items() if np.isfinite(ratio.value)
+            ]
+            for name in order
+        }
+        return {
+            name: dict(sorted(x, key=lambda rival: -rival[1].value)) for name, x in known.items()
+        }
+
+    @property
+    def costs(self) -> dict[str, Estimate]:
+        """Cost over nominal's (%) of the names with every task, the best first."""
+        ranked = self.complete
+        means = {
+            name: geometric_mean(*(-r for r in ranked.gains[name].values()))
+            for name in ranked.ranked
+        }
+        return {name: mean.rescale(100.0) for name, mean in means.items()}
+
+    def find_best(self) -> str:
+        """Find the first of the names with every task, "" without any."""
+        return next(iter(self.complete.ranked), "")
+
+    def describe_first(self) -> str:
+        """Describe in a clause which name leads, and by how much."""
+        first = next(iter(self.ranked.items()), None)
+        return describe_leader(*first, "cost") if first else "nobody has a score"
 
 
-def _describe_first(by_name: Mapping[str, _Gains]) -> str:
-    """Describe in a clause which name leads, and by how much."""
-    ranked = _rank_entries(by_name)
-    return describe_leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
+def _group_filters(by_tier: _ByTier) -> _Ranking:
+    """Rank the estimators under the reference controller, the truth left out."""
+    return _rank(by_tier, lambda entry: (
+        entry.estimator if entry.agent == REFERENCE_CONTROLLER and entry.estimator != TRUTH
+        else ""))  # fmt: skip
 
 
-def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """Describe the tiers in which another name surely leads, and controllers of fewer tasks."""
+def _group_agents(by_tier: _ByTier) -> _Ranking:
+    """Rank the agents on their default filters, the oracles left out."""
+    return _rank(by_tier, lambda entry: (
+        entry.agent if entry.agent not in ORACLE_NAMES and entry.is_default else ""))  # fmt: skip
+
+
+def _rank(by_tier: _ByTier, name_entry: Callable[[Entry], str]) -> _Ranking:
+    """Collect what each name drove, in all tiers; "" is left out."""
+    gains: dict[str, _Gains] = {}
+    for standing in (item for standings in by_tier.values() for item in standings):
+        if name := name_entry(standing.entry).replace(", ", " with "):  # in a list of names
+            gains.setdefault(name, {}).update({task: r for task, (r, _) in standing.pairs.items()})
+    return _Ranking({name: item for name, item in gains.items() if item})
+
+
+def _describe_exceptions(by_tier: _ByTier) -> str:
+    """Describe the tiers in which another name surely leads, and agents of fewer tasks."""
     parts = []
     for tier, standings in by_tier.items():
-        for collect in (_group_estimators, lambda by: select_complete(_group_controllers(by))):
-            overall, in_tier = (_rank_entries(collect(x)) for x in (by_tier, {tier: standings}))
+        for group in (_group_filters, lambda x: _group_agents(x).complete):
+            overall, in_tier = (group(x).ranked for x in (by_tier, {tier: standings}))
             first, best = next(iter(overall), ""), next(iter(in_tier), "")
             rivals = in_tier.get(best, {})
             if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
-    gains, overall_best = _group_controllers(by_tier), _find_best_controller(by_tier)
-    partial = gains.keys() - select_complete(gains).keys() if overall_best else ()
-    ratios = {name: _compute_cost_ratio(gains[name], gains[overall_best]) for name in partial}
-    cheaper = (name for name in ratios if ratios[name].high < 1.0)
-    ordered = sorted(cheaper, key=lambda label: ratios[label].value)
-    parts += [f"{name} on its own manoeuvres" for name in ordered]
+    agents = _group_agents(by_tier)
+    if overall_best := agents.find_best():
+        partial = agents.gains.keys() - agents.complete.gains.keys()
+        best_gains = agents.gains[overall_best]
+        ratios = {name: _compute_cost_ratio(agents.gains[name], best_gains) for name in partial}
+        cheaper = (name for name in ratios if ratios[name].high < 1.0)
+        ordered = sorted(cheaper, key=lambda label: ratios[label].value)
+        parts += [f"{name} on its own manoeuvres" for name in ordered]
     return f"It costs less with {summarise_names(parts)}. " if parts else ""
 
 
-def _describe_reasons(
-    by_tier: Mapping[str, Sequence[Standing]],
-    prices: Sequence[DelayCost],
-    foresight: Mapping[ControlTask, Array],
-) -> str:
+def _describe_reasons(matrix: Matrix) -> str:
     """Describe what the oracles save by their knowledge, and the cost of delay."""
-    all_standings = [standing for standings in by_tier.values() for standing in standings]
-    oracles = [item for item in all_standings if item.entry.controller == PARAMETERS]
-    parameter_pairs = [pair for item in oracles for pair in item.pairs.values()]
+    pairs = [
+        pair
+        for standings in matrix.by_tier.values()
+        for standing in standings
+        if standing.entry.agent == PARAMETERS
+        for pair in standing.pairs.values()
+    ]
     steps = (
-        ("the true car and road", [r for r, _ in parameter_pairs]),
-        ("its exact motion", [oracle_gain - r for r, oracle_gain in parameter_pairs]),
-        ("what is ahead", list(foresight.values())),
+        ("the true car and road", [r for r, _ in pairs]),
+        ("its exact motion", [oracle_gain - r for r, oracle_gain in pairs]),
+        ("what is ahead", list(matrix.foresight.values())),
     )
     texts = [
         f"{what} saves {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
         for what, logs in steps
         if logs
     ]
-    late = [price.over for price in prices if price.entry.controller == REFERENCE_CONTROLLER]
-    delay = ""
-    if late and np.isfinite(late[0][-1].value):
-        grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
+    costs = matrix.delay_costs.items()
+    late, delay = next((x for entry, x in costs if entry.agent == REFERENCE_CONTROLLER), ()), ""
+    if late and np.isfinite(late[-1].value):
+        grown = 100.0 * (late[-1].value / late[0].value - 1.0)
         delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
-    return f"Knowing {', then '.join(texts)} of the cost{delay}." if parameter_pairs else ""
+    return f"Knowing {', then '.join(texts)} of the cost{delay}." if pairs else ""
 
 
 _PANELS = (
@@ -232,62 +212,46 @@ _COST = "cost / nominal's, %: less is better"
 _CAPTION = "nominal: an LQG that knows the data sheet. Whiskers: 95 % intervals. Hollow: a variant."
 
 
-def add_figures(
-    suite: Suite,
-    by_tier: Mapping[str, Sequence[Standing]],
-    results: Results,
-    prices: Sequence[DelayCost],
-    foresight: Mapping[ControlTask, Array],
-) -> None:
-    """Add the figures to a suite that has its verdict; without plotly only the tracks.
+def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
+    """Add the figures to a suite.
 
     Args:
         suite: Suite, to which the figures are added.
-        by_tier: Entries by tier, the best first.
-        results: Episodes by entry.
-        prices: Relative costs of entries at each delay of camera and GPS.
-        foresight: Log of oracle-state's cost over clairvoyant's by task.
+        matrix: Measurements.
+        draw: `report.figures`.
     """
-    outcomes = results.outcomes.items()
-    series = {entry: drive.series for entry, drive in outcomes if drive.series is not None}
-    best = _find_best_controller(by_tier)
-    suite.files += _make_tracks(series, best)
-    try:
-        from ..report.figures import draw_curves, draw_groups
-    except ModuleNotFoundError:
-        return
+    by_tier = matrix.by_tier
     questions = (
-        ("Which controller holds the car?", {"All contests": _compute_relative_costs(by_tier)}),
-        ("Which controller holds it in each tier?", _group_costs(by_tier, _controller)),
-        ("Which estimator does a controller drive best with?", _group_costs(by_tier, _estimator)),
-        ("What would knowing more save?", _group_oracles(by_tier, foresight)),
+        ("Which controller holds the car?", {"All contests": _group_agents(by_tier).costs}),
+        ("Which controller holds it in each tier?", _group_costs(by_tier, _name_agent)),
+        ("Which estimator does a controller drive best with?", _group_costs(by_tier, _name_filter)),
+        ("What would knowing more save?", _group_oracles(matrix)),
     )
     suite.answers += [
-        (title, draw_groups(groups, _COST, {100.0: "nominal"}), _CAPTION)
+        (title, draw.draw_groups(groups, _COST, {100.0: "nominal"}), _CAPTION)
         for title, groups in questions
         if any(groups.values())
     ]
-    shown = make_cost_lines(prices)
+    lines = {entry.label: np.array(x).T for entry, x in matrix.delay_costs.items()}
+    shown = {label: (*line,) for label, line in lines.items() if np.isfinite(line).all()}
     if shown:
         ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
-        figure = draw_curves(ms, shown, "further delay of camera and GPS / ms", label)
+        figure = draw.draw_curves(ms, shown, "further delay of camera and GPS / ms", label)
         text = f"{DELAY_TASK.name}: camera every 50 ms, GPS every 200 ms; "
         text += "each filter is designed for its delay."
         suite.answers.append(("What does late sensing cost?", figure, text))
-    suite.explorers.append(_make_explorer(series, best))
+    suite.explorers.append(_make_explorer(matrix))
     for tier, standings in by_tier.items():
-        suite.figures += _draw_maps(tier, standings)
+        suite.figures += _draw_maps(tier, standings, draw)
 
 
-def _group_costs(
-    by_tier: Mapping[str, Sequence[Standing]], name: Callable[[ControlEntry], str]
-) -> dict[str, dict[str, Estimate]]:
+def _group_costs(by_tier: _ByTier, name: Callable[[Entry], str]) -> dict[str, dict[str, Estimate]]:
     """Group costs over nominal's (%) by tier and name(entry), "" left out; the best is first."""
     groups = {}
     for tier, standings in by_tier.items():
         shown = [item for item in standings if "cost_vs_nominal" in item.overall]
         costs = {
-            name(item.entry): Estimate(*(100.0 * n for n in item.overall["cost_vs_nominal"]))
+            name(item.entry): item.overall["cost_vs_nominal"].rescale(100.0)
             for item in shown
             if name(item.entry)
         }
@@ -296,34 +260,32 @@ def _group_costs(
     return {title: costs for title, costs in groups.items() if costs}
 
 
-def _estimator(entry: ControlEntry) -> str:
-    return entry.estimator if entry.controller == REFERENCE_CONTROLLER else ""
+def _name_filter(entry: Entry) -> str:
+    return entry.estimator if entry.agent == REFERENCE_CONTROLLER else ""
 
 
-def _controller(entry: ControlEntry) -> str:
-    is_shown = is_default_filter(entry.controller, entry.estimator) and entry.controller != NOMINAL
-    return entry.controller if is_shown and entry.estimator != TRUTH else ""
+def _name_agent(entry: Entry) -> str:
+    is_shown = entry.is_default and entry.agent != NOMINAL and entry.estimator != TRUTH
+    return entry.agent if is_shown else ""
 
 
-def _group_oracles(
-    by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
-) -> dict[str, dict[str, Estimate]]:
+def _group_oracles(matrix: Matrix) -> dict[str, dict[str, Estimate]]:
     """Group the oracles' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
-    names = ORACLE_NAMES
-    groups = _group_costs(by_tier, lambda x: x.controller if x.controller in names else "")
+    by_tier, names = matrix.by_tier, ORACLE_NAMES
+    groups = _group_costs(by_tier, lambda x: x.agent if x.agent in names else "")
     for tier in by_tier:
         title = f"Tier {tier}: {TITLES[tier]}"
-        logs = [value for task, value in foresight.items() if task.tier == tier]
+        logs = [value for task, value in matrix.foresight.items() if task.tier == tier]
         if logs and "oracle-state" in groups.get(title, {}):
             state = groups[title]["oracle-state"].value
             ratio = geometric_mean(*(-value for value in logs))
-            groups[title]["clairvoyant"] = Estimate(*(state * value for value in ratio))
+            groups[title]["clairvoyant"] = ratio.rescale(state)
     return groups
 
 
-def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, "Figure", str]]:
-    from ..report.figures import draw_heat_map
-
+def _draw_maps(
+    tier: str, standings: Sequence[Standing], draw: ModuleType
+) -> list[tuple[str, "Figure", str]]:
     names = [standing.label for standing in standings]
     tasks = list(dict.fromkeys(c for standing in standings for c in standing.results))
     figures = []
@@ -338,20 +300,27 @@ def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, "Fig
         if np.isfinite(values).any():
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
             columns = [task.name for task in tasks]
-            figures.append((title, draw_heat_map(names, columns, values, metric, good), text))
+            figures.append((title, draw.draw_heat_map(names, columns, values, metric, good), text))
     return figures
 
 
-def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[str, str, str]]:
-    """Make the tracks (KML) of the first and the last task, without control and with the best."""
-    tasks = list(dict.fromkeys(entry.task for entry in series))
+def make_tracks(matrix: Matrix) -> list[tuple[str, str, str]]:
+    """Make the tracks (KML) of the first and the last task, without control and with the best.
+
+    Args:
+        matrix: Measurements.
+
+    Returns:
+        Name, media type and text of each file.
+    """
+    series, best = matrix.series, _group_agents(matrix.by_tier).find_best()
+    tasks = list(dict.fromkeys(task for task, _ in series))
     files = []
     for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
         places = {
             entry.label: (values[:, 1 + SIGNALS.index("X")], values[:, 1 + SIGNALS.index("Y")])
-            for entry, values in series.items()
-            if entry.task == task and entry.controller in ("none", best)
-            if is_default_filter(entry.controller, entry.estimator)
+            for (driven, entry), values in series.items()
+            if driven == task and entry.agent in ("none", best) and entry.is_default
         }
         text = make_track_kml(task.name, places, {name: find_colour(name) for name in places})
         name = f"{task.name.replace(', ', '-')}.kml"
@@ -359,23 +328,18 @@ def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[
     return files
 
 
-def _make_explorer(series: Mapping[ControlEntry, Array], best: str) -> Explorer:
+def _make_explorer(matrix: Matrix) -> Explorer:
     """Make the view of every entry's first test seed, at first no control and the best."""
-    labels = (
-        entry.label
-        for entry in series
-        if entry.controller == best and is_default_filter(best, entry.estimator)
-    )
-    keyed: dict[tuple[str, ...], Array] = {
-        (entry.task.tier, entry.task.name, entry.label): values for entry, values in series.items()
-    }
+    series, best = matrix.series, _group_agents(matrix.by_tier).find_best()
+    keyed: dict[tuple[str, ...], Array] = {}
     bodies: dict[tuple[str, ...], tuple[float, float]] = {}
-    for entry in series:
-        car = VEHICLES[entry.task.vehicle or "coms"]
-        size = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
-        bodies[entry.task.tier, entry.task.name] = size
-    best = next(labels, "")
-    return make_time_explorer("Any two side by side", ("tier", "contest"), keyed, best, bodies)
+    for (task, entry), values in series.items():
+        car = VEHICLES[task.vehicle or "coms"]
+        keyed[task.tier, task.name, entry.label] = values
+        bodies[task.tier, task.name] = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
+    labels = (entry.label for _, entry in series if entry.agent == best and entry.is_default)
+    menus = ("tier", "contest")
+    return make_time_explorer("Any two side by side", menus, keyed, next(labels, ""), bodies)
 
 
 def make_time_explorer(
@@ -406,31 +370,3 @@ def make_time_explorer(
         "the car goes in a quarter of a second, its angle to the body the sideslip."
     )
     return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})
-
-
-def run_entry(entry: ControlEntry, seed: int) -> Rollout:
-    """Run one episode of an entry in a single env.
-
-    Args:
-        entry: Task, estimator and controller with their options.
-        seed: Seed of the episode.
-
-    Returns:
-        Rollout of the episode.
-    """
-    return rollout(*make_env_and_agent(entry), seed)
-
-
-def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
-    """Make a single env with its filter, and the agent that drives it.
-
-    Args:
-        entry: Task, estimator and controller with their options.
-
-    Returns:
-        Env of one car, and the agent that drives it.
-    """
-    estimate = make_estimate_options(entry) if entry.estimator else None
-    name = get_filter_name(entry.estimator)
-    env = make_env(entry.task.env_id, name, estimate, **entry.env_options)
-    return env, make_agent(entry.controller, env, **make_agent_options(entry))

@@ -1,26 +1,27 @@
-"""Episodes of the control benchmark: driven, reduced to metrics, and kept as finished cases.
+"""Episodes of the control benchmark: driven, reduced to metrics, timed, kept as finished cases.
 
 A chunk drives all its seeds at once in a vector env. A folder keeps finished chunks, by a hash of
 everything that their numbers depend on.
 """
 
-import contextlib
 import hashlib
 import inspect
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 
 from ...agents.learned.policy import hash_policy
 from ...agents.rollout import EpisodeStep, iterate_steps
-from ...envs.io import atomic_file
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import FAST, Array
 from ...envs.task import FAILURES
@@ -29,8 +30,8 @@ from ...envs.validation import parse_actions
 from ...envs.vehicle.dynamics import Motion
 from ...estimators.registry import describe_error
 from ..harness.metrics import EPISODE, REDUCTIONS, StepSample, compute_dissipation
-from ..harness.parallel import run_cases
-from .entries import SLOW_EPISODES, ControlEntry, make_cars
+from ..report.study import CaseStorage, Request
+from .entries import SLOW_EPISODES, ControlCase, Entry
 from .tasks import ControlTask, Seeds, make_salt
 
 NUMBERS = tuple(metric.name for metric in EPISODE)
@@ -41,11 +42,17 @@ SIGNALS = (*_INFO[1:], *_PLACE)
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some seeds of an entry; keep: whether the first seed's series is returned, no folder."""
+    """Some seeds of a task; keep: whether the first seed's time series is returned too."""
 
-    entry: ControlEntry
+    task: ControlTask
+    entry: Entry
     seeds: tuple[int, ...]
     keep: bool = False
+
+    @property
+    def case(self) -> ControlCase:
+        """Task and entry."""
+        return ControlCase(self.task, self.entry)
 
 
 @dataclass
@@ -65,6 +72,11 @@ class DriveResult:
     def costs(self) -> Array:
         """Cost of each episode, shape (seeds,)."""
         return self["cost"]
+
+    @property
+    def survived(self) -> npt.NDArray[np.bool_]:
+        """Whether each episode ended by no failure, shape (seeds,)."""
+        return np.asarray(self["failure"] == 0.0)
 
     def mark_failures(self, cause: str) -> Array:
         """Mark the episodes that ended by a failure.
@@ -105,7 +117,7 @@ class _MetricAccumulator:
         power = np.abs(torques).sum(axis=1) * speed / self.radius
         base, commands = self.base, (command, self.last_command)
         infos, scales = (info, self.last), (self.full_scale, self.dt)
-        dissipation = compute_dissipation(base.params, base.states, base.switches)
+        dissipation = compute_dissipation(*base.engine.arrays[:3])  # params, states, switches
         motion = (self.lateral_deviation, power, dissipation)
         sample = StepSample(*commands, step.reward, *infos, *scales, *motion)
         for metric, total in zip(EPISODE, self.totals, strict=True):
@@ -139,7 +151,7 @@ def run_chunk(chunk: Chunk) -> DriveResult:
 
 def _run_chunk(chunk: Chunk) -> DriveResult:
     start_time = time.process_time()
-    env, agent = make_cars(chunk.entry, len(chunk.seeds))
+    env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
     steps = iterate_steps(env, agent, list(chunk.seeds))
     reset = next(steps)
     tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
@@ -159,48 +171,55 @@ def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
     return [float(step.info[name][0]) for name in _INFO] + place
 
 
-def get_control_period(entry: ControlEntry) -> float:
-    """Return the time between two decisions of an entry.
+_STEPS = 200  # of a decision's time
+
+
+class _TimedFunction:
+    """A function that notes how long each of its calls takes, in s of wall time."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        self.function, self.seconds = function, list[float]()
+
+    def __call__(self, *args: object, **kwargs: object) -> object:
+        start_time = time.perf_counter()
+        result = self.function(*args, **kwargs)
+        self.seconds.append(time.perf_counter() - start_time)
+        return result
+
+
+def measure_decision_time(case: ControlCase) -> float:
+    """Measure the wall time of a decision of one car: predict, and the estimator's part.
+
+    Medians over _STEPS steps of an episode, the bare env stepped side by side.
 
     Args:
-        entry: Entry whose options may name the period.
+        case: Task and who drives it.
 
     Returns:
-        Period (s).
+        Wall time (us).
     """
-    return int(entry.options.get("control_period", 10)) * TICK
+    env, agent = case.entry.make(case.task, 1)
+    bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)
+    bare.reset(seed=0)
+    agent.predict, env.step = _TimedFunction(agent.predict), _TimedFunction(env.step)
+    without = _TimedFunction(bare.step)
+    for step in islice(iterate_steps(env, agent, 0), 1, _STEPS + 1):
+        without(np.zeros_like(step.action))
+    timers = (agent.predict, env.step, without)
+    predict, with_estimator, without_estimator = (np.median(f.seconds) for f in timers)
+    return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))
 
 
 CHUNK = 64
 """Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
-_LENGTH = 24  # hexadecimal digits of a case's file name
 
 
-@dataclass
-class Results:
-    """Episodes by entry."""
-
-    outcomes: dict[ControlEntry, DriveResult] = field(default_factory=dict)
-
-    def select(self, task: ControlTask, controller: str, estimator: str = "") -> DriveResult:
-        """Return one entry's episodes.
-
-        Args:
-            task: Task that was driven.
-            controller: Name of the controller.
-            estimator: Name of the estimator.
-
-        Returns:
-            Episodes.
-
-        Raises:
-            KeyError: It was not asked for.
-        """
-        return self.outcomes[ControlEntry(task, estimator, controller)]
+Results = dict[tuple[ControlTask, Entry], DriveResult]
+"""Episodes by task and entry."""
 
 
 def measure(
-    entries: Sequence[ControlEntry],
+    cases: Iterable[tuple[ControlTask, Entry]],
     seeds: Seeds,
     *,
     jobs: int | None = None,
@@ -209,10 +228,10 @@ def measure(
     runner: Callable[[Chunk], DriveResult] | None = None,
     title: str = "control",
 ) -> Results:
-    """Drive every entry on its task's seeds, slow ones on the first of them.
+    """Drive every case on its task's seeds, slow entries on the first of them.
 
     Args:
-        entries: Entries to drive.
+        cases: Tasks and who drives them.
         seeds: Seeds of all tasks, or a function of the task.
         jobs: Processes, None for all processors.
         console: Where progress is shown.
@@ -221,26 +240,26 @@ def measure(
         title: Title of the progress bar.
 
     Returns:
-        Episodes of all entries.
+        Episodes of all cases.
     """
-    if not entries:
-        return Results()
-    seeds_by_entry: dict[ControlEntry, Sequence[int]] = {}
-    for entry in entries:
-        task_seeds = seeds(entry.task) if callable(seeds) else seeds
-        seeds_by_entry[entry] = task_seeds[:SLOW_EPISODES] if entry.slow else task_seeds
-    chunks = [  # the first of every cell before the second of any: a stopped run has them all
-        Chunk(entry, tuple(entry_seeds[first : first + CHUNK]), keep=first == 0)
-        for first in range(0, max(map(len, seeds_by_entry.values())), CHUNK)
-        for entry, entry_seeds in seeds_by_entry.items()
-        if first < len(entry_seeds)
+    seeds_by_case: dict[ControlCase, Sequence[int]] = {}
+    for case in (ControlCase(task, entry) for task, entry in cases):
+        task_seeds = seeds(case.task) if callable(seeds) else seeds
+        seeds_by_case[case] = task_seeds[:SLOW_EPISODES] if case.is_slow else task_seeds
+    if not seeds_by_case:
+        return {}
+    chunks = [  # the first of every case before the second of any: a stopped run has them all
+        Chunk(*case, tuple(case_seeds[first : first + CHUNK]), keep=first == 0)
+        for first in range(0, max(map(len, seeds_by_case.values())), CHUNK)
+        for case, case_seeds in seeds_by_case.items()
+        if first < len(case_seeds)
     ]
-    cached = CachedDrive(keep and keep.absolute(), runner)  # a worker of a cluster runs elsewhere
-    results = run_cases(cached, chunks, title, jobs, console)
-    parts: dict[ControlEntry, list[DriveResult]] = {}
+    request = Request(jobs=jobs, console=console, keep=keep)
+    results = request.run_cases(runner or run_chunk, chunks, title, make_storage(runner))
+    parts: dict[ControlCase, list[DriveResult]] = {}
     for chunk, item in zip(chunks, results, strict=True):
-        parts.setdefault(chunk.entry, []).append(item)
-    return Results({entry: _join_results(item) for entry, item in parts.items()})
+        parts.setdefault(chunk.case, []).append(item)
+    return {case: _join_results(item) for case, item in parts.items()}
 
 
 def _join_results(parts: list[DriveResult]) -> DriveResult:
@@ -252,42 +271,6 @@ def _join_results(parts: list[DriveResult]) -> DriveResult:
     )
 
 
-@dataclass(frozen=True)
-class CachedDrive:
-    """`run_chunk`, or another runner, behind a folder of results; None caches nothing.
-
-    A result is taken only where sources (those of the plant and the benchmark too) and a policy's
-    weights are the same.
-    """
-
-    folder: Path | None
-    runner: Callable[[Chunk], DriveResult] | None = None
-
-    def __call__(self, chunk: Chunk) -> DriveResult:
-        """Return the chunk's result, from the folder if it is there."""
-        if self.folder is None:
-            return self._run_chunk(chunk)
-        path = self._make_path(chunk)
-        cached = _read_finished(path, chunk, entire=self.runner is None)
-        if cached is not None:
-            return cached
-        result = self._run_chunk(chunk)
-        if not result.error:  # an error is worth another try
-            _write_finished(path, result)
-        return result
-
-    def _run_chunk(self, chunk: Chunk) -> DriveResult:
-        return run_chunk(chunk) if self.runner is None else self.runner(chunk)
-
-    def _make_path(self, chunk: Chunk) -> Path:
-        assert self.folder is not None
-        weights = hash_policy(chunk.entry.controller)
-        source_text = "" if self.runner is None else Path(inspect.getfile(self.runner)).read_text()
-        key = [hash_sources(), source_text, weights, chunk.entry.oracle, asdict(chunk)]
-        text = json.dumps(key, sort_keys=True)
-        return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
-
-
 @cache
 def hash_sources() -> str:
     """Hash all files that an episode's numbers depend on, tuned options and weights too."""
@@ -297,35 +280,46 @@ def hash_sources() -> str:
     return digest.hexdigest()
 
 
-def _read_finished(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | None:
-    """Read a finished chunk's result; None where the file is absent, damaged or another's."""
+def make_storage(
+    runner: Callable[[Chunk], DriveResult] | None = None,
+) -> CaseStorage[Chunk, DriveResult]:
+    """Make the storage of finished chunks.
+
+    A result is taken only where sources (those of the plant and the benchmark too) and a policy's
+    weights are the same.
+
+    Args:
+        runner: Function that drives a chunk instead of `run_chunk`, some of whose numbers are NaN.
+
+    Returns:
+        Storage.
+    """
+    describe = partial(_describe_chunk, runner=runner)
+    return CaseStorage(describe, _pack_result, partial(_unpack_result, is_whole=runner is None))
+
+
+def _describe_chunk(chunk: Chunk, runner: Callable[[Chunk], DriveResult] | None) -> str:
+    weights, driver = hash_policy(chunk.entry.agent), chunk.case.driver
+    source_text = "" if runner is None else Path(inspect.getfile(runner)).read_text()
+    key = [hash_sources(), source_text, weights, driver, asdict(chunk)]
+    return json.dumps(key, sort_keys=True)
+
+
+def _pack_result(result: DriveResult) -> dict[str, Any] | None:
+    arrays = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
+    series = {} if result.series is None else {"series": result.series}
+    return None if result.error else arrays | series  # an error is worth another try
+
+
+def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array], is_whole: bool) -> DriveResult:
+    """Make a result of finite numbers, all if it is to be whole, else any; ValueError otherwise."""
     shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
     shapes["seconds"] = ()
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
-        if chunk.keep and entire:
-            shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
-        if not all(_has_shape(arrays[name], shape, entire) for name, shape in shapes.items()):
-            return None
-    except Exception:  # whatever NumPy, zipfile and zlib find wrong with it
-        return None
+    if chunk.keep and is_whole:
+        shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
+    for name, shape in shapes.items():
+        array, finite = arrays[name], np.isfinite(arrays[name])
+        is_valid = finite.all() if is_whole else finite.any()
+        if not (is_valid and array.dtype == np.float64 and array.shape == shape):
+            raise ValueError(f"{name} are not a chunk's")
     return DriveResult(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))
-
-
-def _has_shape(array: Array, shape: tuple[int, ...], entire: bool) -> bool:
-    """Whether an array has a shape and finite numbers: all if it is to be entire, else any."""
-    finite = np.isfinite(array)
-    is_valid = finite.all() if entire else finite.any()
-    return array.dtype == np.float64 and array.shape == shape and bool(is_valid)
-
-
-def _write_finished(path: Path, result: DriveResult) -> None:
-    """Write a file of `_read_finished`; a full disk loses the file, not the run."""
-    arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
-    if result.series is not None:
-        arrays["series"] = result.series
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as file:
-            np.savez_compressed(file, **arrays)

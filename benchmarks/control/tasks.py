@@ -9,7 +9,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,11 @@ from ... import __version__
 from ...agents import baselines
 from ...envs.io import from_json
 from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
+from ...envs.ticks import TICK
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import VEHICLES
 from ...estimators.learned.network import SUFFIX
-from ..harness.results import read_objects, write_text
+from ..harness.results import read_objects
 
 YAW = "sideslip/YawFusion-v0"
 STEERING = "sideslip/AfsYawFusion-v0"
@@ -52,13 +53,15 @@ LIMIT = ("2c",)  # tiers in which nominal may fail as often as it does
 
 @dataclass(frozen=True)
 class ControlTask:
-    """A scenario in an environment; vehicle, reference: "" for the id's; tier: "" if unscored."""
+    """A scenario in an environment. Tasks are equal whatever the changes are."""
 
-    tier: str = ""
+    tier: str = ""  # "" if unscored
     env_id: str = YAW
-    vehicle: str = ""
-    reference: str = ""
+    vehicle: str = ""  # "" for the id's
+    reference: str = ""  # "" for the id's
     scenario: str = "random-steering"
+    # options of the env over its own, with a scenario that has no name
+    changes: Mapping[str, Any] = field(default_factory=dict, compare=False, kw_only=True)
 
     @property
     def name(self) -> str:
@@ -73,14 +76,24 @@ class ControlTask:
         return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
 
     @property
-    def seed_text(self) -> str:
-        """JSON from which the seeds are drawn. Its keys stay when a field gets another name."""
+    def record(self) -> dict[str, str]:
+        """What files hold of it. Its keys stay when a field gets another name."""
         names = ("tier", "env_id", "vehicle", "reference", "scenario")
-        return json.dumps({name: getattr(self, name) for name in names})
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def seed_text(self) -> str:
+        """JSON from which the seeds are drawn."""
+        return json.dumps(self.record)
+
+    @property
+    def control_period(self) -> float:
+        """Time between two decisions (s)."""
+        return int(self.changes.get("control_period", 10)) * TICK
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env."""
+        """Options of the env without the changes."""
         car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
         reference_options = {"reference": self.reference} if self.reference else {}
         return {"scenario": self.scenario} | car | reference_options
@@ -186,16 +199,6 @@ def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
             )
         measurements.append(measurement)
     return tuple(measurements)
-
-
-def write_tasks(entries: Sequence[TaskMeasurement], path: Path = FILE) -> None:
-    """Write a file that `read_tasks` reads.
-
-    Args:
-        entries: Candidates.
-        path: File.
-    """
-    write_text(path, json.dumps([asdict(entry) for entry in entries], indent=1) + "\n")
 
 
 @cache

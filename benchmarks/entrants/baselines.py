@@ -5,7 +5,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from ..control.entries import (
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
     TRUTH,
-    ControlEntry,
+    ControlCase,
+    Entry,
     select_quick_tasks,
 )
 from ..control.run import NUMBERS, DriveResult, Results, measure
@@ -36,10 +37,11 @@ from .challenge import EPISODES
 
 FILE = Path(__file__).with_name("baselines.json")
 COMMAND = f"python -m {__name__}"
-_BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
-_AGENT_RIVALS = ((REFERENCE_FILTER, "esc"),)
-_RIVALS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
-"""(estimator, controller) pairs of all baselines, of an agent's and of an estimator's rivals."""
+_BASELINES = tuple(map(Entry, (NOMINAL, STATE, "none")))
+_AGENT_RIVALS = (Entry("esc", REFERENCE_FILTER),)
+_RIVAL_FILTERS = ("multirate-kf, camera and gps", TRUTH)
+_RIVALS = tuple(Entry(REFERENCE_CONTROLLER, name) for name in _RIVAL_FILTERS)
+"""All baselines, an agent's and an estimator's rivals."""
 _SAMPLE = 2  # episodes of a baseline that are driven again
 _SAME = 1e-6  # relative difference of equal costs
 
@@ -56,69 +58,62 @@ class BaselineRecord(TaskRecord):
     failures: list[int]
 
     @property
-    def entry(self) -> ControlEntry:
-        """The entry of these episodes."""
-        return ControlEntry(self.task, self.estimator, self.controller)
+    def case(self) -> ControlCase:
+        """Who drove these episodes, in which task."""
+        return ControlCase(self.task, Entry(self.controller, self.estimator))
 
-    def drives(self, n: int) -> DriveResult:
-        """Return the first episodes; what is not on file is NaN.
-
-        Args:
-            n: Number of episodes.
-
-        Returns:
-            Episodes.
-        """
+    def _make_drives(self, n: int) -> DriveResult:
+        """Make the first n episodes; what is not on file is NaN."""
         numbers = np.full((n, len(NUMBERS)), np.nan)
         numbers[:, NUMBERS.index("cost")] = self.costs[:n]
         numbers[:, NUMBERS.index("failure")] = self.failures[:n]
         return DriveResult(numbers, 0.0)
 
 
-def make_baseline_entries(
+def make_baseline_cases(
     tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
-) -> list[ControlEntry]:
-    """Make the baselines' entries.
+) -> list[ControlCase]:
+    """Make the baselines' cases.
 
     Args:
-        tasks: Tasks that every pair drives.
+        tasks: Tasks that every entry drives.
         agents: Whether an agent's rivals are among them.
         estimators: Whether an estimator's rivals are among them.
 
     Returns:
-        Entries, task by task.
+        Cases, task by task.
     """
-    pairs = _BASELINE_PAIRS + (_AGENT_RIVALS if agents else ()) + (_RIVALS if estimators else ())
-    return [ControlEntry(task, *pair) for task in tasks for pair in pairs]
+    entries = _BASELINES + (_AGENT_RIVALS if agents else ()) + (_RIVALS if estimators else ())
+    return [ControlCase(task, entry) for task in tasks for entry in entries]
 
 
-def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
+def read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], BaselineRecord]:
     """Read the records of a file that are of this version.
 
     Args:
         path: JSON file of the records.
 
     Returns:
-        Records by entry.
+        Records by case.
 
     Raises:
         ValueError: The file holds no such records.
     """
     items = enumerate(read_objects(path), 1)
     records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
-    return {record.entry: record for record in records if record.env_version == __version__}
+    return {record.case: record for record in records if record.env_version == __version__}
 
 
 def find_baselines(
-    wanted: Sequence[ControlEntry], n: int, **options: Any
+    wanted: Sequence[ControlCase], n: int, **options: Any
 ) -> tuple[str, Results] | None:
     """Find the stored episodes of baselines, if each baseline has n of them.
 
     Returns None if a sample driven again no longer reproduces any stored cost of a baseline. The
-    sample is `_SAMPLE` episodes of each entry, of slow entries the first alone.
+    sample is `_SAMPLE` episodes of each case, of slow entries the first alone.
 
     Args:
-        wanted: Entries to look up.
+        wanted: Cases to look up.
         n: Number of episodes of each.
         options: Options of `measure`.
 
@@ -126,46 +121,42 @@ def find_baselines(
         Salt and episodes, or None.
     """
     records = read_baselines(FILE) if FILE.is_file() else {}
-    known = (records[entry] for entry in wanted if entry in records)
-    matches = [record for record in known if len(record.costs) >= n]
-    salts = {record.salt for record in matches}
-    if len(matches) < len(wanted) or len(salts) != 1:
+    matches = {case: records[case] for case in wanted if case in records}
+    salts = {record.salt for record in matches.values()}
+    if len(matches) < len(wanted) or any(len(x.costs) < n for x in matches.values()):
+        return None
+    if len(salts) != 1:
         return None
     (salt,) = salts
-    slow = [entry for entry in wanted if entry.slow]
-    sample = [entry for entry in wanted if entry not in slow[1:]]
+    slow = [case for case in wanted if case.is_slow]
+    sample = [case for case in wanted if case not in slow[1:]]
     again = measure(sample, make_task_seeds(salt, _SAMPLE), title="baselines, a sample", **options)
-    for entry, result in again.outcomes.items():
-        same = np.isclose(result.costs, records[entry].costs[:_SAMPLE], rtol=_SAME, atol=0.0)
+    for case, result in again.items():
+        same = np.isclose(result.costs, records[case].costs[:_SAMPLE], rtol=_SAME, atol=0.0)
         # On another processor one drive of `oracle-state` costs 0.3 % more. What changes the car or
         # a controller changes every drive.
         if result.error or not same.any():
             return None
-    return salt, Results({entry: records[entry].drives(n) for entry in wanted})
+    return salt, {case: record._make_drives(n) for case, record in matches.items()}
 
 
-def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
-    """Drive all baselines of the usual tasks, and write the file.
-
-    Args:
-        path: JSON file to write.
-        jobs: Processes, None for all processors.
-
-    Raises:
-        ValueError: An entry cannot drive.
-    """
+def _write_baselines(path: Path = FILE) -> None:
+    """Drive all baselines of the usual tasks, and write the file."""
     salt, lines = make_salt(), []
-    entries = make_baseline_entries(select_quick_tasks(list_scored_tasks()))
+    cases = make_baseline_cases(select_quick_tasks(list_scored_tasks()))
     seeds = make_task_seeds(salt, EPISODES)
-    for entry, result in measure(entries, seeds, jobs=jobs, console=Console()).outcomes.items():
+    for (task, entry), result in measure(cases, seeds, console=Console()).items():
         if result.error:
-            raise ValueError(f"{entry.task.name}, {entry.label}: {result.error}")
-        record = asdict(entry.task) | {"estimator": entry.estimator, "controller": entry.controller}
-        record |= {"salt": salt, "env_version": __version__, "costs": result.costs.tolist()}
-        record |= {"failures": result["failure"].astype(int).tolist()}
-        lines.append(json.dumps(record))
+            raise ValueError(f"{task.name}, {entry.label}: {result.error}")
+        record = task.record | {"estimator": entry.estimator, "controller": entry.agent}
+        numbers = {
+            "costs": result.costs.tolist(),
+            "failures": result["failure"].astype(int).tolist(),
+        }
+        version = {"salt": salt, "env_version": __version__}
+        lines.append(json.dumps(record | version | numbers))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 
 
 if __name__ == "__main__":
-    write_baselines()
+    _write_baselines()

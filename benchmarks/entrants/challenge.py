@@ -1,6 +1,6 @@
 """The request of an open benchmark: a user's entries, and the tasks in which they drive."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents import AGENTS
-from ...agents.baselines import get_tuned_options
 from ...agents.learned.policy import ZIP, is_policy, list_shipped, load_policy
 from ...agents.training.export import check_trusted
 from ...envs.scenarios.manoeuvres import make_scenario
@@ -22,11 +21,10 @@ from ..control.entries import (
     REFERENCE_FILTER,
     SETUPS,
     TRUTH,
-    ControlEntry,
+    Entry,
     select_quick_tasks,
 )
 from ..control.tasks import (
-    NOMINAL,
     STEERING,
     TIERS,
     YAW,
@@ -43,65 +41,20 @@ _IDS = tuple(
 _COMS, _CAR = "1", "2a"  # tiers, of which a scenario without one has car and reference
 
 
-@dataclass(frozen=True)
-class UserEntry:
-    """A user's agent and estimator.
+def make_user_entry(agent: object, estimator: object, trust: bool = False) -> Entry:
+    """Make the entry of a user's agent and estimator.
 
-    Attributes:
+    Args:
         agent: Name, file's class or path of `make_agent`, or an object or factory.
         estimator: The same of `make_estimator`, or a name in `SETUPS`, "" for none.
         trust: Whether a zip may be read.
+
+    Returns:
+        Entry.
     """
-
-    agent: object
-    estimator: object = REFERENCE_FILTER
-    trust: bool = False
-
-    @property
-    def label(self) -> str:
-        """Agent and estimator in words, as of a `ControlEntry`."""
-        return self.make_entry(ControlTask()).label
-
-    def make_entry(
-        self, task: ControlTask, options: Mapping[str, Any] | None = None
-    ) -> ControlEntry:
-        """Make the entry of a task.
-
-        Args:
-            task: Task that the contestant drives.
-            options: Options of the env beside the task's.
-
-        Returns:
-            Entry.
-        """
-        parts = {"controller": self.agent, "estimator": self.estimator}
-        objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
-        estimator, agent = _label(self.estimator), _label(self.agent)
-        best = None
-        if self.trust:
-            best = get_tuned_options(task.kind, NOMINAL) | {"controller": {"trust": True}}
-        return ControlEntry(task, estimator, agent, dict(options or {}), best, objects)
-
-    @property
-    def files(self) -> list[Path]:
-        """The user's files that it is made of."""
-        texts = [source for source in (self.agent, self.estimator) if isinstance(source, str)]
-        paths = [find_class(text)[0] if is_user_file(text) else Path(text) for text in texts]
-        return [path for path in paths if path.is_file()]
-
-    def check(self) -> None:
-        """Raise FileNotFoundError or ValueError for what is unknown, PermissionError for a zip."""
-        for source, known in ((self.agent, AGENTS), (self.estimator, ESTIMATORS)):
-            if not isinstance(source, str):
-                continue
-            if is_user_file(source):
-                find_class(source)
-            elif known is AGENTS and is_policy(source):
-                load_policy(source)
-            elif known is AGENTS and source.endswith(ZIP):
-                check_trusted(Path(source), self.trust)
-            elif source not in ("", TRUTH, *SETUPS) and ":" not in source:
-                known.load(source, list_shipped() if known is AGENTS else SETUPS)
+    parts = {"agent": agent, "estimator": estimator}
+    objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
+    return Entry(_label(agent), _label(estimator), objects=objects, trust=trust)
 
 
 def _label(source: object) -> str:
@@ -109,9 +62,25 @@ def _label(source: object) -> str:
     return source if isinstance(source, str) else str(kind.__qualname__)
 
 
+def _check_entry(entry: Entry) -> None:
+    """Raise FileNotFoundError or ValueError for what is unknown, PermissionError for a zip."""
+    for part, known in (("agent", AGENTS), ("estimator", ESTIMATORS)):
+        source: str = getattr(entry, part)
+        if part in entry.objects:
+            continue
+        if is_user_file(source):
+            find_class(source)
+        elif known is AGENTS and is_policy(source):
+            load_policy(source)
+        elif known is AGENTS and source.endswith(ZIP):
+            check_trusted(Path(source), entry.trust)
+        elif source not in ("", TRUTH, *SETUPS) and ":" not in source:
+            known.load(source, list_shipped() if known is AGENTS else SETUPS)
+
+
 def make_user_entries(
     agents: Sequence[str], estimators: Sequence[str], trust: bool = False
-) -> list[UserEntry]:
+) -> list[Entry]:
     """Make every agent on every or its usual estimator, and the reference controller on each.
 
     Args:
@@ -123,11 +92,11 @@ def make_user_entries(
         Entries without repetition.
     """
     entries = [
-        UserEntry(agent, estimator, trust and agent.endswith(ZIP))
+        Entry(agent, estimator, trust=trust and agent.endswith(ZIP))
         for agent in agents
         for estimator in estimators or [choose_estimator(agent)]
     ]
-    entries += [UserEntry(REFERENCE_CONTROLLER, estimator) for estimator in estimators if estimator]
+    entries += [Entry(REFERENCE_CONTROLLER, estimator) for estimator in estimators if estimator]
     return list(dict.fromkeys(entries))
 
 
@@ -168,7 +137,7 @@ class ComparisonRequest:
             beside other seeds; and what the makers above raise.
     """
 
-    entries: tuple[UserEntry, ...]
+    entries: tuple[Entry, ...]
     vehicle: Any = None
     scenarios: tuple[Any, ...] = ()
     env_id: str = ""
@@ -180,7 +149,7 @@ class ComparisonRequest:
 
     def __post_init__(self) -> None:
         for entry in self.entries:
-            entry.check()
+            _check_entry(entry)
         if self.env_id:
             check_choice("env", self.env_id, _IDS)
         if len(self.seeds or range(self.episodes)) < 2:
@@ -198,42 +167,52 @@ class ComparisonRequest:
     @property
     def files(self) -> list[Path]:
         """The user's files without repetition."""
-        return list(dict.fromkeys(path for entry in self.entries for path in entry.files))
+        texts = [
+            getattr(entry, part)
+            for entry in self.entries
+            for part in ("agent", "estimator")
+            if part not in entry.objects
+        ]
+        paths = [find_class(text)[0] if is_user_file(text) else Path(text) for text in texts]
+        return list(dict.fromkeys(path for path in paths if path.is_file()))
 
     @property
     def is_as_shipped(self) -> bool:
         """Whether all tasks are the package's own, on its seeds."""
-        return not (self.fresh or self.salt or self.seeds or any(self.tasks.values()))
+        is_changed = any(task.changes for task in self.tasks)
+        return not (self.fresh or self.salt or self.seeds or is_changed)
 
     @cached_property
-    def tasks(self) -> dict[ControlTask, dict[str, Any]]:
-        """The env's options beside its own by task, a vehicle and a scenario as data."""
+    def tasks(self) -> list[ControlTask]:
+        """Tasks whose changes are a vehicle and a scenario as data."""
         car = {} if self.vehicle is None else make_vehicle(self.vehicle).to_dict()
-        options = {"vehicle": car, "nominal": car} if car else {}
+        changes = {"vehicle": car, "nominal": car} if car else {}
         if not self.scenarios:
-            usual = select_quick_tasks(list_scored_tasks())
-            return dict.fromkeys(self._select_tasks(usual), options)
-        tasks: dict[ControlTask, dict[str, Any]] = {}
+            return self._select_tasks(select_quick_tasks(list_scored_tasks()), changes)
+        tasks: dict[ControlTask, ControlTask] = {}
         for source in self.scenarios:
-            scored = [task for task in list_scored_tasks() if task.scenario == source]
-            if scored:
-                tasks |= dict.fromkeys(self._select_tasks(scored), options)
-                continue
-            scenario = make_scenario(source)
-            data = options | {"scenario": scenario.to_dict()}
-            variants = [
-                ControlTask("", *variant, scenario.name)
-                for variant in TIERS[_CAR if car else _COMS]
-            ]
-            selected = self._select_tasks(variants)
-            if any(tasks.get(task, data) != data for task in selected):
-                name = scenario.name
-                raise ValueError(f"two scenarios are called {name!r}: give each a name of its own")
-            tasks |= dict.fromkeys(selected, data)
-        return tasks
+            variants = [task for task in list_scored_tasks() if task.scenario == source]
+            varied = changes
+            if not variants:
+                scenario = make_scenario(source)
+                cars = TIERS[_CAR if car else _COMS]
+                variants = [ControlTask("", *variant, scenario.name) for variant in cars]
+                varied = changes | {"scenario": scenario.to_dict()}
+            for task in self._select_tasks(variants, varied):
+                if tasks.setdefault(task, task).changes != varied:
+                    name = task.scenario
+                    raise ValueError(
+                        f"two scenarios are called {name!r}: give each a name of its own"
+                    )
+        return list(tasks)
 
-    def _select_tasks(self, tasks: Sequence[ControlTask]) -> list[ControlTask]:
+    def _select_tasks(
+        self, tasks: Sequence[ControlTask], changes: dict[str, Any]
+    ) -> list[ControlTask]:
         """Tasks of the id; one that no tier has takes the place of the id without steering."""
-        if self.env_id in ("", YAW, STEERING):
-            return [task for task in tasks if self.env_id in ("", task.env_id)]
-        return [replace(task, env_id=self.env_id) for task in tasks if task.env_id == YAW]
+        env_id = self.env_id
+        if env_id in ("", YAW, STEERING):
+            selected = [task for task in tasks if env_id in ("", task.env_id)]
+        else:
+            selected = [replace(task, env_id=env_id) for task in tasks if task.env_id == YAW]
+        return [replace(task, changes=changes) for task in selected]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...agents import make_agent
+from ...agents import Agent, make_agent
 from ...agents.env_info import EnvView
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
@@ -30,7 +30,7 @@ from ...envs.validation import parse_actions
 from ...estimators.make import make_estimator
 from ...estimators.protocol import EstimatorLike
 from ...estimators.registry import describe_error
-from ..control.entries import CheckedAgent
+from ..control.entries import check_agent
 
 _MEMORY = 4 * 2**30  # bytes of address space
 _WRITTEN = 2**26  # bytes of the longest file that it may write, in its scratch folder
@@ -53,7 +53,8 @@ class _EntryServer:
     """The agent, or the estimators of all rows, of one process."""
 
     def __init__(self) -> None:
-        self._agent: CheckedAgent
+        self._agent: Agent
+        self._shape: tuple[int, int]
         self._state: object = None
         self._estimators: dict[int, EstimatorLike] = {}
 
@@ -61,14 +62,14 @@ class _EntryServer:
         """Build the agent of a text that `make_agent` takes."""
         env: Any = view
         agent = make_agent(source, env, **options)
-        self._agent = CheckedAgent(agent, view.num_envs, view.facts.width)
+        self._shape = view.num_envs, view.facts.width
+        self._agent = check_agent(agent, *self._shape)
         return b""
 
     def predict(self, observation: Array, start: Array) -> bytes:
         """Return the actions of all rows, float32 (rows, width); the memory stays here."""
         action, self._state = self._agent.predict(observation, self._state, start)
-        rows, width = self._agent.shape
-        return parse_actions(action, rows, width, fail=True).tobytes()
+        return parse_actions(action, *self._shape, fail=True).tobytes()
 
     def estimator(self, row: int, source: str, arguments: Mapping[str, Any]) -> bytes:
         """Build the estimator of a row; return the names of its states as JSON."""

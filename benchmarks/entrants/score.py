@@ -10,29 +10,40 @@ import os
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from ...envs.numerics import require_extra
-from ..control.baseline_gaps import list_failures, make_score_scales
-from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
+from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
 from ..control.run import Chunk, Results, measure
-from ..control.score import Standing, make_rows, make_task_table, rank_entries
-from ..control.tasks import NOMINAL, ControlTask, make_salt, make_task_seeds, make_tuning_seeds
+from ..control.score import Standing, make_score_scales, rank_entries
+from ..control.tables import list_failures, make_task_table
+from ..control.tasks import NOMINAL, make_salt, make_task_seeds, make_tuning_seeds
 from ..harness.parallel import run_cases
-from ..harness.results import ResultTable, Suite
+from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..harness.verdict import format_percent
-from .baselines import find_baselines, make_baseline_entries
-from .challenge import EPISODES, ComparisonRequest, UserEntry, choose_estimator
-from .worker import LIMIT, run_isolated_chunk, run_rehearsal, run_user_chunk
+from .baselines import find_baselines, make_baseline_cases
+from .challenge import EPISODES, ComparisonRequest, choose_estimator, make_user_entry
+from .worker import LIMIT, IsolatedDrive, run_user_chunk
 
 if TYPE_CHECKING:
     import pandas as pd
 
+_TABLE = (
+    Column("label", "contestant"),
+    Column("cost_vs_nominal", "cost, % [95 %]", 100.0, ".0f"),
+    Column("share_won", "won, %", 100.0, ".0f", interval=False),
+    Column("failure_rate", "fails, %", 100.0, ".1f", interval=False),
+    Column("score", "score [95 %]", form=".2f"),
+    Column("n", "episodes"),
+)
+_NONE = Estimate(math.nan)
+_COLUMNS = {"score": "score", "cost": "cost_vs_nominal"}
+_COLUMNS |= {"won": "share_won", "failures": "failure_rate"}
 _REHEARSED = 2  # episodes of a task in which entries show what they open
 
 
@@ -59,24 +70,8 @@ class Comparison:
         Returns:
             Standings, the best first.
         """
-        scales = make_score_scales(self.results, self.tasks)
-        return rank_entries(self.results.outcomes, tier, scales)
-
-    @property
-    def tasks(self) -> list[ControlTask]:
-        """Tasks that were driven."""
-        return list(self.request.tasks)
-
-    def select(self, entry: UserEntry) -> Standing:
-        """Return an entry's standing over all tasks.
-
-        Args:
-            entry: Entry of the request.
-
-        Returns:
-            Standing.
-        """
-        return next(standing for standing in self.overall if standing.label == entry.label)
+        scales = make_score_scales(self.results, self.request.tasks)
+        return rank_entries(self.results, tier, scales)
 
 
 def compare(
@@ -100,15 +95,16 @@ def compare(
     shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
     controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
     filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
-    rivals = [
-        ControlEntry(entry.task, entry.estimator, entry.controller, tasks[entry.task])
-        for entry in make_baseline_entries(list(tasks), controllers, filters)
-    ]
-    user_entries = [
-        user.make_entry(task, options) for task, options in tasks.items() for user in entries
-    ]
-    isolated = [entry for entry in user_entries if not entry.objects]
-    objects = [entry for entry in user_entries if entry.objects]
+    rivals = make_baseline_cases(tasks, controllers, filters)
+    isolated, objects = (
+        [
+            ControlCase(task, entry)
+            for task in tasks
+            for entry in entries
+            if bool(entry.objects) == has_objects
+        ]
+        for has_objects in (False, True)
+    )
     known = find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
     allowed: frozenset[str] | None = None
     salt = known[0] if known else request.salt or make_salt()
@@ -118,23 +114,22 @@ def compare(
         salt = make_salt(*digests, secrets.token_hex(16))
     seeds = request.seeds or make_task_seeds(salt, request.episodes)
     results = known[1] if known else measure(rivals, seeds, title="baselines", **shared)
-    runner = partial(run_isolated_chunk, limit=request.limit, allowed=allowed)
-    remote = measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
-    in_process = measure(objects, seeds, jobs=1, runner=run_user_chunk)
-    all_results = Results(results.outcomes | remote.outcomes | in_process.outcomes)
-    return Comparison(request, "" if request.seeds else salt, bool(known), all_results)
+    runner = IsolatedDrive(request.limit, allowed)
+    results |= measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
+    results |= measure(objects, seeds, jobs=1, runner=run_user_chunk)
+    return Comparison(request, "" if request.seeds else salt, bool(known), results)
 
 
 def _find_opened_files(
     request: ComparisonRequest,
-    entries: Sequence[ControlEntry],
+    cases: Sequence[ControlCase],
     jobs: int | None,
     console: Console | None,
 ) -> frozenset[str]:
     """Find the files that entries open, theirs included, by a drive on tuning seeds."""
-    chunks = [Chunk(entry, tuple(make_tuning_seeds(_REHEARSED))) for entry in entries]
-    runner = partial(run_rehearsal, limit=request.limit)
-    opened = [files for _, files in run_cases(runner, chunks, "rehearsal", jobs, console)]
+    chunks = [Chunk(*case, tuple(make_tuning_seeds(_REHEARSED))) for case in cases]
+    rehearse = IsolatedDrive(request.limit).rehearse
+    opened = run_cases(rehearse, chunks, "rehearsal", jobs, console)
     return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))
 
 
@@ -150,8 +145,8 @@ def compose_verdict(comparison: Comparison) -> list[str]:
     Returns:
         Lines.
     """
-    labels = {entry.label for entry in comparison.request.entries}
-    placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.label in labels]
+    entries = comparison.request.entries
+    placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.entry in entries]
     count, more = len(comparison.overall), len(placed) - _MAX_SENTENCES
     lines = [f"Place {i} of {count}: {_make_sentence(x)}." for i, x in placed[:_MAX_SENTENCES]]
     if more > 0:
@@ -203,7 +198,7 @@ def _describe_trust(comparison: Comparison) -> str:
     """Sentence on what the numbers rest, and what they do not say."""
     request = comparison.request
     n = len(request.seeds or range(request.episodes))
-    count = len(comparison.tasks)
+    count = len(request.tasks)
     where = f"{count} contest{'s' if count > 1 else ''} x {n} episodes"
     if request.fresh:
         files = ", ".join(path.name for path in request.files)
@@ -230,27 +225,20 @@ def make_table(comparison: Comparison) -> ResultTable:
     Returns:
         Table.
     """
-    labels, cells = {entry.label for entry in comparison.request.entries}, []
+    lines: list[Line] = []
     for standing in comparison.overall:
-        numbers = [standing.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
-        cost, won, score = (Estimate(math.nan) if n is None else n for n in numbers)
         label = standing.label
-        baseline = f"{label} (lqr on {REFERENCE_FILTER})" if label == NOMINAL else label
-        failed = Estimate(standing.overall["failure_rate"].value)
-        texts = [_format_text(cost, 100.0, ".0f"), _format_text(Estimate(won.value), 100.0, ".0f")]
-        texts += [_format_text(failed, 100.0, ".1f"), _format_text(score, 1.0, ".2f")]
-        cells.append([f"> {label}" if label in labels else baseline, *texts, str(standing.n)])
-    header = ("contestant", "cost, % [95 %]", "won, %", "fails, %", "score [95 %]", "episodes")
+        if standing.entry in comparison.request.entries:
+            label = f"> {label}"
+        elif label == NOMINAL:
+            label = f"{label} (lqr on {REFERENCE_FILTER})"
+        lines.append({"label": label, "n": standing.n} | standing.overall)
     note = (
         "> yours. Cost in percent of nominal's, the paired geometric mean of the episodes that "
         "nominal and oracle-state survive. won: cheaper than nominal. score: 0 nominal, an LQG "
         "that knows the nominal car, 1 oracle-state, which knows state and car."
     )
-    return ResultTable("Your contestants and the package's", header, cells, note)
-
-
-def _format_text(number: Estimate, scale: float, digits: str) -> str:
-    return number.inline(scale, digits) if math.isfinite(number.value) else ""
+    return ResultTable("Your contestants and the package's", _TABLE, lines, note)
 
 
 @dataclass(frozen=True, repr=False)
@@ -290,11 +278,6 @@ class Score:
             import pandas as pd
 
         return pd.DataFrame(list(self.contests))
-
-
-_NONE = Estimate(math.nan)
-_COLUMNS = {"score": "score", "cost": "cost_vs_nominal"}
-_COLUMNS |= {"won": "share_won", "failures": "failure_rate"}
 
 
 def score(
@@ -339,12 +322,12 @@ def score(
     chosen = None if seeds is None else tuple(map(int, seeds))
     if estimator is None:
         estimator = choose_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
-    entry = UserEntry(agent, estimator, trust)
+    entry = make_user_entry(agent, estimator, trust)
     request = ComparisonRequest(
         (entry,), vehicle, scenario_list, env_id, episodes, chosen, fresh=fresh, limit=limit
     )
     comparison = compare(request, jobs)
-    standing = comparison.select(entry)
+    standing = next(item for item in comparison.overall if item.entry == entry)
     rows = []
     for task, result in standing.results.items():
         numbers = standing.by_task.get(task, {})
@@ -355,9 +338,9 @@ def score(
         pairs = standing.pairs.get(task)
         rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
-    errors, driven = [row["error"] for row in rows], standing.entry
+    errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
     n, contests, error = standing.n, tuple(rows), errors[0] if all(errors) else ""
-    names, text = (driven.controller, driven.estimator), _make_sentence(standing)
+    text = _make_sentence(standing)
     return Score(*names, total, cost, won, failures, n, contests, error, text)
 
 
@@ -386,12 +369,12 @@ def run(
     suite.verdict = "\n".join(compose_verdict(comparison))
     suite.tables += [make_table(comparison)]
     title = "Contest by contest"
-    suite.tables += [make_task_table(title, comparison.overall, comparison.tasks)]
+    suite.tables += [make_task_table(title, comparison.overall, request.tasks)]
     lines = [line[1:] for line in list_failures(comparison.results)]
     if lines:
         header = ("contest", "contestant", "what happened")
         suite.tables.append(ResultTable("Cells that went wrong", header, lines, keyed=False))
-    for tier in dict.fromkeys(task.tier for task in comparison.tasks):
+    for tier in dict.fromkeys(task.tier for task in request.tasks):
         for standing in comparison.standings(tier):
-            suite.rows += make_rows(standing, comparison.salt)
+            standing.add_rows(suite, comparison.salt)
     return suite

@@ -14,9 +14,9 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
@@ -32,7 +32,7 @@ from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...estimators.registry import is_user_file
 from ...estimators.vector.batch import ForeignBatch
-from ...estimators.wrappers.outputs import write_outputs
+from ...estimators.wrappers.outputs import StepRecord
 from ..control.run import NUMBERS, Chunk, DriveResult, run_chunk
 from .child import DONE, ChildSettings
 
@@ -46,11 +46,9 @@ class _ContestantError(Exception):
 
 
 class _ChildProcess:
-    """The process of texts that make an entry; `limit`: wall time (s) that all answers may take."""
+    """The process of texts that make an entry, whose answers together may take a drive's limit."""
 
-    def __init__(
-        self, texts: Sequence[str], limit: float, allowed: Iterable[str] | None = None
-    ) -> None:
+    def __init__(self, texts: Sequence[str], drive: "IsolatedDrive") -> None:
         self._texts, self.reason = texts, ""
         self._folder = TemporaryDirectory(prefix="sideslip-")
         self._log = TemporaryFile()  # noqa: SIM115  # closed with the process
@@ -79,10 +77,10 @@ class _ChildProcess:
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # of a message that stops halfway
             with socket.socket(fileno=os.dup(self._pipe.fileno())) as end:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))
-        start = ChildSettings(scratch, None if allowed is None else frozenset(allowed))
+        start = ChildSettings(scratch, drive.allowed)
         self._left, self._limit = _GRACE, _GRACE
         self._started = float(json.loads(self.call(start)))
-        self._left = self._limit = limit
+        self._left = self._limit = drive.limit
 
     def call(self, *message: object, length: int | None = None) -> bytes:
         """Ask for a method of `_EntryServer` by name; the answer's bytes, of a known length.
@@ -205,19 +203,14 @@ class _RemoteEstimators:
 class _RemoteBatch(ForeignBatch):
     """The estimators of a child, all rows in one message."""
 
-    def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
-        """Process some rows, as `BatchEstimator.take`."""
-        fast, rows, packets, counts, obs, inner, plan, limits, *others = arguments
-        chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
-        remote: list[Any] = [self[i].inner for i in chosen.tolist()]  # type: ignore[union-attr]
+    def _step_rows(self, rows: Sequence[int], record: StepRecord) -> Iterator[int]:
+        remote: list[Any] = [self[i].inner for i in rows]  # type: ignore[union-attr]
         records = [
-            (item.row, fast[i, : rows[i]], packets[i, : counts[i]])
-            for i, item in zip(chosen.tolist(), remote, strict=True)
+            (item.row, record.fast[i, : record.rows[i]], record.packets[i, : record.count[i]])
+            for i, item in zip(rows, remote, strict=True)
         ]
         _RemoteRow.take(remote, records)
-        for i in chosen.tolist():
-            beta, gamma, out, summary = (item[i] for item in others)
-            write_outputs(self[i], obs[i], inner, plan, limits, beta, gamma, out, summary)
+        yield from rows
 
 
 class _RemoteRow:
@@ -274,52 +267,49 @@ def run_user_chunk(chunk: Chunk) -> DriveResult:
     return _make_failed_result(chunk, wrong) if failed else result
 
 
-def run_isolated_chunk(
-    chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | None = None
-) -> DriveResult:
-    """Run a chunk as `run_user_chunk`, but agent and estimator of a user in a child of their own.
+@dataclass(frozen=True)
+class IsolatedDrive:
+    """`run_user_chunk`, but agent and estimator of a user in a child of their own.
 
-    Args:
-        chunk: Chunk whose entry has names and files.
+    Attributes:
         limit: Wall time (s).
         allowed: Files that a child may open, of `ChildSettings`.
-
-    Returns:
-        Episodes.
     """
-    return _run_isolated_chunk(chunk, limit, allowed)[0]
+
+    limit: float = LIMIT
+    allowed: frozenset[str] | None = None
+
+    def __call__(self, chunk: Chunk) -> DriveResult:
+        """Run a chunk whose entry has names and files."""
+        return _run_isolated_chunk(self, chunk)[0]
+
+    def rehearse(self, chunk: Chunk) -> set[str]:
+        """Run a chunk.
+
+        Args:
+            chunk: Chunk whose entry has names and files.
+
+        Returns:
+            Files that its contestants open.
+        """
+        return _run_isolated_chunk(self, chunk)[1]
 
 
-def run_rehearsal(chunk: Chunk, limit: float = LIMIT) -> tuple[DriveResult, set[str]]:
-    """Drive a chunk as `run_isolated_chunk`, and note the files that its contestants open.
-
-    Args:
-        chunk: Chunk whose entry has names and files.
-        limit: Wall time (s).
-
-    Returns:
-        Episodes, and the files.
-    """
-    return _run_isolated_chunk(chunk, limit, None)
-
-
-def _run_isolated_chunk(
-    chunk: Chunk, limit: float, allowed: Iterable[str] | None
-) -> tuple[DriveResult, set[str]]:
+def _run_isolated_chunk(drive: IsolatedDrive, chunk: Chunk) -> tuple[DriveResult, set[str]]:
     """Episodes of a chunk, and the files that its children opened."""
     entry, children, opened = chunk.entry, list[_ChildProcess](), set[str]()
     objects = dict(entry.objects)
     try:
-        for part in ("controller", "estimator"):
-            source = getattr(entry, part)
+        for part in ("agent", "estimator"):
+            source: object = getattr(entry, part)
             if part in objects or not _is_foreign(source):
                 continue
-            child = _ChildProcess((entry.controller, entry.estimator), limit, allowed)
+            child = _ChildProcess((entry.agent, entry.estimator), drive)
             children.append(child)
-            trust = bool(entry.best["controller"].get("trust"))
-            is_agent = part == "controller"
             objects[part] = (
-                _RemoteAgent(child, source, trust) if is_agent else _RemoteEstimators(child, source)
+                _RemoteAgent(child, source, entry.trust)
+                if part == "agent"
+                else _RemoteEstimators(child, source)
             )
         result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
         for child in children:

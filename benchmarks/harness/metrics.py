@@ -176,9 +176,7 @@ def _write(params: Matrix, states: Matrix, switches: Matrix, out: Vector) -> Non
         car = apply_tyre_change(read(p, P.car), change, z[Z.clock.tick] >= change.tick)
         _, g_y = compute_gravity(motion, read(p, P.road), kind.small_angle)
         load = compute_static_load(drive, car, kind)
-        F_yf, F_yr, _, _ = compute_tyre_forces(
-            motion, load, car, g_y, kind.small_angle, kind.law, kind.roll
-        )
+        F_yf, F_yr, _, _ = compute_tyre_forces(motion, load, car, g_y, kind)
         sin_d, cos_d = sincos(drive.delta_f)
         front = (motion.v_y + car.l_f * motion.gamma) * cos_d - motion.v_x * sin_d
         out[i] = -F_yf * front - F_yr * (motion.v_y - car.l_r * motion.gamma)

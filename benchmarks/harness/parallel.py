@@ -73,19 +73,10 @@ def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
         ray.shutdown()
 
 
-def execute_cases(
+def _execute_cases(
     function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """Execute cases in processes or on the cluster, and yield each one's index and result.
-
-    Args:
-        function: Function of a case, importable by workers.
-        cases: Arguments of the function, one for each call.
-        jobs: Number of processes, None for one a processor at most; a cluster has its own.
-
-    Yields:
-        Index and result of a case: processes in order of the cases, a cluster in order of ends.
-    """
+    """Execute cases and yield index and result; a cluster does in the order of their ends."""
     ray = _CLUSTER.get()
     if ray is None:
         # the number asked for is left alone: another one would end the processes of the last call
@@ -232,7 +223,7 @@ def run_cases(
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases), unit="cases")
-        for place, result in execute_cases(function, cases, jobs):
+        for place, result in _execute_cases(function, cases, jobs):
             results[place] = result
             bar.advance(task)
     return [results[place] for place in range(len(cases))]

@@ -1,14 +1,17 @@
-"""Results of suites: rows for machines, tables and maps for people, and the files of rows."""
+"""Results of suites: rows for machines, tables of numbers and maps, and the files of rows."""
 
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ... import __version__
 from ...envs.io import atomic_file, from_json, write_atomic
 from ...envs.record import Array
 from ...envs.validation import check_choice
@@ -67,27 +70,84 @@ class ResultRow:
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
+_COLUMNS = {item.name for item in fields(ResultRow)} - {"suite", "metric", "value", "low", "high"}
+
+
+Cell = Any
+"""A text, a number, an `Estimate`, several numbers of one template, or nothing (NaN too)."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table, and how `report` formats its numbers."""
+
+    key: str  # key of the column's cells in a record
+    heading: str = ""  # quantity and unit, "" for the key
+    scale: float = 1.0  # factor of the numbers
+    form: str = "g"  # format of each number, or template of several: "{:.3g} ({:.3g})"
+    interval: bool = True  # whether intervals are shown
+
+
+Line = Mapping[str, Cell]
+"""Cells of a line by key, of which metrics become rows."""
+
+
 @dataclass
 class ResultTable:
-    """A table for the screen and the report."""
+    """A table for the screen, the report and pandas."""
 
     title: str
-    header: Sequence[str]  # headings of the columns
-    cells: Sequence[Sequence[str]]
+    columns: Sequence[object]  # each a `Column`, or the heading of one of texts
+    cells: Sequence[Any]  # lines: cells by the columns' keys, or in the columns' order
     note: str = ""  # meaning of the columns
     keyed: bool = True  # the first column names estimators or controllers, shown in colour
     detail: bool = False  # it stands in the report alone, too long for a screen
 
+    def split(self) -> list[tuple[Column, list[Cell]]]:
+        """Split the table into columns.
+
+        Returns:
+            Each column with its cells.
+
+        Raises:
+            ValueError: A line is not as long as the columns.
+        """
+        columns = [x if isinstance(x, Column) else Column(str(x)) for x in self.columns]
+        lines = list[Sequence[Cell]]()
+        for line in self.cells:
+            if isinstance(line, Mapping):
+                lines.append([line.get(column.key) for column in columns])
+            elif len(line) == len(columns):
+                lines.append(line)
+            else:
+                text = f"{len(line)} cells under {len(columns)} headers: {line}"
+                raise ValueError(f"table {self.title!r}: {text}")
+        return [(column, [line[i] for line in lines]) for i, column in enumerate(columns)]
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """Headings of the columns."""
+        return tuple(column.heading or column.key for column, _ in self.split())
+
     def to_pandas(self) -> "DataFrame":
-        """Convert the texts to a pandas table (needs the extra `report`)."""
+        """Convert the table to pandas, in the headings' units (needs the extra `report`)."""
         from pandas import DataFrame
 
-        return DataFrame(self.cells, columns=list(self.header))
+        scaled = [
+            [_rescale(cell, column.scale) for cell in cells] for column, cells in self.split()
+        ]
+        return DataFrame(list(zip(*scaled, strict=True)), columns=self.header)
 
     def _repr_html_(self) -> str:
         """Format the table for a notebook."""
         table = self.to_pandas().to_html(index=False, border=0)
         return f"<b>{escape(self.title)}</b>{table}<p>{escape(self.note)}</p>"
+
+
+def _rescale(cell: Cell, scale: float) -> Cell:
+    if cell is None or isinstance(cell, str):
+        return cell
+    return cell.rescale(scale) if isinstance(cell, Estimate) else scale * np.asarray(cell)
 
 
 @dataclass(frozen=True)
@@ -127,6 +187,28 @@ class Suite:
         """Warnings and verdict, line by line."""
         ended = (text if text.endswith("?") else f"{text}." for text in self.warnings)
         return [*(f"WARNING: {text}" for text in ended), *self.verdict.splitlines()]
+
+    def add_rows(self, records: Iterable[Line], env_id: str = "", **common: str | int) -> None:
+        """Add a row of each metric of records, on fixed seeds unless `salt` says otherwise.
+
+        A number that is not finite has no row; keys that are no metrics and no columns of
+        `ResultRow` are for tables alone.
+
+        Args:
+            records: Columns of rows, and numbers by metric.
+            env_id: Id of the env, "" where rows have the package's version alone.
+            **common: Columns that all rows share.
+        """
+        shared = {"salt": "fixed", "env_version": f"{env_id} {__version__}".lstrip()} | common
+        for record in records:
+            columns: dict[str, Any] = shared | {k: v for k, v in record.items() if k in _COLUMNS}
+            for metric, cell in record.items():
+                if metric not in METRICS or cell is None or isinstance(cell, str):
+                    continue
+                number = Estimate(*cell) if isinstance(cell, tuple) else Estimate(float(cell))
+                if math.isfinite(number.value):
+                    row = ResultRow.from_estimate(metric, number, suite=self.name, **columns)
+                    self.rows.append(row)
 
     def to_pandas(self) -> "DataFrame":
         """Convert the rows to a pandas table (needs the extra `report`)."""

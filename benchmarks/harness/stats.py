@@ -7,7 +7,7 @@ for rare failures that did not occur: failures are counted, and `share` bounds t
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from ...envs.record import Array
 
 _LEVEL = 0.95  # of the intervals
 _TAIL = 0.5 * (1.0 - _LEVEL)  # probability beyond each bound
+_BLOCK = 512  # rows of a jackknife at once
 _MIN_SEEDS = 4  # with fewer an interval spans orders of magnitude
 _WORST = 0.05  # fraction of the episodes whose mean `compute_tail_mean` takes
 _MIN_TAIL = 25  # episodes in the tail; with fewer an interval covers too rarely
@@ -40,6 +41,17 @@ class Estimate(NamedTuple):
         """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
+
+    def rescale(self, factor: float) -> "Estimate":
+        """Multiply number and interval.
+
+        Args:
+            factor: Factor.
+
+        Returns:
+            Product.
+        """
+        return Estimate(factor * self.value, factor * self.low, factor * self.high)
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
         """Format the number and, in brackets, its interval if there is one.
@@ -68,19 +80,6 @@ def root_mean(squares: Array, axis: int = -1) -> Array:
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
 
-def mean(values: Array, axis: int = -1) -> Array:
-    """Compute the mean over the seeds, a statistic of `interval`.
-
-    Args:
-        values: Numbers.
-        axis: Axis of the seeds.
-
-    Returns:
-        Means.
-    """
-    return np.asarray(np.mean(values, axis=axis))
-
-
 def margin_of_error(*strata: Array) -> float:
     """Compute half of the 95 % interval of the sum of independent means, by Student's t.
 
@@ -107,13 +106,13 @@ def margin_of_error(*strata: Array) -> float:
         uncertainty += (square / (n - 1.0)) ** 2 / freedom
     if uncertainty == 0.0:
         return 0.0
-    from scipy.stats import t as student  # half a second, which a command's help need not take
+    from scipy.special import stdtrit  # which a command's help need not load
 
-    return float(student.isf(_TAIL, variance**2 / uncertainty)) * math.sqrt(variance)
+    return float(-stdtrit(variance**2 / uncertainty, _TAIL)) * math.sqrt(variance)
 
 
 def interval(
-    values: Array, statistic: Callable[..., Array] = mean, paired: Array | None = None
+    values: Array, statistic: Callable[..., Any] = np.mean, paired: Array | None = None
 ) -> Estimate:
     """Compute a statistic over seeds with its 95 % interval, by the jackknife.
 
@@ -131,15 +130,24 @@ def interval(
     estimate, n = float(statistic(*data, axis=-1)), len(values)
     if n < _MIN_SEEDS:
         return Estimate(estimate)
+    blocks = np.array_split(np.arange(n), -(-n // _BLOCK))
     with np.errstate(divide="ignore"):
-        rest = [statistic(*(np.delete(column, i) for column in data), axis=-1) for i in range(n)]
+        parts = [statistic(*(_make_subsets(x, block) for x in data), axis=-1) for block in blocks]
+    rest = np.concatenate(parts)
     if not np.isfinite(rest).all():
         return Estimate(estimate)
-    if min(map(np.min, data)) >= 0.0 and min(rest) > 0.0:
+    if min(map(np.min, data)) >= 0.0 and rest.min() > 0.0:
         reach = math.exp(margin_of_error((n - 1.0) * np.log(rest)))
         return Estimate(estimate, estimate / reach, estimate * reach)
-    reach = margin_of_error((n - 1.0) * np.array(rest))
+    reach = margin_of_error((n - 1.0) * rest)
     return Estimate(estimate, estimate - reach, estimate + reach)
+
+
+def _make_subsets(values: Array, block: npt.NDArray[np.intp]) -> Array:
+    """Copy the numbers (n,) without that of each index of a block, shape (block, n - 1)."""
+    others = block[:, None] != np.arange(len(values))
+    rest: Array = np.broadcast_to(values, others.shape)[others].reshape(len(block), -1)
+    return rest
 
 
 def mean_share(values: Array) -> Estimate:
@@ -161,32 +169,19 @@ def _odds(values: Array, axis: int = -1) -> Array:
     return ratio_of_means(values, 1.0 - values, axis)
 
 
-def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the RMSE over that of a reference on the same seeds, from squared errors.
+def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:
+    """Make a statistic over that of a reference on the same seeds, (values, reference, axis)."""
 
-    Args:
-        squares: Squared errors.
-        reference: Those of the reference.
-        axis: Axis of the seeds.
+    def ratio(values: Array, reference: Array, axis: int = -1) -> Array:
+        return np.asarray(statistic(values, axis=axis) / statistic(reference, axis=axis))
 
-    Returns:
-        Ratios.
-    """
-    return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
+    return ratio
 
 
-def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the mean over that of a reference on the same seeds.
-
-    Args:
-        values: Numbers.
-        reference: Those of the reference.
-        axis: Axis of the seeds.
-
-    Returns:
-        Ratios.
-    """
-    return np.asarray(mean(values, axis) / mean(reference, axis))
+ratio_of_means = _make_ratio(np.mean)
+"""Mean over that of a reference."""
+ratio_of_roots = _make_ratio(root_mean)
+"""RMSE over that of a reference, from squared errors."""
 
 
 def average(*strata: Array) -> Estimate:
@@ -227,9 +222,9 @@ def share(hits: npt.ArrayLike) -> Estimate:
     Returns:
         Mean and interval; NaN without hits.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
-    values, z = np.asarray(hits, np.float64), float(norm.isf(_TAIL))
+    values, z = np.asarray(hits, np.float64), float(-ndtri(_TAIL))
     n = len(values)
     value = float(np.mean(values)) if n else math.nan
     if math.isnan(value):
@@ -250,22 +245,6 @@ def compute_win_rate(costs: Array, others: Array) -> Estimate:
         Fraction and interval.
     """
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
-
-
-def compute_profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """Compute the fraction of numbers that are at most each level, with Wilson's interval.
-
-    Source: performance profiles of Dolan and Moré 2002. NaN counts as above.
-
-    Args:
-        values: Numbers, shape (n,).
-        levels: Levels, shape (k,).
-
-    Returns:
-        Value, lower and upper bound, shape (k,) each.
-    """
-    value, low, high = np.array([share(values <= level) for level in levels]).T
-    return value, low, high
 
 
 def compute_tail_mean(costs: Array) -> Estimate:
@@ -327,9 +306,9 @@ def compute_p_value(logs: Array) -> float:
     middle = float(np.mean(logs)) if len(logs) else math.nan
     if not spread > 0.0:
         return 1.0
-    from scipy.stats import t as student
+    from scipy.special import stdtr
 
-    return float(student.cdf(middle * math.sqrt(len(logs)) / spread, len(logs) - 1))
+    return float(stdtr(len(logs) - 1, middle * math.sqrt(len(logs)) / spread))
 
 
 def holm(chances: Sequence[float]) -> list[bool]:

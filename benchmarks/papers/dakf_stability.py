@@ -2,22 +2,8 @@
 
 from functools import partial
 
-from .ledger import (
-    Analysis,
-    Bound,
-    ClaimPart,
-    PaperFilter,
-    make_claim_factory,
-    make_number_part,
-    make_smaller_part,
-)
-from .manoeuvres import (
-    EstimationSimulation,
-    FollowingSimulation,
-    PaperFigure,
-    make_course,
-    make_curves,
-)
+from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
+from .manoeuvres import Curves, EstimationSimulation, FollowingSimulation, PaperFigure
 from .theory import compute_coms_ranks
 
 PAPER = "dakf-stability"
@@ -55,55 +41,52 @@ def _make_tracking_parts(
 ) -> tuple[ClaimPart, ...]:
     slip, rate = "sideslip error, with / without", "yaw rate error, with / without"
     return (
-        make_smaller_part(slip, scenario, WITH, WITHOUT, beta, "rms_beta"),
-        make_smaller_part(rate, scenario, WITH, WITHOUT, gamma, "rms_gamma"),
+        compare(slip, scenario, WITH, WITHOUT, beta, "rms_beta"),
+        compare(rate, scenario, WITH, WITHOUT, gamma, "rms_gamma"),
     )
 
 
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
-        make_smaller_part("DAKF / KF", FIG6, DAKF, KF, 0.75),
-        make_smaller_part("KF / LOB", FIG6, KF, LOB, 0.80),
-        make_smaller_part("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
-        make_smaller_part("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
+        compare("DAKF / KF", FIG6, DAKF, KF, 0.75),
+        compare("KF / LOB", FIG6, KF, LOB, 0.80),
+        compare("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
+        compare("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
     claim("Fig. 6", "the DAKF is better during the outage too",
         *(
-            make_smaller_part(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_,
-                metric="outage")
+            compare(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, quantity="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
             for rival, filter_ in (("KF", KF), ("LOB", LOB))
         )),
     claim("Sec. IV.D", "slip and disturbances are observable",
-        make_number_part("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
+        ClaimPart("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
             Bound("=", 4.0), "rank"),
-        make_number_part("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
+        ClaimPart("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
             "last", None, Bound(">=", 0.05), "drift"),
-        make_number_part("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01),
-            "drift"),
+        ClaimPart("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift"),
         note="A constant slip is the same to the sensors as a heading the other way with constant "
         "d1 and d2."),
     claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
         *_make_tracking_parts(FIG7, 0.80, 0.50),
-        make_smaller_part("peak of the slip, with / without", FIG7, WITH, WITHOUT,
-            metric="peak_beta"),
-        make_number_part("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
+        compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_beta"),
+        ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
             metric="share"),
-        make_number_part("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
+        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
     claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
         *(
-            make_smaller_part(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
-                metric=metric)
+            compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
+                quantity=metric)
             for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
         ),
         note="The feedback's integrals already take away what is constant."),
     claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
-        make_smaller_part("DAKF / KF", FIG8, DAKF, KF),
-        make_smaller_part("KF / LOB", FIG8, KF, LOB),
-        make_smaller_part("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
-        make_smaller_part("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
+        compare("DAKF / KF", FIG8, DAKF, KF),
+        compare("KF / LOB", FIG8, KF, LOB),
+        compare("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, quantity="outage"),
+        compare("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, quantity="outage"),
         note="At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its "
         "sign, there is little slip to see, and no course while it is there."),
     claim("Fig. 9 (twin)", "with control the car tracks on the road too",
@@ -119,29 +102,29 @@ FIGURES = (
             (FIG6, "Fig. 6", "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s."),
             (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."))
         for panel, draw in (
-            ("(a): sideslip angle", make_curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
-            ("(b): course angle", make_course("truth", KF, DAKF)))
+            ("(a): sideslip angle", Curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
+            ("(b): course angle", Curves("course", "course angle / rad", ("truth", KF, DAKF))))
     ),
-    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, make_curves("beta", _SLIP),
+    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, Curves("beta", _SLIP),
         "Straight on at 25 km/h: the direction that the DAKF cannot see fills up."),
     *(
         figure(f"Fig. 7 {panel}", FIG7, draw, caption)
         for panel, draw, caption in (
             ("(a): sideslip angle",
-                make_curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
+                Curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
-            ("(b): yaw rate", make_curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
+            ("(b): yaw rate", Curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
             ("(c): front steering angle",
-                make_curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
+                Curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
                 "Behind the EPS motor's lag of 30 ms."),
             ("(d): yaw moment",
-                make_curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
+                Curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
                 "What the motors deliver."))
     ),
     *(
         figure(f"Fig. 9 (twin) ({panel}): {text}: {agent}", FIG9,
-            make_curves(signal, label, ("reference", agent)),
+            Curves(signal, label, ("reference", agent)),
             "Cornering by wire at 20 km/h, with everything that the plant has.")
         for panel, agent, text, signal, label in (("a", WITHOUT, "sideslip angle", "beta", _SLIP),
             ("b", WITHOUT, "yaw rate", "gamma", _RATE),

@@ -3,15 +3,8 @@
 from functools import partial
 
 from ...estimators.filters import FILTERS
-from .ledger import (
-    Bound,
-    ClaimPart,
-    PaperFilter,
-    make_claim_factory,
-    make_smaller_part,
-    select_ratio,
-)
-from .manoeuvres import EstimationSimulation, PaperFigure, make_curves
+from .ledger import Bound, Claim, ClaimPart, PaperFilter, compare
+from .manoeuvres import Curves, EstimationSimulation, PaperFigure
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"
@@ -23,7 +16,7 @@ ROLL, KINEMATIC = "roll-kf", "kinematic-velocity-kf"
 DESIGNED = "kinematic-velocity-kf, Q of its sensors"
 FIXED = ", R of HDOP 1"
 _ENV = "sideslip/YawGps-v0"
-_HDOP = {"hdop_table": FILTERS["double-layer"].hdop}
+_HDOP = {"hdop_table": FILTERS["double-layer"].hdop_table}
 # a tuning of its own, found as those of estimators/design/tunings.toml, seeds 1000 to 1011 of FIG9
 _Q = {"q_beta": 1.1e-4, "q_gamma": 2.4e-6, "q_psi": 2.3e-5, "q_d1": 0.089, "q_d2": 0.46}
 _PREDICTED = {"intersample": "predict", **_Q}
@@ -59,45 +52,43 @@ SIMULATIONS = (
 )
 # fmt: on
 
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # Formatted by hand: each claim is a paragraph, each part a line.
 # fmt: off
 CLAIMS = (
     claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
         *(
-            make_smaller_part(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
+            compare(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
             for scenario, text in _SLALOMS
             for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
                 ("double layer", PROPOSED, 0.95))
         ),
-        *(make_smaller_part(f"three-state / two-state, {text}", name, THREE, LOB) for name,
+        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name,
           text in _SLALOMS),
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
     claim("Fig. 9 (b)", "the smallest error between courses",
         *(
-            make_smaller_part(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
+            compare(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
             for name, text in _SLALOMS
         ),
         *(
-            make_smaller_part(f"jump at a course, double layer / three-state, {text}", name,
-                PROPOSED, THREE, metric="jump")
+            compare(f"jump at a course, double layer / three-state, {text}", name,
+                PROPOSED, THREE, quantity="jump")
             for name, text in _SLALOMS
         ),
         note="The error over all milliseconds is that between courses: there are 200 to a course."),
     claim("Fig. 9 (c)", "the yaw angle at 1 kHz from courses at 5 Hz",
-        make_smaller_part("double layer / three-state", FIG9, PROPOSED, THREE, metric="psi")),
+        compare("double layer / three-state", FIG9, PROPOSED, THREE, quantity="psi")),
     claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
-        make_smaller_part("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
-        make_smaller_part("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, metric="phi"),
+        compare("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
+        compare("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, quantity="phi"),
         note="30 % on inertia, damping and stiffness cancel except in the input gain."),
     claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
-        make_smaller_part("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30,
-            "v_y"),
-        make_smaller_part("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED,
-            metric="v_x"),
+        compare("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
+        compare("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, quantity="v_x"),
         *(
-            make_smaller_part(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
+            compare(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, quantity=state)
             for state in ("v_y", "v_x")
         ),
         note="The kinematic KF with the process noise of its accelerometers, and with one tuned "
@@ -105,7 +96,7 @@ CLAIMS = (
         "layer the GPS's speed at 5 Hz."),
     claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
         *(
-            make_smaller_part(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
+            compare(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
             for label, filter_, limited in (("disturbance KF", WALKS, True),
                 ("double layer", PROPOSED, False))
             for name, _, _, max_ratio in _SKIES
@@ -116,14 +107,12 @@ CLAIMS = (
         "corrects between courses, gains nothing. On three real receivers the spread hardly "
         "follows HDOP (docs/PAPERS.md)."),
     claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
-        ClaimPart("slip, double layer / best rival", ROAD,
-            select_ratio(ROAD, PROPOSED, THREE, LOB), Bound("<", 1.0)),
-        make_smaller_part("slip, three-state / two-state", ROAD, THREE, LOB),
-        make_smaller_part("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
-        make_smaller_part("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
-            metric="v_y"),
-        make_smaller_part("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
-            metric="v_x")),
+        ClaimPart("slip, double layer / best rival", ROAD, PROPOSED, stated=Bound("<", 1.0),
+            rivals=(THREE, LOB)),
+        compare("slip, three-state / two-state", ROAD, THREE, LOB),
+        compare("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, quantity="phi"),
+        compare("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_y"),
+        compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")),
 )
 
 _SLIP, _SLIPS = "sideslip angle / rad", ("truth", LOB, THREE, PROPOSED)
@@ -132,18 +121,18 @@ FIGURES = tuple(
     figure(f"Fig. 9 ({panel}){twin}: {text}", name, draw, caption)
     for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
     for panel, text, draw, caption in (
-        ("a", "sideslip angle", make_curves("beta", _SLIP, _SLIPS),
+        ("a", "sideslip angle", Curves("beta", _SLIP, _SLIPS),
             "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
-        ("b", "sideslip angle between courses", make_curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
+        ("b", "sideslip angle between courses", Curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
             "One second: five courses."),
-        ("c", "yaw angle", make_curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
+        ("c", "yaw angle", Curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
             "At 1 kHz from 5 Hz."),
-        ("d", "roll angle", make_curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
+        ("d", "roll angle", Curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
             "The roll model is 30 % off."),
         ("e", "longitudinal velocity",
-            make_curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
+            Curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
             "The front wheels are the kinematic filter's reference."),
         ("f", "lateral velocity",
-            make_curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
+            Curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
             "Roll puts gravity into the accelerometer."))
 )

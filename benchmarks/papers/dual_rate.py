@@ -2,13 +2,8 @@
 
 from functools import partial
 
-from .ledger import (
-    ClaimPart,
-    PaperFilter,
-    make_claim_factory,
-    make_smaller_part,
-)
-from .manoeuvres import EstimationSimulation, PaperFigure, make_course, make_curves
+from .ledger import Claim, ClaimPart, PaperFilter, compare
+from .manoeuvres import Curves, EstimationSimulation, PaperFigure
 from .theory import PAPER
 
 FIG4, FIG5 = "dual-rate-fig4", "dual-rate-fig5"
@@ -44,13 +39,13 @@ SIMULATIONS = (
 
 def _make_order_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart, ...]:
     return (
-        make_smaller_part("pseudo / conventional", scenario, PSEUDO, CONVENTIONAL, max_ratio),
-        make_smaller_part("pseudo / holding", scenario, PSEUDO, HOLDING),
-        make_smaller_part("holding / conventional", scenario, HOLDING, CONVENTIONAL),
+        compare("pseudo / conventional", scenario, PSEUDO, CONVENTIONAL, max_ratio),
+        compare("pseudo / holding", scenario, PSEUDO, HOLDING),
+        compare("holding / conventional", scenario, HOLDING, CONVENTIONAL),
     )
 
 
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
@@ -61,12 +56,12 @@ CLAIMS = (
         "measurement (31) to rounding."),
     claim("Sec. 4.1",
         "slip can be estimated from the GPS's course alone, robustly by disturbance accommodation",
-        make_smaller_part("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
-        make_smaller_part("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
+        compare("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
+        compare("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
         note="At 25 km/h the course alone hardly tells slip from heading: an estimate of zero is "
         "about as good."),
     claim("Fig. 4 (c)", "the pseudo measurement is smoother",
-        make_smaller_part("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL,
+        compare("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL,
             0.15, "jump")),
     claim("Fig. 5 (twin)", "the pseudo measurement is the most accurate on the road",
         *_make_order_parts(FIG5, None)),
@@ -79,7 +74,7 @@ FIGURES = tuple(
     for name, number, caption in (
         (FIG4, "Fig. 4", "A slalom at 25 km/h, wind from 4 to 8 s, tyres 1.3 times too stiff."),
         (FIG5, "Fig. 5 (twin)", "The road test's slalom, with everything that the plant has."))
-    for panel, draw in (("(a): course angle", make_course(*_ALL)),
-        ("(b): sideslip angle", make_curves("beta", _SLIP, _ALL)),
-        ("(c): inter-sample performance", make_curves("beta", _SLIP, _ALL, (6.0, 7.0))))
+    for panel, draw in (("(a): course angle", Curves("course", "course angle / rad", _ALL)),
+        ("(b): sideslip angle", Curves("beta", _SLIP, _ALL)),
+        ("(c): inter-sample performance", Curves("beta", _SLIP, _ALL, (6.0, 7.0))))
 )

@@ -1,6 +1,6 @@
 """Claims of the papers: the simulations that measure them and the rule of their verdicts.
 
-A simulation gives one number a seed for each subject and metric. A part of a claim is such a
+A simulation gives one number a seed for each subject and quantity. A part of a claim is such a
 number, what the paper states of it and the threshold that an honest implementation meets
 (docs/PAPERS.md section 3). The median over the seeds has to meet the threshold, which has no part
 in the verdict.
@@ -40,8 +40,13 @@ class Example:
 class SimulationResult:
     """The result of a simulation or an analysis."""
 
-    numbers: dict[tuple[str, str], Array]  # (seeds,) by subject and metric
+    numbers: dict[tuple[str, str], Array]  # (seeds,) by subject and quantity
     example: Example | None = None  # of the chunk with the first seed
+
+    def __add__(self, later: "SimulationResult") -> "SimulationResult":
+        """Join it with the result of later seeds."""
+        joint = {x: np.concatenate([self.numbers[x], later.numbers[x]]) for x in self.numbers}
+        return SimulationResult(joint, self.example or later.example)
 
 
 Results = Mapping[str, SimulationResult]
@@ -72,62 +77,71 @@ class Bound:
                 f"got {self.relation!r} {self.value!r}"
             )
 
-    def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which of the values meet it; NaN never does.
-
-        Args:
-            values: Numbers of any shape.
-
-        Returns:
-            Whether each one does, of the same shape.
-        """
-        return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
-
     def __str__(self) -> str:
         return f"{self.relation} {self.value:g}"
 
 
+def _is_met(bound: Bound, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Tell which of the values meet a bound; NaN never does."""
+    return np.asarray(_RELATIONS[bound.relation](np.asarray(values, float), bound.value))
+
+
 @dataclass(frozen=True)
 class ClaimPart:
-    """One measured number of a claim."""
+    """One measured number of a claim: a subject's, or its ratio to rivals', seed by seed."""
 
-    label: str  # what is compared with what
+    label: str  # what is measured, or compared with what
     scenario: str  # name of the simulation or analysis
-    compute: Callable[[Results], Array]  # one number a seed, (seeds,)
+    subject: str  # filter, controller or other name that has the number
+    quantity: str = "beta"
     stated: Bound | None = None  # by the paper
     threshold: Bound | None = None  # of an honest implementation
     metric: str = "ratio"  # of `METRICS`
+    _: KW_ONLY
+    rivals: tuple[str, ...] = ()  # subjects of the denominator
+    pick: Callable[..., Array] = np.min  # the best of the rivals; `np.max`: the poorest
+    is_pooled: bool = False  # RMS values over all seeds together are divided
+
+    def measure(self, results: Results) -> Array:
+        """Measure the number of each seed.
+
+        Args:
+            results: Results of all simulations.
+
+        Returns:
+            Numbers, shape (seeds,).
+        """
+        numbers = results[self.scenario].numbers
+        one = numbers[self.subject, self.quantity]
+        others = [numbers[rival, self.quantity] for rival in self.rivals]
+        if self.is_pooled:
+            return np.array([np.sqrt(np.mean(one**2) / np.mean(others[0] ** 2))])
+        return np.asarray(one / self.pick(others, axis=0)) if others else one
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim of a paper; ValueError without parts."""
-
-    paper: str  # its short name
-    source: str  # equation, figure or section
-    text: str
-    parts: tuple[ClaimPart, ...]
-    note: str = ""  # on what was found, for the report
-
-    def __post_init__(self) -> None:
-        if not self.parts:
-            raise ValueError(f"{self.paper} {self.source}: a claim needs at least one part")
-
-
-def make_claim_factory(paper: str) -> Callable[..., Claim]:
-    """Make a function that makes a paper's claims from source, text, parts and a note.
+def compare(
+    label: str,
+    scenario: str,
+    one: str,
+    other: str,
+    max_ratio: float | None = None,
+    quantity: str = "beta",
+) -> ClaimPart:
+    """Make a part that states one's number smaller than the other's.
 
     Args:
-        paper: Short name of the paper.
+        label: What is compared with what.
+        scenario: Name of the simulation.
+        one: Subject whose number is stated to be smaller.
+        other: Subject whose number is larger.
+        max_ratio: Threshold of the ratio, None for none.
+        quantity: Name of the number.
 
     Returns:
-        The function.
+        Part.
     """
-
-    def make_claim(source: str, text: str, *parts: ClaimPart, note: str = "") -> Claim:
-        return Claim(paper, source, text, parts, note)
-
-    return make_claim
+    threshold = None if max_ratio is None else Bound("<=", max_ratio)
+    return ClaimPart(label, scenario, one, quantity, Bound("<", 1.0), threshold, rivals=(other,))
 
 
 @dataclass(frozen=True)
@@ -147,147 +161,92 @@ class MeasuredPart:
     def agreement(self) -> float:
         """The fraction of seeds that meet what the paper states; NaN where it states nothing."""
         stated = self.part.stated
-        return math.nan if stated is None else float(np.mean(stated.is_met(self.values)))
+        return math.nan if stated is None else float(np.mean(_is_met(stated, self.values)))
 
     @property
     def holds_in_median(self) -> bool:
         """Whether the median meets what the paper states."""
-        return self.part.stated is not None and bool(self.part.stated.is_met(self.number.value))
+        stated = self.part.stated
+        return stated is not None and bool(_is_met(stated, self.number.value))
 
     @property
     def meets_threshold(self) -> bool | None:
         """Whether the median meets the threshold; None where there is none."""
         threshold = self.part.threshold
-        return None if threshold is None else bool(threshold.is_met(self.number.value))
+        return None if threshold is None else bool(_is_met(threshold, self.number.value))
 
 
-def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
-    """Measure every part of a claim; ValueError for a part without numbers.
-
-    Args:
-        claim: Claim of a paper with its parts.
-        results: Results of all simulations that its parts name.
-
-    Returns:
-        Its parts with their numbers.
-    """
-    parts = []
-    for part in claim.parts:
-        values = np.atleast_1d(np.asarray(part.compute(results), np.float64))
-        if values.ndim != 1 or not len(values):
-            raise ValueError(f"{claim.paper} {claim.source}, {part.label}: {values.shape} numbers")
-        parts.append(MeasuredPart(part, values))
-    return tuple(parts)
-
-
-def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
-    """Evaluate a claim by the parts of which the paper states something.
-
-    "reproduced": all are as stated in at least nine of ten seeds; "not reproduced": none is, even
-    in the median over the seeds; "partly": anything between; "report only": no such part.
+class Claim:
+    """A claim of a paper.
 
     Args:
-        parts: Parts with their numbers.
+        paper: Short name of the paper.
+        source: Equation, figure or section.
+        text: What is claimed.
+        *parts: Numbers that show it.
+        note: What was found, for the report.
 
-    Returns:
-        Verdict, one of `VERDICTS`.
-    """
-    stated_parts = [result for result in parts if result.part.stated is not None]
-    if not stated_parts:
-        return "report only"
-    if all(result.agreement >= _MIN_AGREEMENT for result in stated_parts):
-        return "reproduced"
-    if any(result.holds_in_median for result in stated_parts):
-        return "partly"
-    return "not reproduced"
-
-
-def make_number_part(
-    label: str,
-    scenario: str,
-    subject: str,
-    quantity: str,
-    stated: Bound | None = None,
-    threshold: Bound | None = None,
-    metric: str = "ratio",
-) -> ClaimPart:
-    """Make a part of a claim of a measured number as it stands.
-
-    Args:
-        label: What is measured.
-        scenario: Name of the simulation or analysis.
-        subject: Filter, controller or other name that has the number.
-        quantity: Name of the number.
-        stated: What the paper states of it.
-        threshold: What an honest implementation meets.
-        metric: Metric of the row.
-
-    Returns:
-        Part.
+    Raises:
+        ValueError: There is no part.
     """
 
-    def select_number(results: Results) -> Array:
-        return results[scenario].numbers[subject, quantity]
+    def __init__(
+        self, paper: str, source: str, text: str, *parts: ClaimPart, note: str = ""
+    ) -> None:
+        self.paper, self.source, self.text = paper, source, text
+        self.parts, self.note = parts, note
+        if not parts:
+            raise ValueError(f"{paper} {source}: a claim needs at least one part")
 
-    return ClaimPart(label, scenario, select_number, stated, threshold, metric)
+    def measure(self, results: Results) -> "MeasuredClaim":
+        """Measure every part; ValueError for one without numbers.
 
+        Args:
+            results: Results of all simulations that the parts name.
 
-def select_ratio(
-    scenario: str,
-    one: str,
-    *others: str,
-    metric: str = "beta",
-    pick: Callable[..., Array] = np.min,
-) -> Callable[[Results], Array]:
-    """Select one's number over the best or the poorest of others', seed by seed.
-
-    Args:
-        scenario: Name of the simulation.
-        one: Subject of the numerator.
-        *others: Subjects of the denominator, one or more.
-        metric: Name of the number.
-        pick: `np.min` for the best of them, `np.max` for the poorest.
-
-    Returns:
-        Function of all results.
-    """
-
-    def compute_ratio(results: Results) -> Array:
-        numbers = results[scenario].numbers
-        rival = pick([numbers[other, metric] for other in others], axis=0)
-        return np.asarray(numbers[one, metric] / rival)
-
-    return compute_ratio
+        Returns:
+            Claim with the numbers of its parts.
+        """
+        parts = []
+        for part in self.parts:
+            values = np.atleast_1d(np.asarray(part.measure(results), np.float64))
+            if values.ndim != 1 or not len(values):
+                raise ValueError(
+                    f"{self.paper} {self.source}, {part.label}: {values.shape} numbers"
+                )
+            parts.append(MeasuredPart(part, values))
+        return MeasuredClaim(self, tuple(parts))
 
 
-def make_smaller_part(
-    label: str,
-    scenario: str,
-    one: str,
-    other: str,
-    max_ratio: float | None = None,
-    metric: str = "beta",
-) -> ClaimPart:
-    """Make a part that states one's number smaller than the other's.
+@dataclass(frozen=True)
+class MeasuredClaim:
+    """A claim with the numbers of its parts."""
 
-    Args:
-        label: What is compared with what.
-        scenario: Name of the simulation.
-        one: Subject whose number is stated to be smaller.
-        other: Subject whose number is larger.
-        max_ratio: Threshold of the ratio, None for none.
-        metric: Name of the number.
+    claim: Claim
+    parts: tuple[MeasuredPart, ...]
 
-    Returns:
-        Part.
-    """
-    threshold = None if max_ratio is None else Bound("<=", max_ratio)
-    ratio = select_ratio(scenario, one, other, metric=metric)
-    return ClaimPart(label, scenario, ratio, Bound("<", 1.0), threshold)
+    @property
+    def source(self) -> str:
+        """The paper, and the equation, figure or section."""
+        return f"{self.claim.paper} {self.claim.source}"
+
+    @property
+    def verdict(self) -> str:
+        """The verdict, one of `VERDICTS`, by the parts of which the paper states something.
+
+        "reproduced": all are as stated in at least nine of ten seeds; "not reproduced": none is,
+        even in the median over the seeds; "partly": anything between; "report only": no such part.
+        """
+        stated_parts = [result for result in self.parts if result.part.stated is not None]
+        if not stated_parts:
+            return "report only"
+        if all(result.agreement >= _MIN_AGREEMENT for result in stated_parts):
+            return "reproduced"
+        return "partly" if any(x.holds_in_median for x in stated_parts) else "not reproduced"
 
 
 Numbers = dict[tuple[str, str], float | Array]
-"""One seed's numbers, by subject and metric."""
+"""One seed's numbers, by subject and quantity."""
 SeedFunction = Callable[[int], tuple[Numbers, Example | None]]
 """From a seed to its numbers and signals."""
 
@@ -319,7 +278,7 @@ class Simulation:
             seeds: Seeds of the case.
 
         Returns:
-            Numbers by subject and metric, shape (seeds,) each, and the example.
+            Numbers by subject and quantity, shape (seeds,) each, and the example.
         """
         measure_seed, lines, example = self.prepare(), list[Numbers](), None
         for seed in seeds:
@@ -345,48 +304,11 @@ class Analysis(Simulation):
         return self.function
 
 
-def rms(values: npt.ArrayLike) -> float:
-    """Compute the root of the mean square.
-
-    Args:
-        values: Numbers of any shape.
-
-    Returns:
-        Root of the mean square.
-    """
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def join_results(chunks: list[SimulationResult]) -> SimulationResult:
-    """Join the results of one simulation's cases.
-
-    Args:
-        chunks: Results in the order of their seeds.
-
-    Returns:
-        Result of all seeds.
-    """
-    names = chunks[0].numbers
-    numbers = {name: np.concatenate([chunk.numbers[name] for chunk in chunks]) for name in names}
-    return SimulationResult(numbers, next((c.example for c in chunks if c.example), None))
-
-
-_TUNED = {
+PAPER_TUNINGS: dict[str, dict[str, float]] = {
     entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
     for entry in read_tunings(Path(__file__).with_name("tunings.toml"))
 }
-
-
-def get_paper_tuning(name: str) -> Mapping[str, float]:
-    """Get the options by which a filter is tuned for its paper's simulation.
-
-    Args:
-        name: Name of the filter.
-
-    Returns:
-        Options of `make_estimator`, {} for the default.
-    """
-    return _TUNED.get(name, {})
+"""Options by which a filter is tuned for its paper's simulation, by its name."""
 
 
 @dataclass(frozen=True)
@@ -413,6 +335,6 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
     by_label = {}
     for spec in filters:
         options = {**facts, "vehicle": cars[spec.vehicle]}
-        options |= {**get_paper_tuning(spec.name), **spec.options}
+        options |= {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}
         by_label[spec.label] = call_quietly(make_estimator, spec.name, **options)
     return by_label

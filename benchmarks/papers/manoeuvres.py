@@ -4,12 +4,13 @@ tie-vision's controllers are measured by the sideslip angle that they leave, dak
 well the car follows its reference model.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
@@ -19,14 +20,13 @@ from ...envs.scenarios.scenario import Scenario
 from ...estimators.analysis.bound import compute_error_bound
 from ..harness.drives import SETTLED, make_env, make_filter_arguments
 from .ledger import (
+    PAPER_TUNINGS,
     Example,
     Numbers,
     PaperFilter,
     SeedFunction,
     Simulation,
-    get_paper_tuning,
     make_filters,
-    rms,
 )
 
 if TYPE_CHECKING:
@@ -87,8 +87,12 @@ class EstimationSimulation(Simulation):
         return measure_seed
 
 
+def _rms(values: npt.ArrayLike) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def _compute_settled_rms(values: Array, log: Log) -> float:
-    return rms(values[log.time >= SETTLED - 1e-9])
+    return _rms(values[log.time >= SETTLED - 1e-9])
 
 
 def _compute_errors(
@@ -108,10 +112,10 @@ def _compute_errors(
     numbers[label, "last"] = float(abs(np.mean(errors["beta"][t >= t[-1] - 1.0])))
     arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
     arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
-    numbers[label, "jump"] = rms(beta[arrived] - beta[arrived - 1])
+    numbers[label, "jump"] = _rms(beta[arrived] - beta[arrived - 1])
     if scenario.gps_outage is not None:
         start, end = scenario.gps_outage
-        numbers[label, "outage"] = rms(errors["beta"][(t >= start) & (t < end)])
+        numbers[label, "outage"] = _rms(errors["beta"][(t >= start) & (t < end)])
     return numbers
 
 
@@ -150,8 +154,8 @@ def run_episode(
     Returns:
         The episode.
     """
-    tuned = dict(get_paper_tuning(estimator))
-    estimate = {"outputs": _STATES, "options": {"slow": "gps"} | tuned}
+    tuned = {"slow": "gps"} | PAPER_TUNINGS.get(estimator, {})
+    estimate = {"outputs": _STATES, "options": tuned}
     env = make_env(_ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
     return rollout(env, make_agent(agent, env, **options), seed)
 
@@ -167,8 +171,8 @@ def measure_tracking(episode: Rollout) -> Tracking:
     """
     moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
     return Tracking(
-        rms_beta=rms(episode["beta"] - episode["beta_ref"]),
-        rms_gamma=rms(episode["gamma"] - episode["gamma_ref"]),
+        rms_beta=_rms(episode["beta"] - episode["beta_ref"]),
+        rms_gamma=_rms(episode["gamma"] - episode["gamma_ref"]),
         peak_beta=float(np.abs(episode["beta"]).max()),
         saturated=float(np.mean(moment >= 1.0)),
         steered=float(steering.max()),
@@ -239,7 +243,7 @@ class SlipSimulation(_AgentSimulation):
         slip, moment, limit = drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit
         change = np.abs(np.diff(moment))
         return drive, {
-            "rms_slip": rms(slip),
+            "rms_slip": _rms(slip),
             "peak_slip": float(np.max(np.abs(slip))),
             "largest_step": float(np.max(change)),
             "total_variation": float(np.sum(change)),
@@ -262,97 +266,26 @@ class FollowingSimulation(_AgentSimulation):
         return drive, {name: float(value) for name, value in values.items()}
 
 
-_Draw = Callable[[Example], "Figure"]
+def _compute_courses(example: Example, labels: Sequence[str]) -> dict[str, Array]:
+    """Compute the courses psi + beta, with the receiver's samples."""
+    curves = {name: example.curves[name] for name in labels}
+    series = {name: curve["psi"] + curve["beta"] for name, curve in curves.items()}
+    return series | {"measured": _extract_samples(example, "gps", 0)}
 
 
-@dataclass(frozen=True)
-class PaperFigure:
-    """One figure of a paper, redrawn."""
-
-    paper: str
-    title: str
-    scenario: str  # name of the simulation
-    draw: _Draw
-    caption: str  # what to see
+def _select_offsets(example: Example, labels: Sequence[str]) -> dict[str, Array]:
+    """Select the lateral offsets, with the camera's held late samples."""
+    series = {name: example.curves[name]["y_l"] for name in labels}
+    return series | {"measured, held": _repeat_samples(_extract_samples(example, "camera", 1))}
 
 
-def _draw_lines(
-    example: Example,
-    series: Mapping[str, Array],
-    y_label: str,
-    window: tuple[float, float] | None = None,
-    **more: Any,
-) -> "Figure":
-    """Draw lines over time, in a window (s) of it; more: of `draw_time_series`."""
-    from ..report.figures import draw_time_series
-
-    t = example.time
-    inside = (t >= window[0]) & (t <= window[1]) if window else np.ones(len(t), bool)
-    shown = {name: signal[inside] for name, signal in series.items()}
-    return draw_time_series(t[inside], shown, y_label, **more)
-
-
-def make_curves(
-    signal: str,
-    y_label: str,
-    labels: Sequence[str] = (),
-    window: tuple[float, float] | None = None,
-    x_label: str = "time / s",
-) -> _Draw:
-    """Make a figure of a signal over time.
-
-    Args:
-        signal: Name of the signal.
-        y_label: Label of the vertical axis.
-        labels: Subjects, none for all.
-        window: Part of the time (s), None for all of it.
-        x_label: Label of the horizontal axis.
-
-    Returns:
-        Function that draws.
-    """
-
-    def draw(example: Example) -> "Figure":
-        signals = {name: example.curves.get(name, {}) for name in labels or example.curves}
-        series = {name: values[signal] for name, values in signals.items() if signal in values}
-        return _draw_lines(example, series, y_label, window, x_label=x_label)
-
-    return draw
-
-
-def draw_loops(example: Example) -> "Figure":
-    """Draw the gain of open loops over the frequency, on a logarithmic axis.
-
-    Args:
-        example: Magnitudes (dB) over Hz.
-
-    Returns:
-        Figure.
-    """
-    series = {name: signals["magnitude"] for name, signals in example.curves.items()}
-    figure = _draw_lines(example, series, "gain of the open loop / dB", x_label="frequency / Hz")
-    ends = np.log10(example.time[[0, -1]])
-    figure.update_xaxes(type="log", range=[float(end) for end in ends])
-    return figure
-
-
-def make_course(*labels: str) -> _Draw:
-    """Make a figure of the course psi + beta, with the receiver's samples.
-
-    Args:
-        *labels: Subjects: the truth, filters.
-
-    Returns:
-        Function that draws.
-    """
-
-    def draw(example: Example) -> "Figure":
-        curves = {name: example.curves[name] for name in labels}
-        series = {name: curve["psi"] + curve["beta"] for name, curve in curves.items()}
-        series["measured"] = _extract_samples(example, "gps", 0)
-        return _draw_lines(example, series, "course angle / rad", dots=("measured",))
-
-    return draw
+def _compute_delays(example: Example, _: Sequence[str]) -> dict[str, Array]:
+    """Compute the delay of the newest frame over the time of its capture."""
+    packets = example.packets["camera"]
+    late = np.full(len(example.time), np.nan)
+    ticks = packets[:, PACKET.captured].astype(int)
+    late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
+    return {"camera": _repeat_samples(late)}
 
 
 def _extract_samples(example: Example, sensor: str, row: int) -> Array:
@@ -373,36 +306,52 @@ def _repeat_samples(values: Array) -> Array:
     return out
 
 
-def make_offset(labels: Sequence[str], window: tuple[float, float]) -> _Draw:
-    """Make a figure of the lateral offset, with the camera's held late samples.
-
-    Args:
-        labels: Subjects: the truth, filters.
-        window: Part of the time (s).
-
-    Returns:
-        Function that draws.
-    """
-
-    def draw(example: Example) -> "Figure":
-        series = {name: example.curves[name]["y_l"] for name in labels}
-        series["measured, held"] = _repeat_samples(_extract_samples(example, "camera", 1))
-        return _draw_lines(example, series, "lateral offset / m", window)
-
-    return draw
+_DERIVED = {"course": _compute_courses, "offset": _select_offsets, "delay": _compute_delays}
+_LOOPS = "magnitude"  # dB over Hz, on a logarithmic axis
 
 
-def draw_delays(example: Example) -> "Figure":
-    """Draw the delay of the newest frame over the time of its capture, for the first second.
+@dataclass(frozen=True)
+class Curves:
+    """What a figure shows over time: a signal of an example, or one of `_DERIVED`."""
 
-    Args:
-        example: Signals with the camera's packets.
+    signal: str
+    y_label: str
+    labels: Sequence[str] = ()  # subjects, none for all
+    window: tuple[float, float] | None = None  # s, None for all of the time
+    x_label: str = "time / s"
 
-    Returns:
-        Figure.
-    """
-    packets = example.packets["camera"]
-    late = np.full(len(example.time), np.nan)
-    ticks = packets[:, PACKET.captured].astype(int)
-    late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    return _draw_lines(example, {"camera": _repeat_samples(late)}, "delay / ms", (0.0, 1.0))
+    def draw(self, example: Example) -> "Figure":
+        """Draw the curves.
+
+        Args:
+            example: Signals of a seed.
+
+        Returns:
+            Figure.
+        """
+        from ..report.figures import draw_time_series
+
+        t, window = example.time, self.window
+        inside = (t >= window[0]) & (t <= window[1]) if window else np.ones(len(t), bool)
+        if self.signal in _DERIVED:
+            series = _DERIVED[self.signal](example, self.labels)
+        else:
+            curves = {name: example.curves.get(name, {}) for name in self.labels or example.curves}
+            series = {name: x[self.signal] for name, x in curves.items() if self.signal in x}
+        shown = {name: values[inside] for name, values in series.items()}
+        figure = draw_time_series(t[inside], shown, self.y_label, self.x_label, ("measured",))
+        if self.signal == _LOOPS:
+            ends = np.log10(t[[0, -1]])
+            figure.update_xaxes(type="log", range=[float(end) for end in ends])
+        return figure
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """One figure of a paper, redrawn."""
+
+    paper: str
+    title: str
+    scenario: str  # name of the simulation
+    curves: Curves
+    caption: str  # what to see

@@ -4,26 +4,16 @@ Each paper has one to three modules with its simulations, claims and figures, wh
 """
 
 from collections import Counter
+from types import ModuleType
+from typing import NamedTuple
 
-from rich.console import Console
-
-from ..harness.parallel import run_cases
 from ..harness.results import VERDICTS, ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
-from ..report.study import add_rows, import_figures
+from ..report.study import Request, Study
 from . import dakf_stability, double_layer, dual_rate, theory, tie_vision_control, uneven_delay
 from . import tie_vision_estimation as tie_vision
 from . import tie_vision_theory as tie_vision_convergence
-from .ledger import (
-    Claim,
-    MeasuredPart,
-    Results,
-    Simulation,
-    SimulationResult,
-    evaluate_claim,
-    join_results,
-    measure_parts,
-)
+from .ledger import Claim, Example, MeasuredClaim, MeasuredPart, Simulation, SimulationResult
 from .manoeuvres import PaperFigure
 
 _MODULES = (
@@ -38,8 +28,6 @@ CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in modu
 FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
 
 
-SEEDS = 20
-QUICK_SEEDS = 4
 NAME = "papers"
 
 _TEXT = (
@@ -54,7 +42,13 @@ _TEXT = (
 )
 
 Case = tuple[str, tuple[int, ...]]
-Ledger = list[tuple[Claim, tuple[MeasuredPart, ...]]]
+
+
+class LedgerResults(NamedTuple):
+    """The measured claims, and the signals of simulations by name."""
+
+    ledger: list[MeasuredClaim]
+    examples: dict[str, Example | None]
 
 
 def measure(case: Case) -> SimulationResult:
@@ -70,59 +64,29 @@ def measure(case: Case) -> SimulationResult:
     return SIMULATIONS[name].measure(seeds)
 
 
-def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run every simulation once, then evaluate every claim.
-
-    Args:
-        seeds: Number of seeds.
-        jobs: Number of processes; None: one a core.
-        console: Console for the progress.
-
-    Returns:
-        The suite.
-    """
-    results = _simulate(seeds, jobs, console)
-    ledger = [(claim, measure_parts(claim, results)) for claim in CLAIMS]
-    suite = Suite(NAME, "Which claims of the papers hold", _TEXT)
-    suite.verdict = compose_verdict(ledger)
-    suite.tables = [_make_verdict_table(ledger), _make_note_table(ledger)]
-    for paper in dict.fromkeys(claim.paper for claim in CLAIMS):
-        suite.tables.append(_make_number_table(ledger, paper))
-    for claim, parts in ledger:
-        columns = {"verdict": evaluate_claim(parts)}
-        columns["paper"] = f"{_format_source(claim)}: {claim.text}"
-        for result in parts:
-            part, n = result.part, len(result.values)
-            where = {"scenario": part.scenario, "estimator": part.label}
-            add_rows(suite, {part.metric: result.number}, n=n, **where, **columns)
-    if import_figures() is None:
-        return suite
-    for figure in FIGURES:
-        if (example := results[figure.scenario].example) is not None:
-            title = f"{figure.paper} {figure.title}"
-            suite.figures.append((title, figure.draw(example), figure.caption))
-    return suite
+def _measure(request: Request) -> LedgerResults:
+    """Run every simulation once, then measure every claim."""
+    seeds = request.episodes or 0
+    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
+    results: dict[str, SimulationResult] = {}
+    for (name, _), result in zip(cases, request.run_cases(measure, cases, NAME), strict=True):
+        results[name] = results[name] + result if name in results else result
+    ledger = [claim.measure(results) for claim in CLAIMS]
+    return LedgerResults(ledger, {name: result.example for name, result in results.items()})
 
 
-def compose_verdict(ledger: Ledger) -> str:
-    """Compose the verdict: how many claims hold, which do not.
-
-    Args:
-        ledger: Claims with their measured parts.
-
-    Returns:
-        Verdict.
-    """
-    verdicts = [(claim, evaluate_claim(parts)) for claim, parts in ledger]
-    counted = Counter(item for _, item in verdicts)
-    papers = dict.fromkeys(claim.paper for claim, _ in verdicts)
+def _compose_verdict(results: LedgerResults) -> str:
+    """Compose the verdict: how many claims hold, which do not."""
+    ledger = results.ledger
+    counted = Counter(entry.verdict for entry in ledger)
+    papers = dict.fromkeys(entry.claim.paper for entry in ledger)
     held = []
     for paper in papers:
-        items = [x for claim, x in verdicts if claim.paper == paper and x != VERDICTS[-1]]
-        if items:
-            held.append(f"{paper} {items.count(VERDICTS[1])} of {len(items)}")
-    failed = [_format_source(claim) for claim, item in verdicts if item == "not reproduced"]
-    missed = sum(item.meets_threshold is False for _, parts in ledger for item in parts)
+        items = [entry.verdict for entry in ledger if entry.claim.paper == paper]
+        if stated := [item for item in items if item != VERDICTS[-1]]:
+            held.append(f"{paper} {stated.count(VERDICTS[1])} of {len(stated)}")
+    failed = [entry.source for entry in ledger if entry.verdict == "not reproduced"]
+    missed = sum(item.meets_threshold is False for entry in ledger for item in entry.parts)
     counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
     reasons = f"Not reproduced: {summarise_names(failed, 3)}. Reasons stand in the table Why."
     return format_verdict(
@@ -134,58 +98,46 @@ def compose_verdict(ledger: Ledger) -> str:
     )
 
 
-def _simulate(seeds: int, jobs: int | None, console: Console | None) -> Results:
-    """Run every simulation and analysis; return the results by name."""
-    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
-    parts: dict[str, list[SimulationResult]] = {name: [] for name in SIMULATIONS}
-    for (name, _), result in zip(
-        cases, run_cases(measure, cases, NAME, jobs, console), strict=True
-    ):
-        parts[name].append(result)
-    return {name: join_results(chunks) for name, chunks in parts.items()}
+_RANGE_NOTE = (
+    "The range is over seeds, tunings or speeds; behind what the paper states stands the share "
+    "of them in which it is so."
+)
 
 
-def _make_verdict_table(ledger: Ledger) -> ResultTable:
-    """Make the table of verdicts, one line a claim."""
-    cells = [
-        [_format_source(claim), claim.text, evaluate_claim(parts), _format_checks(parts)]
-        for claim, parts in ledger
-    ]
-    header = ("paper", "claim", "verdict", "thresholds")
-    return ResultTable("The claims and what became of them", header, cells, keyed=False)
-
-
-def _make_number_table(ledger: Ledger, paper: str) -> ResultTable:
-    """Make the table of numbers, one line a part of a paper's claims."""
-    cells = []
-    for source, result in ((c.source, r) for c, parts in ledger if c.paper == paper for r in parts):
-        label, part = f"{source}: {result.part.label}", result.part
-        share = f" ({100.0 * result.agreement:.0f} %)"
-        stated = "" if part.stated is None else f"{part.stated}{share}"
-        met = "met" if result.meets_threshold else "MISSED"
-        check = "" if part.threshold is None else f"{part.threshold} {met}"
-        cells.append([label, _format_range(result), stated, check])
-    header = ("number", "median [range]", "paper states", "threshold")
-    note = (
-        "The range is over seeds, tunings or speeds; behind what the paper states stands the share "
-        "of them in which it is so."
+def _add_tables(suite: Suite, results: LedgerResults) -> None:
+    """Add a row of each part, and the tables of verdicts, remarks, and each paper's numbers."""
+    verdicts, remarks, numbers = [], [], dict[str, list[list[str]]]()
+    for entry in results.ledger:
+        claim = entry.claim
+        columns = {"verdict": entry.verdict, "paper": f"{entry.source}: {claim.text}"}
+        for item in entry.parts:
+            record = {"scenario": item.part.scenario, "estimator": item.part.label, **columns}
+            suite.add_rows([{**record, "n": len(item.values), item.part.metric: item.number}])
+        verdicts.append([entry.source, claim.text, entry.verdict, _format_checks(entry.parts)])
+        remarks += [[entry.source, claim.note]] if claim.note else []
+        cells = [_format_part(claim.source, item) for item in entry.parts]
+        numbers.setdefault(claim.paper, []).extend(cells)
+    header, title = (
+        ("paper", "claim", "verdict", "thresholds"),
+        "The claims and what became of them",
     )
-    return ResultTable(f"{paper}: what was measured", header, cells, note, keyed=False)
+    suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
+    suite.tables.append(ResultTable("Why", ("paper", "what was found"), remarks, keyed=False))
+    header = ("number", "median [range]", "paper states", "threshold")
+    for paper, cells in numbers.items():
+        title = f"{paper}: what was measured"
+        suite.tables.append(ResultTable(title, header, cells, _RANGE_NOTE, keyed=False))
 
 
-def _make_note_table(ledger: Ledger) -> ResultTable:
-    """Make the table of remarks on claims."""
-    cells = [[_format_source(claim), claim.note] for claim, _ in ledger if claim.note]
-    return ResultTable("Why", ("paper", "what was found"), cells, keyed=False)
-
-
-def _format_source(claim: Claim) -> str:
-    return f"{claim.paper} {claim.source}"
-
-
-def _format_range(result: MeasuredPart) -> str:
-    median, low, high = map(_format_number, result.number)
-    return median if result.number.low == result.number.high else f"{median} [{low}, {high}]"
+def _format_part(source: str, item: MeasuredPart) -> list[str]:
+    """Format a part's number, what the paper states of it, and its threshold."""
+    part, number = item.part, item.number
+    median, low, high = map(_format_number, number)
+    shown = median if number.low == number.high else f"{median} [{low}, {high}]"
+    stated = f"{part.stated} ({100.0 * item.agreement:.0f} %)" if part.stated else ""
+    met = "met" if item.meets_threshold else "MISSED"
+    check = f"{part.threshold} {met}" if part.threshold else ""
+    return [f"{source}: {part.label}", shown, stated, check]
 
 
 def _format_number(value: float) -> str:
@@ -199,3 +151,22 @@ def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
     if not checked:
         return ""
     return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
+
+
+def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:
+    for figure in FIGURES:
+        if (example := results.examples[figure.scenario]) is not None:
+            title = f"{figure.paper} {figure.title}"
+            suite.figures.append((title, figure.curves.draw(example), figure.caption))
+
+
+STUDY = Study(
+    NAME,
+    "Which claims of the papers hold",
+    _TEXT,
+    (20, 4),
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    _add_figures,
+)

@@ -7,6 +7,7 @@ the prediction error X~_{k|k-1} at the sample, without noise. Ranks are exact: n
 import math
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from scipy.linalg import expm
@@ -17,7 +18,7 @@ from ...envs.vehicle import linear
 from ...envs.vehicle.linear import make_course_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design import dual_rate, kalman
-from .ledger import Analysis, Bound, Numbers, make_claim_factory, make_number_part
+from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers
 from .manoeuvres import PaperFigure
 
 
@@ -199,7 +200,7 @@ def _measure_gains(seed: int) -> tuple[Numbers, None]:
         ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
     }
     for name, q in tunings.items():
-        shares = dual_rate.compute_shares_29(A, np.diag(q) * 1e-3, C, R, RATIO)
+        shares = dual_rate.SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
         growth = np.linalg.eigvals(dual_rate.frame_map(A, C, shares))
         radii[name, "spectral_radius"] = float(np.abs(growth).max())
     return radii, None
@@ -211,20 +212,20 @@ SIMULATIONS = (
     Analysis(RANKS, compute_coms_ranks, share=0.0),
 )
 
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(33)", "the error dynamics are those of fast measurements",
-        make_number_part("difference of the maps, square C", MAPS, SQUARE, "difference",
+        ClaimPart("difference of the maps, square C", MAPS, SQUARE, "difference",
             Bound("<=", 1e-9), Bound("<=", 1e-9), "difference"),
-        make_number_part("difference of the maps, course only", MAPS, APPLICATION, "difference",
+        ClaimPart("difference of the maps, course only", MAPS, APPLICATION, "difference",
             Bound("<=", 1e-9), Bound(">=", 0.2), "difference"),
         note="(30) has no exact solution unless C is invertible, and with disturbance "
         "accommodation it never is: C = [c 0]."),
     claim("Sec. 3.3", "gains from the pseudo measurement's noise (29) make a filter",
         *(
-            make_number_part(f"spectral radius, {tuning}", GAINS, tuning, "spectral_radius",
+            ClaimPart(f"spectral radius, {tuning}", GAINS, tuning, "spectral_radius",
                 Bound("<=", _GROWS), threshold, "spectral_radius")
             for tuning, threshold in ((STRONG, Bound(">=", 1.1)), (ANY, None))
         ),
@@ -234,8 +235,7 @@ CLAIMS = (
         "bounded else. As corrected in docs/PAPERS.md; as printed (29) does the same (in the "
         "tests)."),
     claim("Sec. 4.3", "the extended model's rank (the paper only checks that C C^T is invertible)",
-        make_number_part("rank, of 6 states", RANKS, "dual-rate", "rank", None, Bound("=", 4.0),
-            "rank")),
+        ClaimPart("rank, of 6 states", RANKS, "dual-rate", "rank", None, Bound("=", 4.0), "rank")),
 )
 
 FIGURES: tuple[PaperFigure, ...] = ()

@@ -10,11 +10,13 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
+from scipy.optimize import brentq
 
 from ...agents import make_agent
 from ...agents.controllers.two_dof import CAMERA_PERIOD
@@ -26,22 +28,13 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ...envs.vehicle.parameters import COMS, Vehicle
 from ...estimators.design.kalman import kalman_gain
-from .ledger import (
-    Analysis,
-    Bound,
-    ClaimPart,
-    Example,
-    Numbers,
-    make_claim_factory,
-    make_number_part,
-    make_smaller_part,
-    select_ratio,
-)
-from .manoeuvres import PaperFigure, SlipSimulation, draw_loops, make_curves
-from .tie_vision_theory import compute_gain_margin
+from .ledger import Analysis, Bound, Claim, ClaimPart, Example, Numbers, compare
+from .manoeuvres import Curves, PaperFigure, SlipSimulation
 
 if TYPE_CHECKING:
-    from control import StateSpace
+    from control import StateSpace, TransferFunction
+
+    Loop: TypeAlias = StateSpace | TransferFunction
 
 Parts = tuple[Array, Array, Array, Array]
 
@@ -174,7 +167,7 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
                 break
             loop = _make_estimator_loop(vehicle, design, dt)
-            decibels, omega = compute_gain_margin(loop)
+            decibels, omega = _compute_gain_margin(loop)
             if abs(omega * dt - math.pi) > 1e-9 or not _is_stable(loop):
                 break
             margins.append(decibels)
@@ -187,6 +180,62 @@ def _is_stable(loop: "StateSpace") -> bool:
     import control
 
     return bool(np.abs(control.feedback(loop, 1).poles()).max() < 1.0)
+
+
+# Gain margins: how much the loops of the paper's Table II may grow until they reach -1.
+_DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
+
+
+def _find_crossings(loop: "Loop") -> Array:
+    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
+
+    L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
+    python-control's `stability_margins` finds crossings by a change of sign, and there is none at
+    the end of the axis. The others are bracketed on a grid (4000 points over six decades) and
+    refined: a pair of crossings closer than that is missed.
+
+    Raises ValueError for a loop in continuous time or with several inputs or outputs.
+    """
+    if not loop.isdtime(strict=True) or loop.dt is True:
+        raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
+    if not loop.issiso():
+        sizes = f"{loop.ninputs} x {loop.noutputs}"
+        raise ValueError(f"margins need one input and one output, got {sizes}")
+    dt = float(loop.dt)
+    top = math.pi / dt
+
+    def evaluate_loop(omega: float) -> complex:
+        return complex(_compute_response(loop, np.exp(1j * np.array([omega * dt])))[0])
+
+    grid = top * np.logspace(-_DECADES, 0.0, _POINTS)[:-1]
+    signs = np.sign(_compute_response(loop, np.exp(1j * grid * dt)).imag)
+    frequencies = [
+        float(brentq(lambda w: evaluate_loop(w).imag, low, high, xtol=1e-14 * low, rtol=1e-14))
+        for low, high, changes in zip(grid, grid[1:], signs[:-1] * signs[1:] < 0.0, strict=False)
+        if changes
+    ]
+    values = [(evaluate_loop(omega), omega) for omega in frequencies]
+    factors = [(1.0 / abs(value), omega) for value, omega in values if value.real < 0.0]
+    end = evaluate_loop(top).real
+    return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
+
+
+def _compute_gain_margin(loop: "Loop") -> tuple[float, float]:
+    """Compute the smallest gain (dB) above 1 with which a loop reaches -1, and its rad/s."""
+    margins = _find_crossings(loop)
+    rising = margins[margins[:, 0] > 1.0]
+    if not len(rising):
+        return math.inf, math.nan
+    factor, omega = rising[np.argmin(rising[:, 0])]
+    return 20.0 * math.log10(factor), float(omega)
+
+
+def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+    """Compute a loop's response at points z, (n,); one solve takes all points of a state space."""
+    if not hasattr(loop, "A"):
+        return np.asarray(loop(z))
+    shifted = z[:, None, None] * np.eye(len(loop.A)) - loop.A
+    return np.asarray((loop.C @ np.linalg.solve(shifted, loop.B[None]) + loop.D)[:, 0, 0])
 
 
 PAPER = "tie-vision"
@@ -213,7 +262,7 @@ def _measure_static_slip(_: int) -> tuple[Numbers, None]:
 def _compute_margin_gain(design: LoopDesign) -> float:
     """Compute by how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
     loops = [_make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK)]
-    slow, fast = (compute_gain_margin(loop)[0] for loop in loops)
+    slow, fast = (_compute_gain_margin(loop)[0] for loop in loops)
     return float(fast - slow)
 
 
@@ -230,7 +279,7 @@ def _measure_table_two(_: int) -> tuple[Numbers, Example]:
     }
     design = at_25[0].design if at_25 else LoopDesign()
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
-        decibels, omega = compute_gain_margin(_make_estimator_loop(COMS, design, dt))
+        decibels, omega = _compute_gain_margin(_make_estimator_loop(COMS, design, dt))
         numbers[label, "gain_margin"] = decibels
         numbers[label, "crossover"] = round(omega / (2.0 * math.pi), 2)
     return numbers, _compute_magnitudes(design)
@@ -260,64 +309,62 @@ SIMULATIONS = (
 )
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(24)", "the feedforward brings the static slip to zero",
-        make_number_part("slip left, 10 to 45 km/h", STATIC, "feedforward", "static_slip",
+        ClaimPart("slip left, 10 to 45 km/h", STATIC, "feedforward", "static_slip",
             Bound("<", 1e-9), Bound("<", 1e-9), "static_slip")),
     claim("Table II", "gain margins of 5.92 dB at 15.15 Hz and 22.8 dB at 477.46 Hz",
-        make_number_part("farther of both margins from the printed ones, best loop / dB", TABLE2,
+        ClaimPart("farther of both margins from the printed ones, best loop / dB", TABLE2,
             "loops", "off", Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
-        make_number_part("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off",
+        ClaimPart("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off",
             Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
         *(
-            make_number_part(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
+            ClaimPart(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
                 Bound("=", hertz), metric="hertz")
             for label, hertz in zip((SINGLE, MULTI), HERTZ, strict=True)
         ),
-        make_number_part("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
+        ClaimPart("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
             metric="count"),
         note="The table gives no speed, no Q and R, no discretisation: a search of "
         "4590 loops finds those that fit. Several do, at several speeds: the table does not tell "
         "which was meant. Every loop crosses at half its sampling rate; 477.46 Hz is 3000 rad/s, "
         "probably where a frequency grid ended."),
     claim("Table II", "multirate feedback raises the gain margin",
-        make_number_part("multirate - single-rate, the same PI / dB", TABLE2, "same PI", "raised",
+        ClaimPart("multirate - single-rate, the same PI / dB", TABLE2, "same PI", "raised",
             Bound(">", 0.0), Bound(">=", 20.0), "decibels")),
     claim("Fig. 8", "the controller reduces the slip",
         *(
-            make_smaller_part(f"{agent} / none, {_TYRES[name]}", name, agent, "none", max_ratio,
-                "rms_slip")
+            compare(f"{agent} / none, {_TYRES[name]}", name, agent, "none", max_ratio, "rms_slip")
             for name, max_ratio in ((FIG8, 0.40), (STIFF, 0.55))
             for agent in (SINGLE, MULTI)
         )),
     claim("Fig. 8 (a)", "the multirate controller keeps the slip smaller than the single-rate one",
         *(
-            make_smaller_part(f"{agent} / single-rate, {_TYRES[name]}", name, agent, SINGLE,
+            compare(f"{agent} / single-rate, {_TYRES[name]}", name, agent, SINGLE,
                 max_ratio, "rms_slip")
             for name, max_ratio in ((FIG8, 0.92), (STIFF, None))
             for agent in (MULTI, PROPOSED)
         )),
     claim("Fig. 8 (b)", "the multirate controller's input is smoother",
-        make_smaller_part("largest 1 ms step, pseudo-residuals / single-rate", FIG8, PROPOSED,
+        compare("largest 1 ms step, pseudo-residuals / single-rate", FIG8, PROPOSED,
             SINGLE, 0.4, "largest_step"),
-        make_smaller_part("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
-            metric="total_variation")),
+        compare("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
+            quantity="total_variation")),
     claim("Fig. 8", "the gain margins of both control systems were set to be the same",
-        make_number_part(
+        ClaimPart(
             "share of time at the yaw moment's limit, multirate with single-rate's margin", FIG8,
             EQUAL, "saturation", metric="share"),
         ClaimPart("its slip / multirate with the same PI", FIG8,
-            select_ratio(FIG8, EQUAL, MULTI, metric="rms_slip")),
+            EQUAL, "rms_slip", rivals=(MULTI,)),
         note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
         "limit to limit with the noise."),
     claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",
-        make_smaller_part("single-rate / none", FIG10, SINGLE, "none", metric="rms_slip"),
-        make_smaller_part("pseudo-residuals / none", FIG10, PROPOSED, "none", metric="rms_slip"),
-        make_smaller_part("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE,
-            metric="rms_slip")),
+        compare("single-rate / none", FIG10, SINGLE, "none", quantity="rms_slip"),
+        compare("pseudo-residuals / none", FIG10, PROPOSED, "none", quantity="rms_slip"),
+        compare("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE, quantity="rms_slip")),
 )
 
 _BETA, _MOMENT = "body slip angle / rad", "yaw moment / (N m)"
@@ -328,22 +375,23 @@ _BEHIND = {
 }
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    figure("Table II: the open loops", TABLE2, draw_loops,
+    figure("Table II: the open loops", TABLE2,
+        Curves("magnitude", "gain of the open loop / dB", x_label="frequency / Hz"),
         "Each line ends at half its sampling rate, where the phase is -180 deg: the gain margin "
         "is how far it is below 0 dB there."),
     *(
         figure(f"{paper} {panel}{more}", name, draw, caption)
         for name, (paper, more, caption) in _BEHIND.items()
         for panel, draw in (
-            ("(a): body slip angle", make_curves("beta", _BETA, ("none", SINGLE, PROPOSED, MULTI))),
-            ("(b): yaw moment", make_curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED, MULTI))))
+            ("(a): body slip angle", Curves("beta", _BETA, ("none", SINGLE, PROPOSED, MULTI))),
+            ("(b): yaw moment", Curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED, MULTI))))
     ),
     figure("Fig. 10 (a) (twin): steering input", FIG10,
-        make_curves("steer", "front steering angle / rad", ("none",)),
+        Curves("steer", "front steering angle / rad", ("none",)),
         "A lane change by the steering motor."),
     figure("Fig. 10 (b) (twin): body slip angle", FIG10,
-        make_curves("beta", _BETA, ("none", SINGLE, PROPOSED)),
+        Curves("beta", _BETA, ("none", SINGLE, PROPOSED)),
         "The road test's simulated twin, with everything that the plant has."),
     figure("Fig. 10 (c) (twin): yaw moment", FIG10,
-        make_curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED)), "Single-rate decides every 33 ms."),
+        Curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED)), "Single-rate decides every 33 ms."),
 )

@@ -1,4 +1,4 @@
-"""tie-vision's theory: the recursions of its appendix, its convergence, and gain margins of loops.
+"""tie-vision's theory: the recursions of its appendix, and its convergence.
 
 The appendix is checked term by term on random time-varying systems with random gains, as printed
 and as docs/PAPERS.md corrects it. The one-step lines of cases 1 and 2 are no equations between
@@ -7,15 +7,11 @@ gain (16) and (21) use between samples. Two are tried: the Kalman gain of (13) a
 row corrected at every step, and the shipped filter's, the multirate gain spread over the frame.
 """
 
-import math
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
-from scipy.optimize import brentq
 
 from ...envs.record import Array
 from ...envs.scenarios.draws import KMH
@@ -25,15 +21,8 @@ from ...envs.vehicle.parameters import COMS
 from ...estimators.design import kalman
 from ...estimators.make import make_estimator
 from . import theory
-from .ledger import (
-    Analysis,
-    Bound,
-    Example,
-    Numbers,
-    make_claim_factory,
-    make_number_part,
-)
-from .manoeuvres import PaperFigure, make_curves
+from .ledger import Analysis, Bound, Claim, ClaimPart, Example, Numbers
+from .manoeuvres import Curves, PaperFigure
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3
@@ -234,16 +223,16 @@ SIMULATIONS = (
 )
 
 _zero = Bound("<=", 1e-12)
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Appendix",
         "pseudo-residuals let the estimate converge, as measurements at every step would",
-        make_number_part("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
+        ClaimPart("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
             "difference", Bound("<=", 1e-9), metric="difference"),
         *(
-            make_number_part(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
+            ClaimPart(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
                 "share", Bound("=", 0.0), metric="share")
             for gain in (LITERAL, SPREAD)
         ),
@@ -252,8 +241,7 @@ CLAIMS = (
         "leaves open."),
     claim("Appendix", "the error recursions of the three cases",
         *(
-            make_number_part(f"{case}, residual", APPENDIX, case, "residual",
-                None if corrected else _zero,
+            ClaimPart(f"{case}, residual", APPENDIX, case, "residual", None if corrected else _zero,
                 _zero if corrected or not case.endswith("printed") else None, "residual")
             for case, corrected in (("case 1", False), ("case 2", False), ("case 3 (a)", True),
                 ("case 3 (a), printed", False), ("case 3 (b)", True),
@@ -266,76 +254,7 @@ CLAIMS = (
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
     figure("Appendix: what is left of an error between samples", MAPS,
-        make_curves("error", "size of the error / its size before the sample", x_label="time / ms"),
+        Curves("error", "size of the error / its size before the sample", x_label="time / ms"),
         "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
         "correction in between (case 2); pseudo-residuals: case 3. Without noise."),
 )
-
-
-if TYPE_CHECKING:
-    from control import StateSpace, TransferFunction
-
-    Loop: TypeAlias = StateSpace | TransferFunction
-
-
-# Gain margins: how much the loops of the paper's Table II may grow until they reach -1.
-_DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
-
-
-def _find_crossings(loop: "Loop") -> Array:
-    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
-
-    L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
-    python-control's `stability_margins` finds crossings by a change of sign, and there is none at
-    the end of the axis. The others are bracketed on a grid (4000 points over six decades) and
-    refined: a pair of crossings closer than that is missed.
-
-    Raises ValueError for a loop in continuous time or with several inputs or outputs.
-    """
-    if not loop.isdtime(strict=True) or loop.dt is True:
-        raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
-    if not loop.issiso():
-        sizes = f"{loop.ninputs} x {loop.noutputs}"
-        raise ValueError(f"margins need one input and one output, got {sizes}")
-    dt = float(loop.dt)
-    top = math.pi / dt
-
-    def evaluate_loop(omega: float) -> complex:
-        return complex(_compute_response(loop, np.exp(1j * np.array([omega * dt])))[0])
-
-    grid = top * np.logspace(-_DECADES, 0.0, _POINTS)[:-1]
-    signs = np.sign(_compute_response(loop, np.exp(1j * grid * dt)).imag)
-    frequencies = [
-        float(brentq(lambda w: evaluate_loop(w).imag, low, high, xtol=1e-14 * low, rtol=1e-14))
-        for low, high, changes in zip(grid, grid[1:], signs[:-1] * signs[1:] < 0.0, strict=False)
-        if changes
-    ]
-    values = [(evaluate_loop(omega), omega) for omega in frequencies]
-    factors = [(1.0 / abs(value), omega) for value, omega in values if value.real < 0.0]
-    end = evaluate_loop(top).real
-    return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
-
-
-def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
-    """Compute the smallest gain above 1 with which a loop reaches -1.
-
-    Args:
-        loop: Loop in discrete time with one input and one output.
-
-    Returns:
-        Gain (dB) and frequency (rad/s); inf and NaN if none does.
-    """
-    margins = _find_crossings(loop)
-    rising = margins[margins[:, 0] > 1.0]
-    if not len(rising):
-        return math.inf, math.nan
-    factor, omega = rising[np.argmin(rising[:, 0])]
-    return 20.0 * math.log10(factor), float(omega)
-
-
-def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-    """Compute a loop's response at points z, (n,); one solve takes all points of a state space."""
-    if not hasattr(loop, "A"):
-        return np.asarray(loop(z))
-    shifted = z[:, None, None] * np.eye(len(loop.A)) - loop.A
-    return np.asarray((loop.C @ np.linalg.solve(shifted, loop.B[None]) + loop.D)[:, 0, 0])

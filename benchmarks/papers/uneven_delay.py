@@ -2,17 +2,8 @@
 
 from functools import partial
 
-from .ledger import (
-    Analysis,
-    Bound,
-    ClaimPart,
-    PaperFilter,
-    make_claim_factory,
-    make_number_part,
-    make_smaller_part,
-    select_ratio,
-)
-from .manoeuvres import EstimationSimulation, PaperFigure, draw_delays, make_curves, make_offset
+from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
+from .manoeuvres import Curves, EstimationSimulation, PaperFigure
 from .theory import compute_coms_ranks
 
 PAPER = "uneven-delay"
@@ -44,17 +35,17 @@ SIMULATIONS = (
 )
 
 _NOISES = ((FIG5, ""), (NOISY, ", three times the noise"))
-claim = make_claim_factory(PAPER)
+claim = partial(Claim, PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Sec. 1.3", "slip is observable from vision alone",
-        make_number_part("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
+        ClaimPart("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
             Bound("=", 4.0), "rank"),
-        make_smaller_part("vision alone / the slip itself", FIG5, VISION, "truth")),
+        compare("vision alone / the slip itself", FIG5, VISION, "truth")),
     claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
         *(
-            make_smaller_part(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
+            compare(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
                 max_ratio, "y_l")
             for scenario, text in _NOISES
             for delay, rival, max_ratio in (("33 ms", FRAME, 0.80),
@@ -65,37 +56,36 @@ CLAIMS = (
         "is the same."),
     claim("Fig. 5", "what exact handling of the delay is worth, lateral offset",
         *(
-            ClaimPart(f"exact rollback / constant 17 ms{text}", scenario,
-                select_ratio(scenario, EXACT, ROLLBACK_17, metric="y_l"),
-                threshold=Bound("<=", 0.95) if scenario == FIG5 else None)
+            ClaimPart(f"exact rollback / constant 17 ms{text}", scenario, EXACT, "y_l",
+                threshold=Bound("<=", 0.95) if scenario == FIG5 else None, rivals=(ROLLBACK_17,))
             for scenario, text in _NOISES
         )),
     claim("Fig. 5", "what the delay does to the slip",
         *(
-            ClaimPart(f"slip, proposed / constant 33 ms{text}", scenario,
-                select_ratio(scenario, PROPOSED, FRAME))
+            ClaimPart(f"slip, proposed / constant 33 ms{text}", scenario, PROPOSED, rivals=(FRAME,))
             for scenario, text in _NOISES
         ),
         note="The paper shows the lateral offset alone. A delay of one frame too many turns the "
         "phase of the slip as too soft tyres do, the other way: with noise the two errors cancel."),
     claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
-        make_smaller_part("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, metric="y_l"),
-        make_smaller_part("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, metric="y_l")),
+        compare("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, quantity="y_l"),
+        compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")),
 )
 
-_SHOWN = ("truth", FRAME, PROPOSED)
+_SHOWN, _OFFSET = ("truth", FRAME, PROPOSED), "lateral offset / m"
+_DELAY = Curves("delay", "delay / ms", window=(0.0, 1.0))
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    figure("Fig. 4: delay of each frame", FIG5, draw_delays, "20, 15, 10, 25 ms, repeated."),
+    figure("Fig. 4: delay of each frame", FIG5, _DELAY, "20, 15, 10, 25 ms, repeated."),
     figure("Fig. 5: lateral offset at the preview point", FIG5,
-        make_offset(_SHOWN, (4.0, 4.5)),
+        Curves("offset", _OFFSET, _SHOWN, (4.0, 4.5)),
         "Truth, the camera's held late samples, a constant delay and the proposed filter."),
     figure("Fig. 5: body slip angle", FIG5,
-        make_curves("beta", "body slip angle / rad", ("truth", FRAME, PROPOSED, VISION)),
+        Curves("beta", "body slip angle / rad", ("truth", FRAME, PROPOSED, VISION)),
         "The same drive; the paper shows the offset alone."),
-    figure("Fig. 6 (twin): delay of each frame", FIG7, draw_delays,
+    figure("Fig. 6 (twin): delay of each frame", FIG7, _DELAY,
         "Processing takes 9 to 18 ms, as on the road."),
     figure("Fig. 7 (twin): lateral offset at the preview point", FIG7,
-        make_offset(_SHOWN, (20.0, 20.5)),
+        Curves("offset", _OFFSET, _SHOWN, (20.0, 20.5)),
         "The driver's sine at about 28 km/h, half a second."),
 )

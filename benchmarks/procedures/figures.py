@@ -1,52 +1,56 @@
 """The suite's figures: yaw rate with its criteria, tracks with cones, frequency responses."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from ...envs.record import Array
 from ...envs.rendering.palette import GREY, INK, find_colour
-from ..harness.results import Suite
 from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
-from .drive import CARS
-from .tables import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
+from .drive import CARS, CaseResults, ProcedureCase, Series
 
 
-def add(suite: Suite, done: CaseResults) -> None:
-    """Add every figure of the results to a suite.
+def draw_figures(results: Mapping[str, CaseResults]) -> list[tuple[str, go.Figure, str]]:
+    """Draw every figure of the results.
 
     Args:
-        suite: Suite that gets the figures.
-        done: Result of every case.
+        results: Results of the cases by procedure.
+
+    Returns:
+        Titles, figures and captions.
     """
+    figures = []
     for car in CARS:
-        car_results = {case: result for case, result in done.items() if case.car == car}
+        of_car = {x: {k: y for k, y in z.items() if k.car == car} for x, z in results.items()}
         title = f"FMVSS 126, {car}: yaw rate at 5 A over its own peak"
         text = (
             "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A car "
             "that spins before completion of steer is left out."
         )
-        suite.figures.append((title, _draw_yaw_rates(select_cases(car_results, "fmvss-126")), text))
+        figures.append((title, _draw_yaw_rates(of_car["fmvss-126"]), text))
         for name in iso3888.TRACKS:
-            attempts = select_cases(car_results, name)
-            runs = {case: _choose_best(result) for case, result in attempts.items()}
+            runs = {case: _choose_best(result) for case, result in of_car[name].items()}
             speeds = ", ".join(f"{k.agent} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
             text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
-            suite.figures.append((f"{name}, {car}: way and cones", _draw_cones(runs), text))
-        for result in select_cases(car_results, "iso-7401").values():
+            figures.append((f"{name}, {car}: way and cones", _draw_cones(runs), text))
+        for result in of_car["iso-7401"].values():
             text = "Dots: measured by a swept sine, no control. Line: the linear model."
             title = f"ISO 7401, {car}: frequency response to steering"
-            suite.figures.append((title, _draw_bode(result), text))
+            figures.append((title, _draw_bode(result), text))
+    return figures
 
 
-def _draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> go.Figure:
+def _draw_yaw_rates(done: CaseResults) -> go.Figure:
     """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
-    t = max((result.shown.t for result in done.values()), key=len)
+    drives = {case.agent: result.shown for case, result in done.items()}
+    t = max((shown.t for shown in drives.values()), key=len)
     series = {
-        case.agent: _compute_shares(result, t)
-        for case, result in done.items()
-        if result.shown.t[-1] >= fmvss126.COMPLETION
+        agent: _compute_shares(shown, t)
+        for agent, shown in drives.items()
+        if shown.t[-1] >= fmvss126.COMPLETION
     }
     figure = draw_time_series(t, series, "yaw rate / its peak after the reversal")
     for time, max_ratio in fmvss126.RATIOS:
@@ -58,9 +62,8 @@ def _draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> go.Figure:
     return figure
 
 
-def _compute_shares(result: SineDwellOutcome, t: Array) -> Array:
+def _compute_shares(shown: Series, t: Array) -> Array:
     """Compute the yaw rate over its peak at the times t; NaN after the drive's end."""
-    shown = result.shown
     steered = (shown.t >= fmvss126.REVERSAL) & (shown.t <= fmvss126.COMPLETION)
     peak = np.max(-shown.gamma[steered], initial=1e-9)  # the first half steers to the left
     return np.interp(t, shown.t, -shown.gamma / peak, right=np.nan)
@@ -92,7 +95,7 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
     return figure
 
 
-def _draw_bode(result: Transient) -> go.Figure:
+def _draw_bode(result: iso7401.Transient) -> go.Figure:
     """Draw magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):

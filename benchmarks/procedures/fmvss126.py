@@ -91,16 +91,8 @@ def _list_amplitudes(A: float) -> Array:
     return np.append(A * (FIRST + STEP * np.arange(count)), last)
 
 
-def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
-    """Make a sine with dwell.
-
-    Args:
-        car: Car under test, with speed and steering ratio.
-        amplitude: Amplitude (rad at the steering wheel), signed as its first half.
-
-    Returns:
-        Fields of the scenario.
-    """
+def _make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
+    """Make a sine with dwell; amplitude: rad at the steering wheel, signed as its first half."""
     return {
         "steering": "sine-with-dwell", "onset": ONSET, "amplitude": amplitude / car.ratio,
         "frequency": FREQUENCY, "hold": DWELL, "speed": car.speed, "acceleration": 0.0,
@@ -129,6 +121,7 @@ class SineDwellResult:
 
     A: float  # rad at the steering wheel, the mean of both sides'
     runs: tuple[SineDwellRun, ...]  # as they were driven
+    shown: Series | None = None  # one more, to look at
 
     @property
     def passed(self) -> bool:
@@ -164,6 +157,7 @@ def run(
     car: TestCar,
     A: float,
     multiples: Sequence[float] | None = None,
+    shown: float | None = None,
 ) -> SineDwellResult:
     """Run the procedure.
 
@@ -172,11 +166,13 @@ def run(
         car: Car under test, with speed and steering ratio.
         A: Reference angle (rad at the steering wheel).
         multiples: Amplitudes (of A); None: the standard's series.
+        shown: Amplitude (of A) of one more run, which is not judged; None: there is none.
 
     Returns:
         The runs, both sides of each amplitude.
     """
     angles = _list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
-    runs = [_evaluate_run(drive(make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
-    return SineDwellResult(A, tuple(runs))
+    runs = [_evaluate_run(drive(_make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
+    more = None if shown is None else drive(_make_sine_with_dwell(car, shown * A))
+    return SineDwellResult(A, tuple(runs), more)

@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from ...envs.record import Array
 from ...envs.vehicle.linear import make_bicycle_model
-from ...envs.vehicle.parameters import Vehicle
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
+from .iso4138 import compute_understeer_gradient
 
 _Complex = npt.NDArray[np.complex128]
 
@@ -27,6 +28,8 @@ ONSET = 1.0  # s
 LOWEST, HIGHEST = 0.2, 2.0  # Hz
 _SEGMENT = 10.0  # s, of the averaged periodograms
 OUTPUTS = ("gamma", "a_y")
+_STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
+_SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
 
 
 @dataclass(frozen=True)
@@ -49,16 +52,8 @@ class FrequencyResponse:
     sd: Array  # of the real or the imaginary part of H
 
 
-def make_step(car: TestCar, steer: float) -> Fields:
-    """Make a step of the steering angle that is held for 4 s.
-
-    Args:
-        car: Car under test, with speed and steering ratio.
-        steer: Steering angle (rad).
-
-    Returns:
-        Fields of the scenario.
-    """
+def _make_step(car: TestCar, steer: float) -> Fields:
+    """Make a step of the steering angle (rad) that is held for 4 s."""
     steering = {"steering": "held-step", "amplitude": steer, "onset": ONSET}
     return steering | {"speed": car.speed, "duration": ONSET + 4.0}
 
@@ -110,19 +105,10 @@ def _estimate_frequency_response(
     return FrequencyResponse(frequency[in_range], H, coherence, sd)
 
 
-def compute_linear_response(
+def _compute_linear_response(
     vehicle: Vehicle, speed: float, frequency: Array
 ) -> dict[str, _Complex]:
-    """Compute the linear model's response to steering.
-
-    Args:
-        vehicle: Vehicle of the linear model.
-        speed: Speed (m/s).
-        frequency: Frequencies (Hz), shape (k,).
-
-    Returns:
-        Response by output, shape (k,) each.
-    """
+    """Compute the linear model's response to steering by output, (k,); frequency in Hz."""
     model = make_bicycle_model(vehicle, speed)
     B = model.B[:, 0]
     turned = [np.linalg.solve(2j * np.pi * f * np.eye(2) - model.A, B) for f in frequency]
@@ -131,17 +117,8 @@ def compute_linear_response(
     return {"gamma": gamma, "a_y": a_y}
 
 
-def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of the linear model under the same steering.
-
-    Args:
-        vehicle: Vehicle of the linear model.
-        speed: Speed (m/s).
-        series: Motion of the car after a step.
-
-    Returns:
-        Numbers by output.
-    """
+def _compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
+    """Compute the step's numbers of the linear model under the same steering by output."""
     from scipy.signal import lsim
 
     model = make_bicycle_model(vehicle, speed)
@@ -152,31 +129,16 @@ def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[
     return {name: _compute_step_response(series.t, series.steer, y) for name, y in outputs}
 
 
-def compute_responses(series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of yaw rate and lateral acceleration after a step.
-
-    Args:
-        series: Motion of the car after a step.
-
-    Returns:
-        Numbers by output.
-    """
+def _compute_responses(series: Series) -> dict[str, StepResponse]:
+    """Compute the numbers of yaw rate and lateral acceleration after a step."""
     t, steer = series.t, series.steer
     return {name: _compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
 
 
-def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
-    """Drive a sine whose frequency rises from 0.05 to 2.5 Hz, and estimate the responses.
+def _run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
+    """Drive a sine from 0.05 to 2.5 Hz, and estimate the responses; steer: amplitude (rad).
 
     It has passed half a segment when it comes to the lowest frequency of the standard.
-
-    Args:
-        drive: Function that drives the car through a scenario.
-        car: Car under test, with speed and steering ratio.
-        steer: Amplitude of the steering angle (rad).
-
-    Returns:
-        Frequency response by output.
     """
     seconds = 100.0
     series = drive({
@@ -186,3 +148,32 @@ def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, Fre
     })  # fmt: skip
     t, steered = series.t, series.steer
     return {x: _estimate_frequency_response(t, steered, getattr(series, x)) for x in OUTPUTS}
+
+
+@dataclass(frozen=True)
+class Transient:
+    """The responses of a car by output, measured and of the linear model."""
+
+    step: dict[str, StepResponse]
+    linear_step: dict[str, StepResponse]
+    sweep: dict[str, FrequencyResponse]
+    linear_sweep: dict[str, _Complex]
+
+
+def run(drive: DriveFunction, car: TestCar) -> Transient:
+    """Drive the step and the sweep.
+
+    Args:
+        drive: Function that drives the car through a scenario.
+        car: Car under test, with speed and steering ratio.
+
+    Returns:
+        The responses.
+    """
+    vehicle, speed = car.vehicle, car.speed
+    per = vehicle.wheelbase / speed**2 + compute_understeer_gradient(vehicle)  # rad s2/m
+    stepped = drive(_make_step(car, per * _STEP_AT))
+    sweep = _run_sweep(drive, car, per * _SWEEP_AT)
+    linear_step = _compute_linear_step(vehicle, speed, stepped)
+    linear = _compute_linear_response(vehicle, speed, sweep[OUTPUTS[0]].frequency)
+    return Transient(_compute_responses(stepped), linear_step, sweep, linear)

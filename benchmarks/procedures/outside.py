@@ -5,20 +5,37 @@ with a yaw moment of at most 500 N m it passes at 6.5 A. The law is a saturating
 true yaw rate's error against a neutral car's within the friction.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.outside.plants import make_outside_vehicle
+from ...envs.outside.plants import (
+    OUTSIDE_PLANTS,
+    OutsideInputs,
+    OutsidePlant,
+    make_outside_vehicle,
+)
+from ...envs.record import Array
+from ...envs.scenarios.draws import Draws
+from ...envs.scenarios.scenario import Scenario
+from ...envs.scenarios.steering import (
+    STEERING_KINDS,
+    STEERING_WIDTH,
+    compute_steering,
+    write_steering,
+)
+from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.drives import make_env
 from . import fmvss126
-from .drive import OUTSIDE_ID, ProcedureEntry, make_outside_car, make_plant_drive
+from .drive import CALM, POSE, DriveFunction, Fields, ProcedureEntry, Series, TestCar
 
-MODEL = "drift"
+MODEL, _ENV_ID = "drift", "sideslip/Outside-v0"
 _LIMIT = 500.0  # N m
 _GAIN = 2e4  # N m s/rad
 _FAILS_AT, _PASSES_AT = 5.0, 6.5  # of A
@@ -32,12 +49,78 @@ _SCENARIO: dict[str, Any] = {
 """A lane change within what the outside car was made for, drawn by the seed."""
 
 
+Law = Callable[[Motion, float], float]
+"""A yaw moment in N m from the true motion and the steering angle."""
+
+_SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
+
+
 def _compute_limited_moment(motion: Motion, steer: float) -> float:
     """Compute the check's yaw moment (N m)."""
     car = make_outside_vehicle()
     max_yaw_rate = 0.85 * GRAVITY * car.friction / motion.v_x
     goal = min(max(motion.v_x * steer / car.wheelbase, -max_yaw_rate), max_yaw_rate)
     return float(min(max(_GAIN * (goal - motion.gamma), -_LIMIT), _LIMIT))
+
+
+def _make_plant_drive(model: str, law: Law | None = None) -> DriveFunction:
+    """Make drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
+
+    The scenario's field `acceleration` None holds the speed, 0 lets the car coast.
+    """
+
+    def run_drive(fields: Fields) -> Series:
+        scenario = Scenario(**(CALM | dict(fields)))
+        profile, hold = _make_steering_profile(scenario), scenario.acceleration is None
+        return _simulate_plant(
+            OUTSIDE_PLANTS[model](None),
+            lambda t: float(compute_steering(t / TICK, profile)),
+            scenario.range("speed")[0],
+            scenario.duration,
+            hold,
+            law,
+        )
+
+    return run_drive
+
+
+def _simulate_plant(
+    plant: OutsidePlant,
+    steering: Callable[[float], float],
+    speed: float,
+    duration: float,
+    hold: bool = False,
+    law: Law | None = None,
+) -> Series:
+    """Simulate an outside plant from straight ahead under a steering angle (rad) over time (s).
+
+    hold: a force keeps the speed (m/s); otherwise the car coasts.
+    """
+    plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    rows = [[0.0, steering(0.0), *plant.motion[:POSE], 0.0]]
+    for k in range(round(duration / TICK)):
+        steer, motion = steering(k * TICK), plant.motion
+        moment = 0.0 if law is None else law(motion, steer)
+        push = plant.p.m * plant.p.R_w * _SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
+        turn = plant.p.R_w / plant.p.T_r * moment
+        plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
+        if not plant.is_finite:
+            break
+        rows.append([(k + 1) * TICK, steer, *plant.motion[:POSE], moment])
+    return replace(Series(*np.array(rows).T), failed=not plant.is_finite)
+
+
+def _make_steering_profile(scenario: Scenario) -> Array:
+    """Make the numbers that `compute_steering` reads, of a scenario that draws nothing.
+
+    Raises ValueError for a range: a procedure leaves nothing to the seed.
+    """
+    low, high = scenario.get_draw_ranges()
+    if (low != high).any():
+        raise ValueError(f"scenario {scenario.name!r} draws; a procedure gives numbers")
+    profile = np.zeros(STEERING_WIDTH)
+    write_steering(STEERING_KINDS.index(scenario.steering), Draws(*low.tolist()), profile)
+    return profile
 
 
 @dataclass(frozen=True)
@@ -55,8 +138,9 @@ class OutsideCheck:
 
 def run_check() -> OutsideCheck:
     """Drive the check; A is the uncontrolled car's."""
-    car, none = make_outside_car(), make_plant_drive(MODEL)
-    law = make_plant_drive(MODEL, _compute_limited_moment)
+    car = TestCar(make_outside_vehicle(), 80.0 / 3.6, 16.0, 4.508, 0.8)  # a BMW 320i
+    none = _make_plant_drive(MODEL)
+    law = _make_plant_drive(MODEL, _compute_limited_moment)
     A = fmvss126.measure_reference_angle(none, car)
     pairs = ((none, _FAILS_AT), (law, _PASSES_AT))
     return OutsideCheck(*(fmvss126.run(drive, car, A, [multiple]) for drive, multiple in pairs))
@@ -84,7 +168,7 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> lis
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     agent_name, estimator, estimate = entry.get_configuration(model)
-    env = make_env(OUTSIDE_ID, estimator, estimate, **options)
+    env = make_env(_ENV_ID, estimator, estimate, **options)
     agent = make_agent(agent_name, env)
     rollouts = [rollout(env, agent, seed) for seed in seeds]
     return [OutsideEpisode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in rollouts]

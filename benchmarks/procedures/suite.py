@@ -1,33 +1,29 @@
 """Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
 
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
+from ...agents.rollout import compute_cost_ratios
 from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.parameters import GRAVITY
-from ..harness.parallel import run_cases
-from ..harness.results import Suite
+from ..harness.results import Column, ResultTable, Suite
+from ..harness.stats import geometric_mean, interval
 from ..harness.verdict import format_verdict, summarise_names
-from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
-from .drive import CARS, ENTRIES
-from .tables import (
-    NAME,
-    CaseResult,
-    CaseResults,
-    ProcedureCase,
-    SineDwellOutcome,
-    Transient,
-    select_cases,
-)
+from ..report.study import Request, Study
+from . import fmvss126, iso3888, iso4138, iso7401, outside
+from .drive import CARS, ENTRIES, CaseResults, ProcedureCase
 
+NAME = "procedures"
+RIVAL = "lqr"  # against whom costs on outside plants are paired
 SHOWN = 5.0  # of A: the sine with dwell in the figures
 _QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
 EPISODES, QUICK_EPISODES = 20, 2
-_STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
-_SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
 
+_HAS_OUTSIDE = find_spec("vehiclemodels") is not None
 _TEXT = (
     "Standard manoeuvres driven by the book. FMVSS 126: sine with dwell, amplitudes in units of A, "
     "the steering wheel angle at 0.3 g; A is the uncontrolled car's, so that all are steered alike "
@@ -35,15 +31,15 @@ _TEXT = (
     "check of the car's body against the cones. ISO 4138: understeer gradient of a circle driven "
     "slowly faster. ISO 7401: step and swept sine. The COMS is tested at 40 km/h, on tracks of "
     "half the length: it oversteers and is unstable above 63 km/h. The 0.3 g and the 1.83 m stay. "
-    "The passenger car is tested at 80 km/h. References are limited by friction."
+    "The passenger car is tested at 80 km/h. References are limited by friction. Outside plants "
+) + (
+    "are CommonRoad's models of a BMW 320i, whose equations and tyres are not ours."
+    if _HAS_OUTSIDE
+    else "are left out: pip install 'sideslip[outside]'."
 )
-_OUTSIDE = (
-    " Outside plants are CommonRoad's models of a BMW 320i, whose equations and tyres are not ours."
-)
-_NONE_OUTSIDE = " Outside plants are left out: pip install 'sideslip[outside]'."
 
 
-def measure(case: ProcedureCase) -> CaseResult:
+def measure(case: ProcedureCase) -> Any:
     """Drive a case.
 
     Args:
@@ -59,27 +55,11 @@ def measure(case: ProcedureCase) -> CaseResult:
     car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
     if case.procedure == "fmvss-126":
         A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car), car)
-        result = fmvss126.run(drive, car, A, _QUICK_MULTIPLES if case.quick else None)
-        return SineDwellOutcome(result, drive(fmvss126.make_sine_with_dwell(car, SHOWN * A)))
+        return fmvss126.run(drive, car, A, _QUICK_MULTIPLES if case.quick else None, SHOWN)
     if case.procedure in iso3888.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
         return iso3888.run(drive, car, case.procedure, (car.speed * shares).tolist())
-    if case.procedure == "iso-4138":
-        return iso4138.run(drive, car)
-    return _measure_transient(case)
-
-
-def _measure_transient(case: ProcedureCase) -> Transient:
-    car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
-    gradient = iso4138.compute_understeer_gradient(car.vehicle)
-    per = car.vehicle.wheelbase / car.speed**2 + gradient  # rad s2/m
-    stepped = drive(iso7401.make_step(car, per * _STEP_AT))
-    sweep = iso7401.run_sweep(drive, car, per * _SWEEP_AT)
-    frequency = sweep[iso7401.OUTPUTS[0]].frequency
-    step = iso7401.compute_responses(stepped)
-    linear_step = iso7401.compute_linear_step(car.vehicle, car.speed, stepped)
-    linear_sweep = iso7401.compute_linear_response(car.vehicle, car.speed, frequency)
-    return Transient(step, linear_step, sweep, linear_sweep)
+    return (iso4138 if case.procedure == "iso-4138" else iso7401).run(drive, car)
 
 
 def _make_cases(quick: bool) -> list[ProcedureCase]:
@@ -88,7 +68,7 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
     driven = ("fmvss-126", *iso3888.TRACKS)
     cases = [ProcedureCase(p, car, k, (), quick) for p in driven for car in CARS for k in indices]
     cases += [ProcedureCase(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
-    if find_spec("vehiclemodels") is None:
+    if not _HAS_OUTSIDE:
         return cases
     cases.append(ProcedureCase("check", outside.MODEL))
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
@@ -97,26 +77,24 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
     return cases
 
 
-def make_verdict(done: CaseResults) -> str:
-    """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are.
+def _group_results(done: CaseResults) -> dict[str, CaseResults]:
+    """Group results by procedure."""
+    names = dict.fromkeys(case.procedure for case in done)
+    return {name: {x: y for x, y in done.items() if x.procedure == name} for name in names}
 
-    Args:
-        done: Result of every case.
 
-    Returns:
-        Verdict.
-    """
+def _make_verdict(done: CaseResults) -> str:
+    """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
     passed, lanes = [], []
     for car in CARS:
-        car_results = {case: result for case, result in done.items() if case.car == car}
-        outcomes = select_cases(car_results, "fmvss-126")
-        sines = {case.agent: outcome.result for case, outcome in outcomes.items()}
+        results = _group_results({case: y for case, y in done.items() if case.car == car})
+        sines = {case.agent: item for case, item in results["fmvss-126"].items()}
         passing = [name for name, item in sines.items() if item.passed]
         weakest = min(sines, key=lambda name: sines[name].highest)
         failing = f"; {weakest} fails above {sines[weakest].highest:.3g} A"
         failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
-        runs = select_cases(car_results, next(iter(iso3888.TRACKS)))
+        runs = results[iso3888.TRACKS[0]]
         speeds = {c.agent: 3.6 * iso3888.find_highest_speed(item) for c, item in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
@@ -129,27 +107,204 @@ def make_verdict(done: CaseResults) -> str:
     )
 
 
-def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run every procedure for both cars and every controller, and the outside plants.
+def _measure(request: Request) -> CaseResults:
+    """Drive every procedure with both cars and every controller, and the outside plants."""
+    cases = _make_cases(request.quick)
+    return dict(zip(cases, request.run_cases(measure, cases, NAME), strict=True))
 
-    Args:
-        quick: Whether a few amplitudes, speeds and seeds do, and slow controllers are left out.
-        jobs: Number of processes; None: one a core.
-        console: Console for the progress.
 
-    Returns:
-        The suite.
-    """
-    cases = _make_cases(quick)
-    done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
-    has_outside = any(case.procedure == "outside" for case in cases)
-    text = _TEXT + (_OUTSIDE if has_outside else _NONE_OUTSIDE)
-    suite = Suite(NAME, "Standard test procedures", text)
-    tables.add(suite, done)
-    suite.verdict = make_verdict(done)
-    try:
-        from . import figures as draw
-    except ModuleNotFoundError:
-        return suite
-    draw.add(suite, done)
-    return suite
+class _Table(NamedTuple):
+    """A procedure's table: title and note may name what the first line has."""
+
+    title: str
+    columns: Sequence[object]
+    make_records: Callable[[CaseResults], list[dict[str, object]]]
+    note: str
+
+
+def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
+    """Make a line of a table, and the columns of its rows; output: if a case measures several."""
+    estimator = ENTRIES[case.contestant].get_configuration(case.car)[1]
+    scenario = f"{case.procedure} {case.car}" + (f", {x}" if (x := more.get("output")) else "")
+    names = {"controller": case.agent, "car": case.car, "estimator": estimator}
+    return {"scenario": scenario, "salt": "", **names, **more}
+
+
+def _add_tables(suite: Suite, done: CaseResults) -> None:
+    """Add rows and a table of each procedure."""
+    results = _group_results(done)
+    for name, table in _TABLES.items():
+        if name in results:
+            records = table.make_records(results[name])
+            suite.add_rows(records)
+            title, note = (text.format(**records[0]) for text in (table.title, table.note))
+            suite.tables.append(ResultTable(title, table.columns, records, note, name != "check"))
+        if name == "fmvss-126":
+            _add_tracks(suite, {track: results[track] for track in iso3888.TRACKS})
+
+
+def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
+    """FMVSS 126: up to which amplitude every run passes, and what the first failure is."""
+    records = []
+    for case, result in done.items():
+        failed = [run for run in result.runs if not run.passed]
+        numbers = {"amplitude": result.highest, "n": len(result.runs), "A": np.degrees(result.A)}
+        passed = result.highest, max(run.multiple for run in result.runs)
+        text = "passes"
+        if failed:
+            text = f"fails at {failed[0].multiple:.3g} A: {_describe_failure(failed[0])}"
+        records.append(_make_record(case, **numbers, passed=passed, text=text))
+    return records
+
+
+def _describe_failure(run: fmvss126.SineDwellRun) -> str:
+    if not run.ratio_2 < np.inf:
+        return "spins"
+    if not run.stable:
+        shares = f"{100 * run.ratio_1:.0f} % and {100 * run.ratio_2:.0f} %"
+        return f"{shares} of the peak yaw rate left (at most 35 % and 20 %)"
+    return f"{run.sideways:.2f} m sideways (at least {fmvss126.SIDEWAYS} m)"
+
+
+def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
+    """Add ISO 3888: the highest clean speed of each controller."""
+    lines: dict[tuple[str, str], dict[str, object]] = {}
+    for track, results in done.items():
+        for case, runs in results.items():
+            speed = iso3888.find_highest_speed(runs)
+            suite.add_rows([_make_record(case, speed=speed, n=len(runs))])
+            line = lines.setdefault((case.agent, case.car), _make_record(case))
+            line[track] = 3.6 * speed if speed else "none clean"
+    speeds = (Column(track, f"{track} / (km/h)", form=".0f") for track in done)
+    note = "The highest speed without a cone; any of five drivers may do it."
+    title = "ISO 3888, lane change and obstacle avoidance"
+    table = ResultTable(title, (*_KEYS, *speeds), list(lines.values()), note)
+    suite.tables.append(table)
+
+
+def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
+    """ISO 4138: the understeer gradient against the linear model's."""
+    return [
+        _make_record(case, understeer_gradient=handling.K, theory=handling.theory)
+        for case, handling in done.items()
+    ]
+
+
+def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
+    """ISO 7401: the step's numbers beside the linear model's."""
+    records = []
+    for case, transient in done.items():
+        for name in iso7401.OUTPUTS:
+            one, other = vars(transient.step[name]), vars(transient.linear_step[name])
+            pairs = {f"both {key}": (number, other[key]) for key, number in one.items()}
+            numbers = {key: one[key] for key in ("response_time", "overshoot")}
+            records.append(_make_record(case, output=name, **numbers, **pairs))
+    return records
+
+
+def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
+    """Outside plants: cost and spins of each controller."""
+    records = []
+    costs = {case: np.array([x.cost for x in episodes]) for case, episodes in done.items()}
+    rivals = {case.car: costs[case] for case in done if case.agent == RIVAL}
+    for case, episodes in done.items():
+        numbers = {"cost": interval(costs[case]), "share": np.mean([x.failed for x in episodes])}
+        if case.car in rivals and case.agent != RIVAL:
+            logs = np.log(compute_cost_ratios(costs[case], rivals[case.car]))
+            numbers["paired"] = geometric_mean(logs)
+        numbers |= {"n": len(episodes), "peak": np.median([x.peak for x in episodes])}
+        records.append(_make_record(case, **numbers, salt="fixed"))
+    return records
+
+
+def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
+    """The claim on the drift model."""
+    (check,) = done.values()
+    case = ProcedureCase("fmvss-126", f"outside {outside.MODEL}")
+    claim = {"verdict": "reproduced" if check.reproduced else "not reproduced", "paper": _CLAIM}
+    records = []
+    for control, result in (("none", check.none), ("500 N m", check.law)):
+        worst = max(result.runs, key=lambda run: run.ratio_1 if run.ratio_1 < np.inf else np.inf)
+        numbers = {"multiple": worst.multiple, "ratio": worst.ratio_1, "later": worst.ratio_2}
+        numbers |= {"n": len(result.runs), "sideways": min(run.sideways for run in result.runs)}
+        text = "passes" if result.passed else "fails"
+        records.append(_make_record(case, **numbers, **claim, text=text) | {"controller": control})
+    return records
+
+
+_KEYS, _PAIR = ("controller", "car"), "{:.3g} ({:.3g})"
+_PER_G = float(np.degrees(GRAVITY))
+_CLAIM = "no control fails at 5 A, a yaw moment of 500 N m passes at 6.5 A"
+_OF = Column("passed", "passes up to / A", form="{:.3g} of {:.3g}")
+_CIRCLE = {"understeer_gradient": "measured / (deg/g)", "theory": "linear model / (deg/g)"}
+_STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s", "peak_time": "peak after / s"}
+_SHARES = {"ratio": "at 1.00 s / %", "later": "at 1.75 s / %"}
+_TABLES = {
+    "fmvss-126": _Table(
+        "FMVSS 126, sine with dwell",
+        (*_KEYS, Column("A", "A / deg", form=".1f"), _OF, Column("text", "result")),
+        _make_sine_records,
+        "Both sides; the last amplitude is the larger of 6.5 A and 270 deg, at most 300 deg.",
+    ),
+    "iso-4138": _Table(
+        "ISO 4138, understeer gradient",
+        (*_KEYS, *(Column(key, text, _PER_G, "+.3f") for key, text in _CIRCLE.items())),
+        _make_circle_records,
+        "At the front wheels, between 0.05 and 0.25 g; negative: the car oversteers.",
+    ),
+    "iso-7401": _Table(
+        "ISO 7401, step response",
+        (
+            *_KEYS,
+            "output",
+            *(Column(f"both {key}", text, form=_PAIR) for key, text in _STEP.items()),
+            Column("both overshoot", "overshoot", form=_PAIR),
+        ),
+        _make_step_records,
+        "In brackets the linear model's under the same steering. No control.",
+    ),
+    "outside": _Table(
+        "CommonRoad's models of a BMW 320i",
+        (
+            "controller",
+            Column("car", "model"),
+            Column("cost", form=".3g"),
+            Column("paired", f"of {RIVAL}'s / %", 100.0, ".0f"),
+            Column("share", "failed / %", 100.0, ".0f"),
+            Column("peak", "peak slip / mrad", 1e3, ".0f"),
+        ),
+        _make_outside_records,
+        "{n} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are drawn by seed. "
+        f"of {RIVAL}'s: geometric mean, paired. peak slip: median.",
+    ),
+    "check": _Table(
+        f"Sine with dwell on the drift model at 80 km/h: {_CLAIM}: {{verdict}}",
+        (
+            Column("controller", "control"),
+            Column("multiple", "amplitude / A", form=".3g"),
+            *(Column(key, text, 100.0, ".0f") for key, text in _SHARES.items()),
+            Column("sideways", "sideways / m", form=".2f"),
+            Column("text", " "),
+        ),
+        _make_check_records,
+        "Worst of both sides.",
+    ),
+}
+
+
+def _add_figures(suite: Suite, done: CaseResults, _: ModuleType) -> None:
+    from .figures import draw_figures
+
+    suite.figures = draw_figures(_group_results(done))
+
+
+STUDY = Study(
+    NAME,
+    "Standard test procedures",
+    _TEXT,
+    (EPISODES, QUICK_EPISODES),
+    _measure,
+    _add_tables,
+    _make_verdict,
+    _add_figures,
+)

@@ -25,7 +25,7 @@ from ...envs.vehicle.dynamics import (
     rk4,
 )
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, TyreInputs, compute_tyre_load
+from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, PlantVariant, TyreInputs, compute_tyre_load
 from .emulate import compute_ground_speed, compute_heading
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
@@ -151,16 +151,20 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
 
 @jit
 def _simulate_windows(
-    rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
+    rows: Any, starts: Any, theta: Any, fixed: Any, law: int, h: float, out: Any
 ) -> None:
     """Fill out (3, windows, rows): yaw rate, lateral specific force, sideslip angle of the GPS."""
+    roll = int(law != LINEAR)
     m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
     car = CarParams(
         m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
         fixed[5] * np.exp(theta[1]), fixed[6], fixed[7], fixed[8], 1.0, mu, 0.0,
         fixed[10], fixed[11], fixed[12], fixed[13], fixed[14], 0.0, 0.0, mu, 0.0, 0.0,
+        1.0, 1.0, 0.0,
     )  # fmt: skip
-    road, push = RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), DisturbanceForces(0.0, 0.0, 0.0)
+    road = RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    push = DisturbanceForces(0.0, 0.0, 0.0)
+    variant = PlantVariant(0, law, roll)
     for w in range(len(starts)):
         at = starts[w]
         V, gamma = rows[2, at], rows[0, at] - theta[5]
@@ -173,11 +177,11 @@ def _simulate_windows(
             late = i + theta[8] / h  # a row's steering is that of the middle of its step
             before, after = after, _compute_load(rows, i, late + 0.5, theta, car)
             loads = (before, _compute_load(rows, i, late, theta, car), after)
-            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
-            motion = rk4(motion, loads, push, car, road, h, 0, law, roll)
+            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot, 0.0, 0.0)
+            motion = rk4(motion, loads, push, car, road, h, variant)
             v_y, gamma, phi, phi_dot = motion.v_y, motion.gamma, motion.phi, motion.phi_dot
-            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
-            slope = derivative(motion, after, push, car, road, 0, law, roll)
+            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot, 0.0, 0.0)
+            slope = derivative(motion, after, push, car, road, variant)
             out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
             out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
@@ -203,7 +207,7 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
         car.gravity_height, car.antenna_ahead,
     ])  # fmt: skip
     law = TYRE_LAWS.index(w.tyres)
-    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, int(law != LINEAR), w.dt, out)
+    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, w.dt, out)
 
     def interpolate_late(values: Array, delay: float) -> Array:
         places = np.arange(first, first + count) - delay / w.dt

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from ...envs.record import FAST, Array, Log
 from ...envs.recordings.log_file import make_packet_rows
-from ...envs.sensors.gps import COURSE_SPEED
 from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import COURSE_SPEED
 
 MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 _NOT_NEGATIVE = ("course_noise_deg", "delay")

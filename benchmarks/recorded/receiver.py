@@ -23,10 +23,10 @@ from ...envs.record import Array
 from ...envs.recordings.dialect import to_metres
 from ...envs.recordings.nmea import HOUR, Counts, Epoch
 from ...envs.recordings.sources import read_nmea
-from ...envs.sensors.gps import COURSE_SPEED, HDOP_LAWS
+from ...envs.sensors.slow import COURSE_SPEED, HDOP_LAWS
 from ...envs.validation import Mask
 from ...estimators.filters import FILTERS
-from ..harness.results import ResultRow, ResultTable, Suite, write_text
+from ..harness.results import Column, ResultTable, Suite, write_text
 from ..harness.stats import Estimate, interval
 from ..harness.verdict import format_verdict
 from ..report.film import make_track_kml
@@ -137,7 +137,7 @@ def _compare(signal: _Signal) -> dict[str, _NoiseLawResult]:
 
 def _compute_law_size(hdop: Array, weight: float) -> Array:
     """Compute the noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
-    knots, factors = zip(*FILTERS["double-layer"].hdop, strict=True)
+    knots, factors = zip(*FILTERS["double-layer"].hdop_table, strict=True)
     return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
 
 
@@ -268,10 +268,8 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     )
     suite = Suite("replay", f"A receiver's log: {replay.name}", text)
     suite.verdict = _compose_verdict(replay)
-    suite.rows = [
-        row for signal, results in replay.outcomes for row in _make_rows(replay, signal, results)
-    ]
-    suite.tables = [_make_table(signal, results) for signal, results in replay.outcomes]
+    for signal, results in replay.outcomes:
+        _add_table(suite, replay, signal, results)
     counts = [[what, str(n)] for what, n in replay.counts.rows()]
     title = "What came from the receiver"
     suite.tables.append(ResultTable(title, ("what", "count"), counts, keyed=False))
@@ -304,47 +302,43 @@ def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
     return f"{what} {how}: log-likelihood {number.inline(digits='+.2f')}."
 
 
-def _make_rows(
-    replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
-) -> list[ResultRow]:
-    rows = []
-    for law, result in results.items():
-        where = {
-            "suite": "replay", "scenario": f"{replay.name}: {signal.name}", "estimator": law,
-            "n": len(result.error), "env_version": f"replay {__version__}",
-        }  # fmt: skip
-        numbers = {
-            _ROWS[signal.name]: Estimate(float(np.sqrt(np.mean(result.error**2)))),
-            "log_likelihood": Estimate(float(result.likelihood.mean())),
-            "nis": Estimate(float(result.square.mean())),
-        }
-        if law != _FIXED:
-            numbers["difference"] = _compute_gain(result, results[_FIXED])
-        rows += [ResultRow.from_estimate(metric, x, **where) for metric, x in numbers.items()]
-    return rows
-
-
-def _make_table(signal: _Signal, results: Mapping[str, _NoiseLawResult]) -> ResultTable:
+def _add_table(
+    suite: Suite, replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
+) -> None:
+    """Add rows and a table of the laws of a signal's noise."""
     scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
-    cells = []
+    records = []
     for law, result in results.items():
-        error = scale * result.error
-        gain = _compute_gain(result, results[_FIXED]).inline(digits="+.3f")
-        numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
-        numbers += [result.likelihood.mean(), result.square.mean()]
-        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * _MIN_NOISE else "none seen"
-        more = "-" if law == _FIXED else gain
-        cells.append([law, noise, *(f"{number:.2f}" for number in numbers), more])
-    header = ("noise", f"at HDOP 1 / {unit}", "median", "rms", "95 %", "log-likelihood", "NIS",
-              "against constant")  # fmt: skip
+        rms = np.sqrt(np.mean(result.error**2))
+        record = {
+            "scenario": f"{replay.name}: {signal.name}", "estimator": law, "n": len(result.error),
+            _ROWS[signal.name]: rms, "log_likelihood": result.likelihood.mean(),
+            "nis": result.square.mean(), "median": np.median(result.error),
+            "high": np.percentile(result.error, 95),
+            "noise": result.r if result.r > 1.5 * _MIN_NOISE else "none seen",
+        }  # fmt: skip
+        gain = {"difference": _compute_gain(result, results[_FIXED])} if law != _FIXED else {}
+        records.append(record | gain)
+    suite.add_rows(records, salt="", env_version=f"replay {__version__}")
+    columns = (
+        Column("estimator", "noise"),
+        Column("noise", f"at HDOP 1 / {unit}", scale, ".3g"),
+        Column("median", form=".2f", scale=scale),
+        Column(_ROWS[signal.name], "rms", scale, ".2f"),
+        Column("high", "95 %", scale, ".2f"),
+        Column("log_likelihood", "log-likelihood", form=".2f"),
+        Column("nis", "NIS", form=".2f"),
+        Column("difference", "against constant", form="+.3f"),
+    )
     note = (
-        f"Errors in {unit} of {len(result.error)} fixes. constant, half, table: how the noise "
+        f"Errors in {unit} of {records[0]['n']} fixes. constant, half, table: how the noise "
         f"follows HDOP; {SAME}: what `table` has on average, while `constant` "
         "has its own. NIS is 1 for a filter that knows its errors; intervals by blocks of fixes."
     )
     if signal.axes == 1:
         note += " The noise of course is that at 1 m/s, it falls with speed."
-    return ResultTable(f"The next {signal.name}, predicted", header, cells, note, keyed=False)
+    title = f"The next {signal.name}, predicted"
+    suite.tables.append(ResultTable(title, columns, records, note, keyed=False))
 
 
 def write_kml(path: Path, replay: ReceiverReplay) -> None:

@@ -16,7 +16,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, call_quietly
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
 from .emulate import Emulation, compute_ground_speed, compute_heading, find_backward
@@ -101,32 +101,21 @@ class ReplayResult:
     outcomes: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)  # why it is left out, or what it misses
 
-    def rmse(self, name: str) -> tuple[float, float, float]:
-        """Return the RMS error over the seeds.
-
-        Args:
-            name: Name of the estimator.
-
-        Returns:
-            Median, smallest and largest (rad).
-        """
-        return _summarise_range(np.sqrt(self.squares[name]))
-
-    def ratio(self, name: str, other: str = GYRO_ONLY) -> tuple[float, float, float]:
-        """Return the RMS error over another's, seed by seed.
-
-        Args:
-            name: Name of the estimator.
-            other: Name of the other one.
-
-        Returns:
-            Median, smallest and largest ratio.
-        """
-        return _summarise_range(np.sqrt(self.squares[name] / self.squares[other]))
+    @property
+    def rmse(self) -> dict[str, Estimate]:
+        """RMS errors over the seeds (rad), best first."""
+        ranges = {name: _compute_range(np.sqrt(x)) for name, x in self.squares.items()}
+        return dict(sorted(ranges.items(), key=lambda item: item[1].value))
 
 
-def _summarise_range(values: Array) -> tuple[float, float, float]:
-    return float(np.median(values)), float(np.min(values)), float(np.max(values))
+def _compute_range(values: Array) -> Estimate:
+    """Compute the median, smallest and largest number."""
+    return Estimate(*(float(function(values)) for function in (np.median, np.min, np.max)))
+
+
+def _compute_ratio(result: ReplayResult, name: str, other: str = GYRO_ONLY) -> Estimate:
+    """Compute the RMS error over another's, seed by seed."""
+    return _compute_range(np.sqrt(result.squares[name] / result.squares[other]))
 
 
 def _make_drives(log: Log, settings: Settings) -> list[Log]:
@@ -234,18 +223,14 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     drives = _make_drives(log, how)
     result = _run_estimators(drives, car, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", _make_text(log, drives, car, how))
-    suite.rows = _make_rows(result, log.name, car, how)
-    suite.tables = [_make_table(result, log.name, car, len(drives))]
-    cells = [
-        [label, state, f"{value:.4g}", f"{sd:.2g}"]
-        for label, states in result.outcomes.items()
-        for state, value, sd in states
-    ]
-    if cells:
+    records = _add_rows(suite, result, log.name, car, how)
+    suite.tables = [_make_table(result, records, log.name, car, len(drives))]
+    if cells := [(x, *state) for x, states in result.outcomes.items() for state in states]:
         note = "At the end of the drive, SI units; tyres are factors on the assumed stiffness."
-        header, title = ("estimator", "state", "value", "deviation"), "what the estimators found"
-        suite.tables.append(ResultTable(f"{log.name}: {title}", header, cells, note))
-    suite.verdict = compose_verdict(result, "gps" in drives[0].slow and "gps" not in log.slow)
+        value, deviation = Column("value", form=".4g"), Column("deviation", form=".2g")
+        columns, title = ("estimator", "state", value, deviation), "what the estimators found"
+        suite.tables.append(ResultTable(f"{log.name}: {title}", columns, cells, note))
+    suite.verdict = _compose_verdict(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
         suite.figures = _draw_figures(result, log)
         if result.squares and suite.figures:
@@ -255,30 +240,23 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     return suite
 
 
-def compose_verdict(result: ReplayResult, emulated: bool) -> str:
-    """Compose the verdict.
-
-    Args:
-        result: Errors of the estimators.
-        emulated: Whether the GPS course is made from the truth.
-
-    Returns:
-        The verdict.
-    """
+def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
+    """Compose the verdict; emulated: whether the GPS course is made from the truth."""
     if not result.squares:
         return format_verdict(
             f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
             "drawn, not scored.",
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
-    first, *rest = sorted(result.squares, key=lambda name: result.rmse(name)[0])
-    over = {name: Estimate(*result.ratio(first, name)) for name in rest}
+    rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
+    first, *rest = rmse
+    over = {name: _compute_ratio(result, first, name) for name in rest}
     slow = [name for name in result.squares if name != GYRO_ONLY]
-    gain = f"{GYRO_ONLY}, with the gyro alone, errs {DEGREES * result.rmse(GYRO_ONLY)[0]:.2f} deg"
+    gain = f"{GYRO_ONLY}, with the gyro alone, errs {rmse[GYRO_ONLY]:.2f} deg"
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         f"From the recorded angle {describe_leader(first, over, 'stray')}.",
-        f"Its error: {DEGREES * result.rmse(first)[0]:.2f} deg; brackets: range over noises.",
+        f"Its error: {rmse[first]:.2f} deg; brackets: range over noises.",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"
         + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
@@ -309,16 +287,13 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
         car = vehicle.scale_stiffness(how.stiffness_factor).scale_stiffness(front, rear)
         result = results[f"{front} / {rear}"] = _run_estimators(drives, car, how)
         scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
-        suite.rows += _make_rows(result, scenario, car, how)
-    medians = [{n: r.rmse(n)[0] for n in r.squares} for r in results.values()]
-    names = [name for name in ESTIMATORS if any(name in corner for corner in medians)]
+        _add_rows(suite, result, scenario, car, how)
+    names = [name for name in ESTIMATORS if any(name in x.squares for x in results.values())]
+    cells = [[name, *(x.rmse.get(name) for x in results.values())] for name in names]
     title = f"{log.name}, {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
-    cells = [
-        [name, *(f"{DEGREES * corner[name]:.2f}" if name in corner else "-" for corner in medians)]
-        for name in names
-    ]
     note = "The same process noise in all corners; medians over the noises."
-    suite.tables = [ResultTable(title, ("estimator", *results), cells, note)]
+    columns = "estimator", *(Column(name, "", DEGREES, ".2f", interval=False) for name in results)
+    suite.tables = [ResultTable(title, columns, cells, note)]
     return suite
 
 
@@ -354,44 +329,38 @@ def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings
     return " ".join(text)
 
 
-def _make_rows(
-    result: ReplayResult, scenario: str, car: Vehicle, settings: Settings
-) -> list[ResultRow]:
-    """Rows of every number of a result."""
-    plain = dataclasses.asdict(settings) | {"estimators": list(settings.estimators or ESTIMATORS)}
+def _add_rows(
+    suite: Suite, result: ReplayResult, scenario: str, car: Vehicle, how: Settings
+) -> Any:
+    """Add rows of every number of a result, and return the records, best first."""
+    plain = dataclasses.asdict(how) | {"estimators": list(how.estimators or ESTIMATORS)}
     del plain["figures"], plain["emulated"]  # these move no number
-    where = {
-        "suite": "replay", "scenario": scenario, "salt": f"seed {settings.seed}",
-        "env_version": f"replay {__version__}",
-        "spec": json.dumps({"vehicle": car.to_dict(), "settings": plain}),
-    }  # fmt: skip
-    rows = []
+    spec = json.dumps({"vehicle": car.to_dict(), "settings": plain})
+    records = {}
     for name, cost in result.cost.items():
-        measured = {"us_per_tick": (cost, math.nan, math.nan)}
+        record: dict[str, Any] = {"estimator": name, "n": 1}
         if name in result.squares:
-            measured = {"rmse": result.rmse(name), "ratio": result.ratio(name)} | measured
-        n = len(result.squares.get(name, [cost]))
-        for metric, x in measured.items():
-            row = ResultRow.from_estimate(metric, Estimate(*x), estimator=name, n=n, **where)
-            rows.append(row)
-    return rows
+            errors = {"rmse": result.rmse[name], "ratio": _compute_ratio(result, name)}
+            record |= errors | {"n": len(result.squares[name])}
+        records[name] = record | {"us_per_tick": cost}
+    where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
+    suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
+    return [records[name] for name in result.rmse or records]
 
 
-def _make_table(result: ReplayResult, name: str, car: Vehicle, noises: int) -> ResultTable:
-    """Table of the estimators, best first; remarks in the note."""
+def _make_table(
+    result: ReplayResult, records: Sequence[Any], name: str, car: Vehicle, noises: int
+) -> ResultTable:
+    """Make the table of the estimators; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
+    cost = Column("us_per_tick", "us per tick", form=".3f")
     if not result.squares:
         title = f"{name}, designed from {car.name}: no truth, no score"
-        cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
-        return ResultTable(title, ("estimator", "us per tick"), cells, note)
-    header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
-    cells = []
-    for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
-        value, low, high = (f"{DEGREES * number:.3f}" for number in result.rmse(label))
-        numbers = f"{result.ratio(label)[0]:.2f}", f"{result.cost[label]:.3f}"
-        cells.append([label, value, f"{low} .. {high}", *numbers])
+        return ResultTable(title, ("estimator", cost), records, note)
+    rmse = Column("rmse", "RMSE / deg [least, most]", DEGREES, ".3f")
+    columns = "estimator", rmse, Column("ratio", "of gyro only", form=".2f", interval=False), cost
     title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
-    return ResultTable(title, header, cells, note)
+    return ResultTable(title, columns, records, note)
 
 
 def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
@@ -406,7 +375,7 @@ def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
 def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
     try:
-        from ..report.figures import draw_bars, draw_error_series, draw_time_series, draw_track
+        from ..report.figures import draw_groups, draw_time_series, draw_track
     except ModuleNotFoundError:
         return []
     truth = log.truth.get("beta")
@@ -428,11 +397,11 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     ]  # fmt: skip
     if truth is not None:
         errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
-        over_time = draw_error_series(log.time, errors, f"error of the {label}")
+        over_time = draw_time_series(log.time, errors, f"error of the {label}", zero_line=True)
         figure = _select_traces(over_time, result)
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
-        value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
-        bars = draw_bars(list(result.squares), value, low, high, f"RMSE of the {label}")
+        groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}
+        bars = draw_groups(groups, f"RMSE of the {label}", {})
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
         shown.insert(0, ("error of each estimator", bars, text))
     return [(f"{log.name}: {title}", *more) for title, *more in shown]
@@ -440,7 +409,7 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
 
 def _select_traces(figure: Any, result: ReplayResult) -> Any:
     """The figure with only truth, gyro-only and the best estimator in sight."""
-    best = min(result.squares, key=lambda name: result.rmse(name)[0], default="exact-kf")
+    best = next(iter(result.rmse), "exact-kf")
     for trace in figure.data:
         if trace.name in result.traces and trace.name not in (GYRO_ONLY, best):
             trace.visible = "legendonly"

@@ -12,7 +12,7 @@ from ...envs.record import FAST, PACKET, Log
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import check_choice, is_finite, short_repr
 from ...envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
-from ...estimators.design.options import FAST_CHANNELS, find_columns
+from ...estimators.design.options import FAST_CHANNELS
 
 _CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)  # that may be late
 _MAX_LATENCY = 5.0  # s
@@ -113,7 +113,7 @@ def apply_wires(log: Log, wires: SignalCalibration) -> Log:
     fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)
     fast[:, FAST.steer] = wires.gain * fast[:, FAST.steer] + wires.offset
     for channel in wires.latency.keys() & FAST_CHANNELS.keys():
-        for column in find_columns(channel):
+        for column in FAST_CHANNELS[channel]:
             late = wires.latency[channel] / record.dt
             fast[:, column] = np.interp(place + late, place, fast[:, column])
     packets = record.packets.copy()

@@ -1,4 +1,4 @@
-"""Figures as plotly figures: time series, errors, curves, tracks, bars, groups, heat maps.
+"""Figures as plotly figures: time series, curves, tracks, groups, heat maps.
 
 Every axis carries its unit, every name has its colour (`envs.rendering.palette`). Lines longer than
 `POINTS` are thinned so that no peak is lost, and numbers are stored in single precision.
@@ -65,6 +65,7 @@ def draw_time_series(
     unit_label: str,
     x_label: str = "time / s",
     dots: Collection[str] = (),
+    zero_line: bool = False,
 ) -> go.Figure:
     """Draw series on one axis over time, "truth" on top and thicker.
 
@@ -74,6 +75,7 @@ def draw_time_series(
         unit_label: Quantity and unit, as "sideslip angle / mrad".
         x_label: Quantity and unit of `t`.
         dots: Names that are drawn as dots, for packets with NaN between them.
+        zero_line: Whether a line is drawn at zero, for errors.
 
     Returns:
         Figure.
@@ -95,23 +97,9 @@ def draw_time_series(
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
         figure.add_trace(trace)
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
+    if zero_line:
+        figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
     return _finish(_sort_facts(figure), x_label, unit_label, 380, hovermode="x unified")
-
-
-def draw_error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> go.Figure:
-    """Draw estimate minus truth over time, with a line at zero.
-
-    Args:
-        t: Times (s), shape (n,).
-        errors: Errors by name, shape (n,) each.
-        unit_label: Quantity and unit.
-
-    Returns:
-        Figure.
-    """
-    figure = draw_time_series(t, errors, unit_label)
-    figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
-    return figure
 
 
 def draw_curves(
@@ -177,61 +165,6 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
     return _finish(_sort_facts(figure), "x / m", "y / m", height, hovermode="closest")
 
 
-def draw_bars(
-    labels: Sequence[str],
-    values: Sequence[float],
-    lows: Sequence[float],
-    highs: Sequence[float],
-    unit: str,
-) -> go.Figure:
-    """Draw a bar for each label, the first on top, with its interval as whiskers.
-
-    Args:
-        labels: Names of the bars.
-        values: Lengths of the bars.
-        lows: Lower bounds; no whiskers for NaN, or a bound that equals the value.
-        highs: Upper bounds.
-        unit: Quantity and unit, as "RMSE / mrad".
-
-    Returns:
-        Figure.
-    """
-    if not len(labels) == len(values) == len(lows) == len(highs):
-        raise ValueError("labels, values, lows and highs differ in length")
-    value = np.asarray(values, float)
-    above, below = np.asarray(highs, float) - value, value - np.asarray(lows, float)
-    none = ~(np.isfinite(above) & np.isfinite(below)) | ((above == 0) & (below == 0))
-    ends = {"array": np.where(none, np.nan, above), "arrayminus": np.where(none, np.nan, below)}
-    whiskers = {
-        "type": "data",
-        "symmetric": False,
-        **ends,
-        "color": INK,
-        "thickness": 1.5,
-        "width": 5,
-    }
-    text = [
-        f"{v:.3g}" if off else f"{v:.3g} [{v - b:.3g}, {v + a:.3g}]"
-        for v, a, b, off in zip(value, above, below, none, strict=True)
-    ]
-    figure = go.Figure(
-        go.Bar(
-            orientation="h",
-            marker={"color": [find_colour(label) for label in labels]},
-            width=0.6,
-            x=value,
-            y=list(labels),
-            error_x=whiskers,
-            showlegend=False,
-            customdata=text,
-            hovertemplate="%{y}: %{customdata}<extra></extra>",
-        )
-    )
-    figure.update_xaxes(type="linear")
-    figure.update_yaxes(type="category", autorange="reversed", ticks="", showgrid=False)
-    return _finish(figure, unit, "", 100 + 34 * len(labels), hovermode="closest")
-
-
 def draw_groups(
     groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
 ) -> go.Figure:
@@ -251,14 +184,15 @@ def draw_groups(
     for title, numbers in groups.items():
         text = {"text": f"<b>{title}</b>", "showarrow": False, "xref": "paper", "x": 1}
         figure.add_annotation(y=row, xanchor="right", font={"size": 12.5}, **text)
-        for name, (value, low, high) in numbers.items():
+        for name, number in numbers.items():
+            value, low, high = number
             row += 1
             ticks[row] = name
             ends = {"array": [high - value], "arrayminus": [value - low], "symmetric": False}
             colour = find_colour(name)
             marker = {"color": colour, "size": 10, "line": {"width": 2, "color": colour}}
             marker["symbol"] = "circle" if find_base(name) in (name, None) else "circle-open"
-            hover = f"{name}: {value:.3g} [{low:.3g}, {high:.3g}]<extra></extra>"
+            hover = f"{name}: {number.inline(digits='.3g')}<extra></extra>"
             pen = {"type": "data", "color": colour, "thickness": 1.6, "width": 4}
             figure.add_trace(
                 go.Scatter(x=[value], y=[row], error_x=pen | ends, marker=marker,

@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from html import escape
 from importlib.resources import files
@@ -26,63 +26,25 @@ from ...envs.record import Array
 from ...envs.rendering.palette import INK, find_base, find_colour
 from ..harness.results import ResultTable, Suite, write_text
 from ..harness.verdict import Explorer
+from .tables import TextColumn, format_columns
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 
-def _parse_number(cell: str) -> float | None:
-    """Parse the number that a cell begins with, None for one that begins with none or with NaN.
-
-    >>> _parse_number("0.31 [0.29, 0.33]"), _parse_number("-1,250 N m")
-    (0.31, -1250.0)
-    >>> _parse_number("< 2e-3"), _parse_number("2-dof")
-    (0.002, None)
-    """
-    match = _NUMBER.match(cell)
-    return float(match[1].translate(_PLAIN)) if match else None
-
-
-_NUMBER = re.compile(
-    r"\s*[\[(<>≤≥~≈±]*\s*([-+\u2212]?(?:inf\b|∞"
-    r"|(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?(?!-\w)))",
-    re.IGNORECASE,
-)
-_PLAIN = str.maketrans({",": "", "\u00a0": "", "\u202f": "", "\u2212": "-", "∞": "inf"})
 _MAX_LETTERS = 40  # letters: a longer cell wraps
-_BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
-
-
-def is_numeric(cells: Iterable[str]) -> bool:
-    """Check whether a column has numbers, and nothing else but blanks.
-
-    Args:
-        cells: Texts of the column.
-
-    Returns:
-        Whether it has.
-    """
-    texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
-    return bool(texts) and all(_parse_number(cell) is not None for cell in texts)
 
 
 def _format_table(table: ResultTable) -> str:
     """Format a folded table; ValueError for a row that is not as long as the header."""
-    for row in table.cells:
-        if len(row) != len(table.header):
-            raise ValueError(
-                f"table {table.title!r}: {len(row)} cells under {len(table.header)} headers: {row}"
-            )
-    columns = list(zip(*table.cells, strict=True)) or [()] * len(table.header)
-    are_numbers = [is_numeric(column) for column in columns]
+    columns = format_columns(table)
     heads = "".join(
-        f'<th scope="col" aria-sort="none"{_format_class(is_number)}>'
-        f'<button type="button">{escape(name)}</button></th>'
-        for name, is_number in zip(table.header, are_numbers, strict=True)
+        f'<th scope="col" aria-sort="none"{_format_class(column.is_numeric)}>'
+        f'<button type="button">{escape(column.heading)}</button></th>'
+        for column in columns
     )
-    body = "\n".join(
-        f"<tr>{_format_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells
-    )
+    cells = [_format_column(column, i == 0, table.keyed) for i, column in enumerate(columns)]
+    body = "\n".join(f"<tr>{''.join(line)}</tr>" for line in zip(*cells, strict=True))
     title = escape(table.title)
     note = f'\n<p class="note">{inline(table.note)}</p>' if table.note else ""
     return (
@@ -93,15 +55,17 @@ def _format_table(table: ResultTable) -> str:
     )
 
 
-def _format_row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
+def _format_column(column: TextColumn, is_first: bool, keyed: bool) -> list[str]:
     cells = []
-    for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
-        value = _parse_number(cell) if is_number else None
-        data = "" if value is None else f' data-value="{value!r}"'.replace("inf", "Infinity")
-        tag, key = ('th scope="row"', _format_key(cell) if keyed else "") if i == 0 else ("td", "")
-        kind = ' class="long"' if len(cell) > _MAX_LETTERS else _format_class(is_number)
-        cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
-    return "".join(cells)
+    for text, value in zip(column.texts, column.values, strict=True):
+        has_value = column.is_numeric and value is not None
+        data = f' data-value="{value!r}"'.replace("inf", "Infinity") if has_value else ""
+        tag, key = (
+            ('th scope="row"', _format_key(text) if keyed else "") if is_first else ("td", "")
+        )
+        kind = ' class="long"' if len(text) > _MAX_LETTERS else _format_class(column.is_numeric)
+        cells.append(f"<{tag}{kind}{data}>{key}{escape(text)}</{tag[:2]}>")
+    return cells
 
 
 def _format_class(is_number: bool) -> str:
@@ -133,14 +97,14 @@ _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 def _format_page_table(table: ResultTable) -> str:
     """Format a heading, the table, and its note in lines of 120."""
-    head, *rows = (
-        [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
-    )
-    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
-    lines.insert(1, "|---" * len(head) + "|")
+    columns = format_columns(table)
+    lines = zip(*([column.heading, *column.texts] for column in columns), strict=True)
+    head, *rows = ([text.replace("|", r"\|") for text in line] for line in lines)
+    shown = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    shown.insert(1, "|---" * len(head) + "|")
     note = textwrap.fill(table.note, 120, break_long_words=False, break_on_hyphens=False)
     note = f"\n{note}\n" if table.note else ""
-    return "\n".join([f"## {table.title}", "", *lines, ""]) + note
+    return "\n".join([f"## {table.title}", "", *shown, ""]) + note
 
 
 def check_page(path: Path | None, names: Sequence[str]) -> None:

@@ -1,28 +1,212 @@
-"""What the suites of a question share: rows of their numbers, and figures where plotly is."""
+"""The skeleton of a suite: a study is data, and every study is run in the same way.
 
-from collections.abc import Mapping
+A study has a title, a text, its number of seeds and four functions: `measure` drives and returns
+results, `add_tables` makes rows and tables of them, `compose_verdict` their answer in words and
+`add_figures` pictures, where plotly is installed. Lines of a table are records, as of a DataFrame:
+`Suite.add_rows` makes rows of them, `ResultTable` with its columns a table.
+"""
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
 from types import ModuleType
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from ... import __version__
-from ..harness.results import ResultRow, Suite
-from ..harness.stats import Estimate
+import numpy as np
+from rich.console import Console
+
+from ...envs.io import atomic_file
+from ...envs.record import Array
+from ..harness.parallel import run_cases, split_seeds
+from ..harness.results import Line, Suite
+
+Case = TypeVar("Case")
+Condition = TypeVar("Condition")
+Result = TypeVar("Result")
+Results = TypeVar("Results")
+Choice = TypeVar("Choice")
+_LENGTH = 24  # hexadecimal digits of a finished case's file name
 
 
-def add_rows(
-    suite: Suite, numbers: Mapping[str, Estimate], env_id: str = "", **columns: str | int
-) -> None:
-    """Add a row of each number of a scenario, on fixed seeds unless `salt` says otherwise.
+@dataclass(frozen=True)
+class Request:
+    """The options of a run.
+
+    Attributes:
+        quick: Whether few seeds are run.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        episodes: Episodes of a cell of the matrix, or seeds; None for the suite's number.
+        keep: Folder of finished cases, so that a stopped run goes on.
+        clairvoyant: File of `sideslip calibrate`, None for the package's.
+        salt: Salt of the seeds of salted suites, "" for the one of the contestants' sources.
+    """
+
+    quick: bool = False
+    jobs: int | None = None
+    console: Console | None = None
+    episodes: int | None = None
+    keep: Path | None = None
+    clairvoyant: Path | None = None
+    salt: str = ""
+
+    def choose(self, usual: Choice, quick: Choice) -> Choice:
+        """Choose by whether the run is quick.
+
+        Args:
+            usual: Choice of a usual run.
+            quick: Choice of a quick run.
+
+        Returns:
+            One of them.
+        """
+        return quick if self.quick else usual
+
+    def run_cases(
+        self,
+        function: Callable[[Case], Result],
+        cases: Sequence[Case],
+        title: str,
+        storage: "CaseStorage[Case, Result] | None" = None,
+    ) -> list[Result]:
+        """Run a function on every case, in processes.
+
+        Args:
+            function: Function of a case, importable by workers.
+            cases: Arguments of the function, one for each call.
+            title: Title of the progress bar.
+            storage: How finished cases lie in the folder `keep`; None: they do not.
+
+        Returns:
+            Results in the order of the cases.
+        """
+        if self.keep is not None and storage is not None:
+            folder = self.keep.absolute()  # a worker of a cluster runs elsewhere
+            function = StoredFunction(function, folder, storage)
+        return run_cases(function, cases, title, self.jobs, self.console)
+
+    def run_seeds(
+        self,
+        function: Callable[[tuple[Condition, Sequence[int]]], Sequence[Result]],
+        conditions: Sequence[Condition],
+        seeds: int,
+        chunk: int,
+        title: str,
+    ) -> list[list[Result]]:
+        """Run a function that gives a result a seed in every condition.
+
+        Args:
+            function: Function of a condition and some seeds, importable by workers.
+            conditions: Conditions, which share the seeds 0 .. seeds-1.
+            seeds: Number of seeds.
+            chunk: Maximum of seeds in a call.
+            title: Title of the progress bar.
+
+        Returns:
+            Results of the seeds in each condition.
+        """
+        chunks = split_seeds(seeds, chunk)
+        cases = list(product(conditions, chunks))
+        results = iter(self.run_cases(function, cases, title))
+        return [[item for _ in chunks for item in next(results)] for _ in conditions]
+
+
+def stack_seeds(drives: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, Array]:
+    """Stack the numbers of entries over seeds.
 
     Args:
-        suite: Suite to which the rows are added.
-        numbers: Numbers with their intervals by metric.
-        env_id: Id of the env, "" where rows have the package's version alone.
-        **columns: Other columns of `ResultRow`, which all rows share.
+        drives: Numbers of each entry by name, of every seed.
+
+    Returns:
+        Numbers by name, shape (seeds, numbers).
     """
-    common = {"salt": "fixed", "env_version": f"{env_id} {__version__}".lstrip()} | columns
-    for metric, number in numbers.items():
-        suite.rows.append(ResultRow.from_estimate(metric, number, suite=suite.name, **common))
+    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
+
+
+class CaseStorage(NamedTuple, Generic[Case, Result]):
+    """Finished cases as arrays in files, whose names are hashes of all that they depend on."""
+
+    describe: Callable[[Case], str]  # text of all that the case's result depends on
+    pack: Callable[[Result], dict[str, Any] | None]  # arrays; None: worth another try
+    unpack: Callable[[Case, Mapping[str, Array]], Result]  # raises for another's arrays
+
+
+@dataclass(frozen=True)
+class StoredFunction(Generic[Case, Result]):
+    """A function of a case behind a folder of its results."""
+
+    function: Callable[[Case], Result]
+    folder: Path
+    storage: CaseStorage[Case, Result]
+
+    def __call__(self, case: Case) -> Result:
+        """Return the case's result, from the folder if it is there."""
+        name = hashlib.sha256(self.storage.describe(case).encode()).hexdigest()[:_LENGTH]
+        path = self.folder / f"{name}.npz"
+        # whatever NumPy, zipfile, zlib or the storage find wrong: the case is run anew
+        with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as archive:
+            return self.storage.unpack(case, dict(archive))
+        result = self.function(case)
+        if (arrays := self.storage.pack(result)) is not None:
+            with contextlib.suppress(OSError):  # a full disk loses the file, not the run
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with atomic_file(path) as file:
+                    np.savez_compressed(file, **arrays)
+        return result
+
+
+@dataclass(frozen=True)
+class Study(Generic[Results]):
+    """A suite of the benchmark.
+
+    Attributes:
+        name: Name of the suite.
+        title: Question that it answers.
+        text: What was measured, and how; paragraphs are separated by an empty line.
+        seeds: Number of seeds of a usual and of a quick run, in place of a request's None.
+        measure: Drives, and returns the results.
+        add_tables: Adds rows and tables of the results to a suite.
+        compose_verdict: Composes the answer from the results.
+        add_figures: Adds pictures of the results with `report.figures`, its last argument.
+        needs: Optional module, and the verdict where it is not installed.
+    """
+
+    name: str
+    title: str
+    text: str
+    seeds: tuple[int, int]
+    measure: Callable[[Request], Results]
+    add_tables: Callable[[Suite, Results], None]
+    compose_verdict: Callable[[Results], str]
+    add_figures: Callable[[Suite, Results, ModuleType], None] | None = None
+    needs: tuple[str, str] = ("", "")
+
+    def run(self, request: Request) -> Suite:
+        """Run the study.
+
+        Args:
+            request: Options of the run.
+
+        Returns:
+            Suite with rows, tables, verdict and figures; the latter only where plotly is installed.
+        """
+        suite = Suite(self.name, self.title, self.text)
+        module, absence = self.needs
+        if module and find_spec(module) is None:
+            suite.verdict = absence
+            return suite
+        count = request.episodes or request.choose(*self.seeds)
+        results = self.measure(replace(request, episodes=count))
+        self.add_tables(suite, results)
+        suite.verdict = self.compose_verdict(results)
+        if self.add_figures is not None and (figures := import_figures()) is not None:
+            self.add_figures(suite, results, figures)
+        return suite
 
 
 def import_figures() -> ModuleType | None:
@@ -31,3 +215,15 @@ def import_figures() -> ModuleType | None:
         return import_module(".figures", __package__)
     except ModuleNotFoundError:
         return None
+
+
+def add_rows(suite: Suite, numbers: Line, env_id: str = "", **columns: str | int) -> None:
+    """Add a row of each number of a record, as `Suite.add_rows`.
+
+    Args:
+        suite: Suite to which the rows are added.
+        numbers: Numbers with their intervals by metric.
+        env_id: Id of the env, "" where rows have the package's version alone.
+        **columns: Other columns of `ResultRow`, which all rows share.
+    """
+    suite.add_rows([numbers], env_id, **columns)

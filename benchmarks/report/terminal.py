@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from ..harness.results import ResultTable, Suite
-from .html import is_numeric
+from .tables import TextColumn, format_columns
 
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
 _MIN_WIDTH = 22  # letters that a column of text has at least, and the first one on a narrow screen
@@ -37,12 +37,14 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
             max_rows = _ROWS // len(suites)
             left = len(table.cells) - max_rows
             cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
-            console.print(_make_rich_table(_split_table(cut, console.width)[0], console.width))
+            part = _split_table(cut, console.width)[0]
+            console.print(_make_rich_table(table.title, part, console.width))
             if left > 0:
                 console.print(f"[dim]and {left} rows more[/]\n", highlight=False)
     count = sum(len(suite.tables) for suite in suites)
     where = "in the report" if reported else "in a report: --html FILE"
-    console.print(f"All {count} tables, with notes and figures, are {where}.", highlight=False)
+    text = f"All {count} tables, with notes and figures, are" if count > 1 else "The table is"
+    console.print(f"{text} {where}.", highlight=False)
 
 
 def _print_title(console: Console, suite: Suite) -> None:
@@ -65,8 +67,9 @@ def print_suite(console: Console, suite: Suite) -> None:
     console.print(f"{escape(suite.text)}\n", highlight=False)
     shown = [table for table in suite.tables if not table.detail]
     for table in shown:
-        for part in _split_table(table, console.width):
-            console.print(_make_rich_table(part, console.width))
+        for i, part in enumerate(_split_table(table, console.width)):
+            title = f"{table.title} (continued)" if i else table.title
+            console.print(_make_rich_table(title, part, console.width))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
     if more := len(suite.tables) - len(shown):
@@ -74,29 +77,24 @@ def print_suite(console: Console, suite: Suite) -> None:
         console.print(f"{count} in the report (--html).\n", highlight=False)
 
 
-def _split_table(table: ResultTable, width: int) -> list[ResultTable]:
+def _split_table(table: ResultTable, width: int) -> list[list[TextColumn]]:
     """Split a table into parts of as many columns as the width takes, the first in all."""
-    columns = list(zip(table.header, *table.cells, strict=True))
-    lengths = [max(map(len, column)) for column in columns]
-    widths = [
-        (length if is_numeric(column[1:]) else min(length, _MIN_WIDTH)) + 2
-        for length, column in zip(lengths, columns, strict=True)
-    ]
-    groups: list[list[int]] = [[0]]
-    used = first = min(widths[0], _choose_width(width) + 2) + 2
-    for i in range(1, len(columns)):
-        if used + widths[i] > width and len(groups[-1]) > 1:
-            groups.append([0])
-            used = first
-        groups[-1].append(i)
-        used += widths[i]
-    parts = list[ResultTable]()
-    for group in groups:
-        header = [table.header[i] for i in group]
-        cells = [[row[i] for i in group] for row in table.cells]
-        title = f"{table.title} (continued)" if parts else table.title
-        parts.append(replace(table, title=title, header=header, cells=cells))
+    first, *columns = format_columns(table)
+    start = min(_measure_width(first), _choose_width(width) + 2) + 2
+    parts, used = [[first]], start
+    for column in columns:
+        added = _measure_width(column)
+        if used + added > width and len(parts[-1]) > 1:
+            parts.append([first])
+            used = start
+        parts[-1].append(column)
+        used += added
     return parts
+
+
+def _measure_width(column: TextColumn) -> int:
+    longest = max(map(len, [column.heading, *column.texts]))
+    return (longest if column.is_numeric else min(longest, _MIN_WIDTH)) + 2
 
 
 def _choose_width(width: int) -> int:
@@ -104,21 +102,20 @@ def _choose_width(width: int) -> int:
     return _NAME if width >= _NARROW else _MIN_WIDTH
 
 
-def _make_rich_table(table: ResultTable, width: int) -> RichTable:
+def _make_rich_table(title: str, columns: list[TextColumn], width: int) -> RichTable:
     """Make a table with numbers to the right and whole, texts to the left and wrapped."""
-    title, style = table.title, box.SIMPLE_HEAD
+    style = box.SIMPLE_HEAD
     shown = RichTable(title=title, title_justify="left", box=style, padding=(0, 1, 0, 0))
-    columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
-    for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
-        right = i > 0 and is_numeric(column)
-        longest = max(map(len, column), default=0)
+    for i, column in enumerate(columns):
+        right = i > 0 and column.is_numeric
+        longest = max(map(len, column.texts), default=0)
         shown.add_column(
-            name,
+            column.heading,
             justify="right" if right else "left",
             no_wrap=right,
             min_width=min(longest, _choose_width(width)) if i == 0 else None,
             overflow="fold",  # a long word goes on in the next line
         )
-    for row in table.cells:
-        shown.add_row(*map(escape, row))
+    for line in zip(*(column.texts for column in columns), strict=True):
+        shown.add_row(*map(escape, line))
     return shown

@@ -20,7 +20,7 @@ from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.results import ResultTable, Suite
-from .timing import Effort, Workload, WorkloadSet, add_row, format_range, measure_interleaved
+from .timing import Effort, Taken, Workload, WorkloadSet, measure_interleaved
 
 COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
 EPISODE, _CHUNK = 500, 50  # steps, the most; in one call
@@ -157,8 +157,7 @@ def add_filters(suite: Suite, effort: Effort) -> None:
         bare, bare_many, one, many = (np.array(values) for values in taken.values())
         cells.append([name])
         for env, added in ((FUSION, one - bare), (f"{FUSION} x {FEWER}", many - bare_many)):
-            row = add_row(suite, f"{env} + {name}", "us_added", added.tolist())
-            cells[-1] += format_range(row)
+            cells[-1] += Taken(added).add_row(suite, f"{env} + {name}", "us_added").cells
     note = (
         f"CPU us that a filter adds to an env-step of {FUSION}, its first two states and their "
         "deviations in the observation: differences round by round."

@@ -10,7 +10,7 @@ import sys
 from tempfile import TemporaryDirectory
 
 from ..harness.results import ResultTable, Suite
-from .timing import AbsentError, Taken, add_row
+from .timing import AbsentError, Taken
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"
@@ -110,20 +110,20 @@ def add(suite: Suite, quick: bool) -> tuple[dict[str, Taken], dict[str, str]]:
     columns, absent = dict[str, Taken](), dict[str, str]()
     try:
         taken = [_measure_first_step() for _ in range((_QUICK_RUNS if quick else _RUNS) + 1)][1:]
-        columns = {f"first use: {name}": [run[name] for run in taken] for name in taken[0]}
+        columns = {f"first use: {name}": Taken(run[name] for run in taken) for name in taken[0]}
         counted = ("import numba", "gym.make", "first reset", "first step")
-        columns[FIRST] = [sum(run[name] for name in counted) for run in taken]
+        columns[FIRST] = Taken(sum(run[name] for name in counted) for run in taken)
     except AbsentError as error:
         absent[FIRST] = str(error)
     if not quick:
         kernels = _measure_compilation()
-        columns["cold compile of all kernels"] = [sum(seconds for _, seconds in kernels)]
-        columns[KERNEL] = [max(seconds for _, seconds in kernels)]
+        columns["cold compile of all kernels"] = Taken([sum(seconds for _, seconds in kernels)])
+        columns[KERNEL] = Taken([max(seconds for _, seconds in kernels)])
     else:
         absent[KERNEL] = "in the full form only"
     cells = []
     for name, values in columns.items():
-        middle, low, high = add_row(suite, name, "cpu_seconds", values)
+        middle, low, high = values.add_row(suite, name, "cpu_seconds").range
         cells.append([name, f"{middle:.3f}", f"{low:.3f} .. {high:.3f}"])
     note = (
         "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "

@@ -36,9 +36,9 @@ def _make_learner(name: str) -> Workload:
 
 def _get_settings() -> dict[str, Any]:
     """Get the settings of PPO that `sideslip train` uses."""
-    from ...agents.training.config import make_model_options, read_settings
+    from ...agents.training.config import TrainingTask
 
-    options = make_model_options("ppo", read_settings("ppo", YAW), 10 * TICK, _COUNT)
+    options = TrainingTask(YAW, num_envs=_COUNT).make_model_options(10 * TICK)
     return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
 
 

@@ -5,7 +5,8 @@
  * we know to that error, operation by operation in the order of `envs`. Blocks of cars,
  * structures of arrays, so that the compiler makes vectors of it; BLOCK, the cars in one, is a
  * macro of its command line. Constants of a call are computed once a block. What the id's cars and
- * roads do not have is left out: load that moves between the axles, roads laid tick by tick.
+ * roads do not have is left out: load that moves between the axles, roads laid tick by tick, waves
+ * of bank.
  *
  * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `plant.py`.
  */
@@ -18,12 +19,14 @@
 #define CAR(DO) \
     DO(m) DO(I) DO(l_f) DO(l_r) DO(C_f) DO(C_r) DO(d_f) DO(d_r) DO(r) DO(T_max) DO(mu) DO(l_pre) \
     DO(S) DO(I_x) DO(K_x) DO(C_x) DO(h) DO(ahead) DO(left) DO(mu_r) \
-    DO(P) DO(h_x)
-#define ROAD(DO) DO(curvature) DO(start) DO(ramp) DO(across) DO(along) DO(turn)
+    DO(P) DO(h_x) DO(k_l) DO(k_r) DO(relaxation)
+#define ROAD(DO) DO(curvature) DO(start) DO(ramp) DO(across) DO(along) DO(turn) \
+    DO(wave) DO(wave_rate) DO(wave_phase)
 #define PUSH(DO) DO(F_d) DO(N_d) DO(N_x)
 #define INPUTS(DO) DO(delta) DO(T_l) DO(T_r)
 #define MOTION(DO) \
-    DO(v_x) DO(v_y) DO(gamma) DO(psi) DO(X) DO(Y) DO(s) DO(y) DO(theta) DO(phi) DO(phi_dot)
+    DO(v_x) DO(v_y) DO(gamma) DO(psi) DO(X) DO(Y) DO(s) DO(y) DO(theta) DO(phi) DO(phi_dot) \
+    DO(slip_f) DO(slip_r)
 #define VELOCITY(DO) DO(v_x) DO(v_y) DO(gamma) DO(phi) DO(phi_dot)
 #define COURSE(DO) DO(X) DO(Y) DO(s) DO(y) DO(theta)
 /* Constants of a car. */

@@ -18,14 +18,20 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs.engine.layout import P, Z
-from ...envs.numerics.jit import inline, jit
+from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import make_offsets, read, write
 from ...envs.numerics.simd import LANES
 from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
-from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3, rk4
-from ...envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load, has_load_shift
+from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
+from ...envs.vehicle.tyres import (
+    FIALA,
+    PlantVariant,
+    TyreInputs,
+    compute_tyre_load,
+    has_load_shift,
+)
 from .timing import AbsentError, Workload, WorkloadSet
 
 _FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
@@ -35,9 +41,9 @@ _VECTOR_FLAGS = """
 CARS, _TICKS = 1024, 10  # cars at once; ticks a call
 PLANT, C = "plant", "plant in C"
 
-_CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
-    make_offsets(kind)[0] for kind in (CarParams, RoadParams, Motion, DisturbanceForces, TyreInputs)
-)
+_CAR, _ROAD = make_offsets(CarParams)[0], make_offsets(RoadParams)[0]
+_MOTION, _PUSH = make_offsets(Motion)[0], make_offsets(DisturbanceForces)[0]
+_INPUTS = make_offsets(TyreInputs)[0]
 
 
 def _find_compiler() -> str:
@@ -94,7 +100,7 @@ def _make_cars(count: int, seed: int = 0) -> Cars:
     """Make cars as the seeds of `YawFusion-v0` draw, all with car 0's lags; count: n LANES."""
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
-    p, z, rng = env.params, env.states, np.random.default_rng(seed)
+    (p, z, *_), rng = env.engine.arrays, np.random.default_rng(seed)
     lags = [p[0, [lag.middle, lag.end]] for lag in (P.steering, P.motor)]
 
     def split_blocks(rows: Array) -> Array:
@@ -111,69 +117,32 @@ def _make_cars(count: int, seed: int = 0) -> Cars:
     )
 
 
-@inline
-def _integrate_tick(
-    first: Any,
-    motion: Any,
-    acting: Any,
-    command: Any,
-    push: Any,
-    car: Any,
-    road: Any,
-    remaining: Any,
-    stages: int,
-) -> Any:
-    """Integrate a tick by 3 or 4 stages from the load `first`; returns load, motion and inputs."""
-    between = TyreInputs(
-        apply_lag(command.delta_f, acting.delta_f, remaining[0]),
-        apply_lag(command.T_l, acting.T_l, remaining[2]),
-        apply_lag(command.T_r, acting.T_r, remaining[2]),
-    )
-    acting = TyreInputs(
-        apply_lag(command.delta_f, acting.delta_f, remaining[1]),
-        apply_lag(command.T_l, acting.T_l, remaining[3]),
-        apply_lag(command.T_r, acting.T_r, remaining[3]),
-    )
-    shifting = has_load_shift(0, FIALA, 1)
-    middle, last = (
-        compute_tyre_load(between, car, 0, shifting),
-        compute_tyre_load(acting, car, 0, shifting),
-    )
-    loads = (first, middle, last)
-    if stages == 4:
-        return last, rk4(motion, loads, push, car, road, TICK, 0, FIALA, 1), acting
-    return last, kutta3(motion, loads, push, car, road, TICK, 0, FIALA, 1), acting
-
-
 @jit
-def _advance(
-    remaining: Any,
-    cars: Any,
-    roads: Any,
-    pushes: Any,
-    commands: Any,
-    motions: Any,
-    acting: Any,
-    ticks: int,
-    stages: int,
-) -> None:
-    """Move all cars by some ticks, a block at a time, in the arrays of `Cars`."""
-    for b in range(len(cars)):
-        car, road = read(cars[b], _CAR), read(roads[b], _ROAD)
-        push, command = read(pushes[b], _PUSH), read(commands[b], _INPUTS)
-        motion, applied = read(motions[b], _MOTION), read(acting[b], _INPUTS)
-        load = compute_tyre_load(applied, car, 0, has_load_shift(0, FIALA, 1))
+def _advance(lanes: Cars, ticks: int) -> None:
+    """Move all cars by some ticks of Kutta's three stages, a block at a time."""
+    remaining, shifting = lanes.remaining, has_load_shift(0, FIALA, 1)
+    for b in range(len(lanes.cars)):
+        car, road = read(lanes.cars[b], _CAR), read(lanes.roads[b], _ROAD)
+        push, command = read(lanes.pushes[b], _PUSH), read(lanes.commands[b], _INPUTS)
+        motion, applied = read(lanes.motions[b], _MOTION), read(lanes.acting[b], _INPUTS)
+        load = compute_tyre_load(applied, car, 0, shifting)
         for _ in range(ticks):
-            load, motion, applied = _integrate_tick(
-                load, motion, applied, command, push, car, road, remaining, stages
+            between = TyreInputs(
+                apply_lag(command.delta_f, applied.delta_f, remaining[0]),
+                apply_lag(command.T_l, applied.T_l, remaining[2]),
+                apply_lag(command.T_r, applied.T_r, remaining[2]),
             )
-        write(motions[b], motion, _MOTION)
-        write(acting[b], applied, _INPUTS)
-
-
-def _advance_in_lanes(cars: Cars, ticks: int) -> None:
-    """Move cars by some ticks as the batch engine does, in lanes."""
-    _advance(*cars, ticks, 3)
+            applied = TyreInputs(
+                apply_lag(command.delta_f, applied.delta_f, remaining[1]),
+                apply_lag(command.T_l, applied.T_l, remaining[3]),
+                apply_lag(command.T_r, applied.T_r, remaining[3]),
+            )
+            middle = compute_tyre_load(between, car, 0, shifting)
+            first, load = load, compute_tyre_load(applied, car, 0, shifting)
+            loads = (first, middle, load)
+            motion = kutta3(motion, loads, push, car, road, TICK, PlantVariant(0, FIALA, 1))
+        write(lanes.motions[b], motion, _MOTION)
+        write(lanes.acting[b], applied, _INPUTS)
 
 
 def make_c_advance() -> _Advance:
@@ -185,7 +154,7 @@ def make_c_advance() -> _Advance:
 
     numba_cars = _make_cars(LANES)
     c_cars = numba_cars.clone()
-    _advance_in_lanes(numba_cars, 100)
+    _advance(numba_cars, 100)
     advance_in_c(c_cars, 100)
     if not np.allclose(c_cars.motions, numba_cars.motions, rtol=1e-9, atol=1e-12):
         off = np.abs(c_cars.motions - numba_cars.motions).max()
@@ -211,6 +180,6 @@ def make_workloads() -> WorkloadSet:
         "(-O3 -march=native, no fused multiply-add), with the same numbers."
     )
     cars, field = _make_cars(CARS), WorkloadSet("Cost of a tick of the plant", "tick", note)
-    field.add(PLANT, lambda: _make_workload(_advance_in_lanes, cars))
+    field.add(PLANT, lambda: _make_workload(_advance, cars))
     field.add(C, lambda: _make_workload(make_c_advance(), cars))
     return field

@@ -1,23 +1,13 @@
-"""CPU time of steps, ticks, learning and first use, and whether it meets the engine's targets."""
+"""The suite `speed`: CPU time of steps, ticks, learning and first use, and the engine's targets."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from rich.console import Console
-
 from ..harness.results import ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
+from ..report.study import Request, Study
 from . import env_steps, first_use, learning, plant
-from .timing import (
-    FULL,
-    QUICK,
-    Taken,
-    add_row,
-    compute_range,
-    format_absences,
-    format_range,
-    format_three_digits,
-)
+from .timing import FULL, QUICK, Taken, format_absences, format_three_digits
 
 
 class _SpeedTarget(NamedTuple):
@@ -59,36 +49,27 @@ TARGETS = (
 )
 
 
-def add(
-    suite: Suite,
-    taken: Mapping[str, Taken],
-    seconds: Mapping[str, Taken],
-    absent: Mapping[str, str],
-) -> None:
+def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, str]) -> None:
     """Add rows of measured targets, and first of all the table of all.
 
-    Args:
-        suite: Suite that gets the results.
-        taken: CPU time a unit (us) of the workloads in each round, by name.
-        seconds: CPU seconds of the first use in each process, by name.
-        absent: Reasons why others were not measured, by name.
+    taken: CPU times a unit (us), or CPU seconds of the first use; absent: reasons; by name.
     """
     cells, missing = [], dict[str, str]()
     for target in TARGETS:
         needed = [target.over, target.workload] if target.over else [target.workload]
-        absent_names = [name for name in needed if name not in {**taken, **seconds}]
+        absent_names = [name for name in needed if name not in taken]
         cells.append([target.name, target.text, "", "", "not measured"])
         if absent_names:
             missing |= {name: absent.get(name, "not run") for name in absent_names}
             continue
         if target.over:
             pairs = zip(taken[target.over], taken[target.workload], strict=True)
-            ratios = [reference_time / workload_time for reference_time, workload_time in pairs]
-            measured = add_row(suite, target.name, "ratio", ratios)
+            measured = Taken(over / workload for over, workload in pairs)
+            measured.add_row(suite, target.name, "ratio")
         else:
-            measured = compute_range(seconds[target.workload])
-        met = "met" if target.met(measured.value) else "not met"
-        cells[-1][2:] = *format_range(measured), met
+            measured = taken[target.workload]
+        met = "met" if target.met(measured.range.value) else "not met"
+        cells[-1][2:] = *measured.cells, met
     header = ("figure", "target", "measured", "range", "")
     note = "Ratios are taken round by round, in CPU time; the median counts."
     note += format_absences(missing)
@@ -98,47 +79,40 @@ def add(
 _RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
 
 
-def run(quick: bool = False, console: Console | None = None) -> Suite:
-    """Measure the CPU times of steps, ticks, learning and first use.
+class _SpeedResults(NamedTuple):
+    """What was measured: CPU times a unit (us) by name, and their rows and tables."""
 
-    Args:
-        quick: Whether rounds are few and nothing is compiled.
-        console: Not used: workloads take turns in this process.
+    taken: Mapping[str, Taken]
+    measured: Suite
 
-    Returns:
-        Suite.
-    """
-    suite = Suite(
-        "speed",
-        "What a step costs",
-        "CPU time on one thread, median and range of rounds in which the contestants of a table "
-        "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
-    )
-    effort = QUICK if quick else FULL
+
+def _measure(request: Request) -> _SpeedResults:
+    """Measure in this process, where workloads take turns; a quick run compiles nothing."""
+    measured, effort = Suite("speed", "", ""), request.choose(FULL, QUICK)
     taken, absent = dict[str, Taken](), dict[str, str]()
     for part in (env_steps, plant, learning):
-        field = part.make_workloads()
-        taken |= field.measure(suite, effort)
-        absent |= field.absent
+        workloads = part.make_workloads()
+        taken |= workloads.measure(measured, effort)
+        absent |= workloads.absent
         if part is env_steps:
-            env_steps.add_filters(suite, effort)
-    seconds, more_absent = first_use.add(suite, quick)
-    add(suite, taken, seconds, absent | more_absent)
-    suite.verdict = make_verdict(taken, suite.tables[0])
-    return suite
+            env_steps.add_filters(measured, effort)
+    seconds, more_absent = first_use.add(measured, request.quick)
+    _add_targets(measured, taken | seconds, absent | more_absent)
+    return _SpeedResults(taken, measured)
 
 
-def make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    """Make the verdict.
+def _add_tables(suite: Suite, results: _SpeedResults) -> None:
+    suite.rows += results.measured.rows
+    suite.tables += results.measured.tables
 
-    Args:
-        taken: CPU time a unit (us) of the workloads in each round, by name.
-        goals: Table of targets.
 
-    Returns:
-        Verdict.
-    """
-    us = {name: compute_range(times).value for name, times in taken.items()}
+def _compose_verdict(results: _SpeedResults) -> str:
+    return _make_verdict(results.taken, results.measured.tables[0])
+
+
+def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
+    """Make the verdict of the CPU times a unit (us) and the table of targets."""
+    us = {name: times.range.value for name, times in taken.items()}
     step_time = us[env_steps.FUSION]
     over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in _RIVALS if x in us]
     met = [line[0] for line in goals.cells if line[-1] == "met"]
@@ -154,3 +128,15 @@ def make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
         "Why: one compiled call an env-step, cars side by side in the processor's wide registers.",
         "Not covered: other machines; compare ratios, not microseconds.",
     )
+
+
+STUDY = Study(
+    "speed",
+    "What a step costs",
+    "CPU time on one thread, median and range of rounds in which the contestants of a table "
+    "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
+    (0, 0),
+    _measure,
+    _add_tables,
+    _compose_verdict,
+)

@@ -33,8 +33,36 @@ FULL = Effort(25, 0.04)
 """Many short rounds: what the machine does meanwhile falls on all workloads of one round."""
 
 _MAX_SLOW_ROUNDS = 5
-Taken = list[float]
-"""CPU microseconds a unit, round by round."""
+
+
+class Taken(list[float]):
+    """CPU microseconds a unit or seconds, round by round."""
+
+    @property
+    def range(self) -> Estimate:
+        """The median, with the smallest and largest number as bounds."""
+        return Estimate(statistics.median(self), min(self), max(self))
+
+    @property
+    def cells(self) -> tuple[str, str]:
+        """The median and range, to three digits, as two cells of a table."""
+        middle, low, high = map(format_three_digits, self.range)
+        return middle, f"{low} .. {high}"
+
+    def add_row(self, suite: Suite, name: str, metric: str) -> "Taken":
+        """Add the median and range as a row of a suite.
+
+        Args:
+            suite: Suite that gets the row.
+            name: Name of the workload.
+            metric: Metric of the row.
+
+        Returns:
+            Itself.
+        """
+        columns = {"salt": "", "env_version": "", "scenario": name}
+        add_rows(suite, {metric: self.range}, n=len(self), **columns)
+        return self
 
 
 def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
@@ -51,7 +79,7 @@ def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> di
         calls = {
             name: _count_calls(workload, effort.seconds) for name, workload in workloads.items()
         }
-        taken: dict[str, Taken] = {name: [] for name in workloads}
+        taken = {name: Taken() for name in workloads}
         for _ in range(effort.rounds):
             for name, workload in workloads.items():
                 taken[name].append(_measure_calls(workload, calls[name]))
@@ -84,18 +112,6 @@ def limit_threads() -> Iterator[None]:
         return
     with threadpool_limits(1):
         yield
-
-
-def compute_range(values: Taken) -> Estimate:
-    """Compute the median and range of rounds.
-
-    Args:
-        values: A number of each round.
-
-    Returns:
-        Median, with smallest and largest number as bounds.
-    """
-    return Estimate(statistics.median(values), min(values), max(values))
 
 
 class AbsentError(Exception):
@@ -144,32 +160,14 @@ class WorkloadSet:
             effort = replace(effort, rounds=max(1, min(effort.rounds // 2, _MAX_SLOW_ROUNDS)))
         taken, cells = measure_interleaved(self.workloads, effort), []
         for name, values in taken.items():
-            number = add_row(suite, name, f"us_per_{self.unit}", values)
-            rate = f"{float(f'{1e6 / number.value:.3g}'):,.0f}"
-            cells.append([name, *format_range(number), rate])
+            values.add_row(suite, name, f"us_per_{self.unit}")
+            rate = f"{float(f'{1e6 / values.range.value:.3g}'):,.0f}"
+            cells.append([name, *values.cells, rate])
         if cells:
             header = ("", f"us per {self.unit}", "range", "per CPU-s")
             text = self.note + format_absences(self.absent)
             suite.tables.append(ResultTable(self.title, header, cells, text, keyed=False))
         return taken
-
-
-def add_row(suite: Suite, name: str, metric: str, values: Taken) -> Estimate:
-    """Add the median and range of rounds as a row of a suite.
-
-    Args:
-        suite: Suite that gets the results.
-        name: Name of the workload.
-        metric: Metric of the row.
-        values: A number of each round.
-
-    Returns:
-        Median with its range.
-    """
-    number = compute_range(values)
-    columns = {"salt": "", "env_version": "", "scenario": name}
-    add_rows(suite, {metric: number}, n=len(values), **columns)
-    return number
 
 
 def format_absences(absent: Mapping[str, str]) -> str:
@@ -184,19 +182,6 @@ def format_absences(absent: Mapping[str, str]) -> str:
     if not absent:
         return ""
     return f" Not measured: {'; '.join(f'{name} ({reason})' for name, reason in absent.items())}."
-
-
-def format_range(number: Estimate) -> tuple[str, str]:
-    """Format a median and its range, to three digits, as two cells of a table.
-
-    Args:
-        number: Median with its range.
-
-    Returns:
-        Both texts.
-    """
-    middle, low, high = map(format_three_digits, number)
-    return middle, f"{low} .. {high}"
 
 
 def format_three_digits(value: float) -> str:

@@ -3,17 +3,16 @@
 dakf-stability's bandwidth K, and lanes held on curved roads from camera and gyro with uneven delay.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from itertools import islice, product
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
 
 from ...agents import make_agent
-from ...agents.controllers.model_following import compute_feedback_gains
+from ...agents.controllers.yaw_stability import compute_feedback_gains
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
@@ -22,18 +21,16 @@ from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import call_quietly
-from ..harness.parallel import run_cases
-from ..harness.results import ResultTable, Suite
+from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, share
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.manoeuvres import measure_tracking, run_episode
-from ..report.study import add_rows, import_figures
+from ..report.study import Request, Study
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
-SEEDS, QUICK_SEEDS = 10, 2
+_SEEDS, _CARS = (10, 2), (200, 20)  # of a usual and of a quick run
 _STEP = "dakf-fig7"
 _ROAD, _ROAD_ID = "curved-road", "sideslip/YawVisionUneven-v0"
-CARS, QUICK_CARS = 200, 20
 LANE_CONTROLLERS = (
     ("none", "uneven-delay-kf", None),
     ("steering alone", "uneven-delay-kf", False),
@@ -43,13 +40,6 @@ LANE_CONTROLLERS = (
     ("steering alone", "exact-kf", False),
     ("both", "exact-kf", True),
 )
-_TEXT = """\
-dakf-stability V.D has the bandwidth K limited by actuators and filter: its step by wire \
-(Fig. 7) with dakf in the loop, from K = 1 to 100 rad/s. The radius is that of the sampled loop of \
-the true car with its lags, without the filter: beyond 1 it is unstable.
-
-Lane keeping: bends of drawn curvature, 1 / 100 m to 1 / 33 m, a lane of 3.5 m, camera and gyro \
-with uneven delay; nobody steers but the controller."""
 _STATES = ("beta", "gamma", "psi", "y_l")
 
 
@@ -110,42 +100,26 @@ def _keep_lane(index: int, cars: int) -> Array:
     return np.stack([max_offset, np.sqrt(squares / steps), departed], axis=1)
 
 
-def run(
-    seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
-) -> Suite:
-    """Answer both questions.
+class FollowingResults(NamedTuple):
+    """Numbers of both questions."""
 
-    Args:
-        seeds: Seeds of the step.
-        cars: Cars on the road.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
+    errors: Array  # of `_track_reference`, shape (1 + bandwidths, seeds, 4)
+    radius: Array  # spectral radius of the loop, shape (bandwidths,)
+    lanes: list[Array]  # of `_keep_lane`, of each of `LANE_CONTROLLERS`
 
-    Returns:
-        Suite.
-    """
-    suite = Suite("following", "What steering and yaw moment do together", _TEXT)
+
+def _measure(request: Request) -> FollowingResults:
+    seeds, cars = request.choose(*_SEEDS), request.choose(*_CARS)
     cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
-    errors = np.array(run_cases(_track_reference, cases, "bandwidth", jobs, console))
-    errors = errors.reshape(len(BANDWIDTHS) + 1, seeds, -1)
-    _add_bandwidths(suite, errors)
-    run_lane = partial(_keep_lane, cars=cars)
-    lanes = run_cases(run_lane, range(len(LANE_CONTROLLERS)), "lanes", jobs, console)
-    _add_lanes(suite, lanes)
-    suite.verdict = compose_verdict(errors, lanes)
-    return suite
+    errors = np.array(request.run_cases(_track_reference, cases, "bandwidth"))
+    lane_cases = range(len(LANE_CONTROLLERS))
+    lanes = request.run_cases(partial(_keep_lane, cars=cars), lane_cases, "lanes")
+    radius = np.array([_compute_loop_radius(_STEP, K) for K in BANDWIDTHS])
+    return FollowingResults(errors.reshape(len(BANDWIDTHS) + 1, seeds, -1), radius, lanes)
 
 
-def compose_verdict(errors: Array, lanes: Sequence[Array]) -> str:
-    """Compose the verdict.
-
-    Args:
-        errors: Numbers of `_track_reference`, shape (1 + bandwidths, seeds, 4).
-        lanes: Numbers of `_keep_lane` of each of `LANE_CONTROLLERS`.
-
-    Returns:
-        Verdict.
-    """
+def _compose_verdict(results: FollowingResults) -> str:
+    errors, _, lanes = results
     ratios = (errors[1:, :, :2].mean(axis=1) / errors[0, :, :2].mean(axis=0)).mean(axis=1)
     stable = [i for i in range(len(BANDWIDTHS)) if not errors[1 + i, :, 3].any()]
     best = min(stable, key=ratios.__getitem__, default=None)
@@ -182,7 +156,7 @@ def _label_controller(i: int) -> str:
     return f"{actuators} on {estimator}" if actuators != "none" else actuators
 
 
-_COLUMNS = {  # what `_track_reference` gives, and what the figure calls it
+_COLUMNS = {  # what `_track_reference` gives
     "error of beta / without control": "ratio",
     "error of the yaw rate / without control": "ratio",
     "share of time at the motors' limit": "saturation",
@@ -190,43 +164,67 @@ _COLUMNS = {  # what `_track_reference` gives, and what the figure calls it
 }
 
 
-def _add_bandwidths(suite: Suite, errors: Array) -> None:
-    """Add table, rows and figure; errors: (none and every bandwidth, seeds, `_track_reference`)."""
-    none, seeds = errors[0].mean(axis=0), errors.shape[1]
-    shares = errors[1:] / np.where([True, True, False, False], none, 1.0)
-    numbers = [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
-    radius = np.array([_compute_loop_radius(_STEP, K) for K in BANDWIDTHS])
-    cells = []
-    for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
-        cells.append([f"{K:.0f}", *(f"{number.value:.3f}" for number in spread), f"{r:.5f}"])
-        scenario = f"{_STEP}, K = {K:.0f} rad/s"
-        columns = {"estimator": "dakf", "controller": "model-following", "scenario": scenario}
-        for metric, number in zip(_COLUMNS.values(), spread, strict=True):
-            add_rows(suite, {metric: number}, **columns, n=seeds)
-        add_rows(suite, {"spectral_radius": Estimate(r, r, r)}, **columns, n=1)
-    header = ("K / (rad/s)", "beta", "yaw rate", "saturated", "failed", "radius")
-    note = "Errors over those without control; shares of time and of runs."
-    suite.tables.append(ResultTable("The bandwidth K", header, cells, note, keyed=False))
-    if (figures := import_figures()) is None:
-        return
-    curves = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
+def _compute_spreads(errors: Array) -> list[list[Estimate]]:
+    """Compute the numbers of `_COLUMNS` at every bandwidth."""
+    shares = errors[1:] / np.where([True, True, False, False], errors[0].mean(axis=0), 1.0)
+    return [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
+
+
+def _add_tables(suite: Suite, results: FollowingResults) -> None:
+    """Add rows and a table of the bandwidths, and those of the lanes."""
+    seeds, lines = results.errors.shape[1], []
+    spreads = _compute_spreads(results.errors)
+    for K, spread, r in zip(BANDWIDTHS, spreads, results.radius.tolist(), strict=True):
+        where = {"estimator": "dakf", "controller": "model-following"}
+        where["scenario"] = f"{_STEP}, K = {K:.0f} rad/s"
+        pairs = zip(_COLUMNS.values(), spread, strict=True)
+        suite.add_rows([{metric: number} for metric, number in pairs], **where, n=seeds)
+        suite.add_rows([{"spectral_radius": Estimate(r, r, r)}], **where, n=1)
+        lines.append([K, *spread, r])
+    shares = (Column(name, form=".3f", interval=False) for name in _COLUMNS)
+    columns = (Column("K / (rad/s)"), *shares, Column("radius", form=".5f"))
+    suite.tables.append(ResultTable("The bandwidth K", columns, lines, keyed=False))
+    records = []
+    for i, numbers in enumerate(results.lanes):
+        actuators, estimator, _ = LANE_CONTROLLERS[i]
+        entry = {"label": _label_controller(i), "estimator": estimator, "controller": actuators}
+        motion = {"offset": interval(numbers[:, 0]), "rms_slip": interval(numbers[:, 1])}
+        records.append({**entry, **motion, "departure_rate": share(numbers[:, 2])})
+    suite.add_rows(records, scenario=_ROAD, n=len(results.lanes[0]))
+    note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
+    title = "Keeping the lane on curved roads"
+    suite.tables.append(ResultTable(title, _LANE_COLUMNS, records, note))
+
+
+_LANE_COLUMNS = (
+    Column("label", "controller"),
+    Column("offset", "largest offset / m", form=".3f"),
+    Column("rms_slip", "RMS slip / mrad", 1e3, ".1f", interval=False),
+    Column("departure_rate", "left / %", 100.0, ".1f", interval=False),
+)
+
+
+def _add_figures(suite: Suite, results: FollowingResults, draw: ModuleType) -> None:
+    # (column, value low high, K)
+    curves = np.array(_compute_spreads(results.errors)).transpose(1, 2, 0)
     lines = {name: tuple(curve) for name, curve in zip(_COLUMNS, curves, strict=True)}
-    lines["spectral radius of the loop"] = (radius, radius, radius)
-    figure = figures.draw_curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
+    lines["spectral radius of the loop"] = (results.radius,) * 3
+    figure = draw.draw_curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
     caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
     suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
 
 
-def _add_lanes(suite: Suite, lanes: list[Array]) -> None:
-    cells = []
-    for i, numbers in enumerate(lanes):
-        actuators, estimator, _ = LANE_CONTROLLERS[i]
-        max_offset, slip, departures = *map(interval, numbers.T[:-1]), share(numbers.T[-1])
-        texts = (*max_offset.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * departures.value:.1f}")
-        cells.append([_label_controller(i), *texts])
-        columns = {"scenario": _ROAD, "estimator": estimator, "controller": actuators}
-        metrics = {"offset": max_offset, "rms_slip": slip, "departure_rate": departures}
-        add_rows(suite, metrics, **columns, n=len(numbers))
-    header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
-    note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
-    suite.tables.append(ResultTable("Keeping the lane on curved roads", header, cells, note))
+STUDY = Study(
+    "following",
+    "What steering and yaw moment do together",
+    "dakf-stability V.D has the bandwidth K limited by actuators and filter: its step by wire "
+    "(Fig. 7) with dakf in the loop, from K = 1 to 100 rad/s. The radius is that of the sampled "
+    "loop of the true car with its lags, without the filter: beyond 1 it is unstable.\n\n"
+    "Lane keeping: bends of drawn curvature, 1 / 100 m to 1 / 33 m, a lane of 3.5 m, camera and "
+    "gyro with uneven delay; nobody steers but the controller.",
+    _SEEDS,
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    _add_figures,
+)

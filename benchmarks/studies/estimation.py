@@ -4,30 +4,36 @@ On the papers' simulations tie-vision-fig7 and dakf-fig6.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
 
-from ...agents.rollout import Rollout, rollout
+from ...agents.rollout import rollout
 from ...envs.record import Array
 from ...estimators.analysis.bound import compute_error_bound
 from ..harness.drives import SETTLED, make_filter_arguments
-from ..harness.parallel import run_cases, split_seeds
-from ..harness.results import ResultTable, Suite
-from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
+from ..harness.results import Column, ResultTable, Suite
+from ..harness.stats import interval, ratio_of_roots, root_mean
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
-from ..report.study import add_rows, import_figures
+from ..report.study import Request, Study, stack_seeds
 
-SEEDS = 100
-QUICK_SEEDS = 10
 _CHUNK = 5
+_COLUMNS = (
+    "estimator",
+    Column("rmse", "RMSE / mrad", 1e3, ".2f"),
+    Column("rmse_over_bound", "over the bound", form=".2f"),
+    Column("us_per_tick", "us per tick", form=".3f"),
+)
+BOUND = "the bound"
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
+Results = list[dict[str, Array]]
+"""Of each experiment by filter and `BOUND`: numbers of `run_filters`, shape (seeds, 2)."""
 
 
 @dataclass(frozen=True)
@@ -69,122 +75,82 @@ EXPERIMENTS = (
 )
 
 
-@dataclass(frozen=True)
-class SeedChunk:
-    """A case: some seeds of an experiment, by its place in EXPERIMENTS."""
-
-    experiment: int
-    seeds: tuple[int, ...]
-
-
-class _EstimationResult(NamedTuple):
-    """Errors and cost of an experiment's filters, and the drive of seed 0 with its estimates."""
-
-    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
-    bound: Array  # mean squares of the bound (rad2), shape (seeds,)
-    cost: Array  # CPU time per tick (us), shape (seeds, filters)
-    example: tuple[Rollout, dict[str, Array]] | None  # estimates of beta (rad)
-
-
-def _make_env(experiment: Experiment) -> gym.Env[Any, Any]:
+def _make_env(experiment: Experiment) -> Any:
     return gym.make(experiment.env_id, scenario=experiment.scenario, control_period=1)
 
 
-def measure(case: SeedChunk) -> _EstimationResult:
-    """Drive the seeds of a case once and run every filter over the same records.
+def run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple[float, float]]]:
+    """Drive some seeds of an experiment once and run every filter over the same records.
 
     Args:
         case: Experiment and seeds.
 
     Returns:
-        Errors, bound, cost, and the drive of seed 0.
+        Mean squared error of beta (rad2) and CPU time per tick (us), by filter and `BOUND`.
     """
-    experiment = EXPERIMENTS[case.experiment]
-    env = _make_env(experiment)
-    base: Any = env.unwrapped
-    shape = (len(case.seeds), len(experiment.filters))
-    squares, cost, best = np.empty(shape), np.empty(shape), np.empty(len(case.seeds))
-    example = None
-    for i, seed in enumerate(case.seeds):
-        drive = rollout(env, seed=seed)
-        settled = drive.log.time >= SETTLED - 1e-9
-        traces = {}
-        for j, (label, estimator) in enumerate(make_filters(experiment.filters, base).items()):
-            estimator.run(drive.log)  # gains are designed when they are first asked for
+    experiment, seeds = case
+    env, results = _make_env(experiment), []
+    base = env.unwrapped
+    for seed in seeds:
+        log = rollout(env, seed=seed).log
+        settled, numbers = log.time >= SETTLED - 1e-9, {}
+        for label, estimator in make_filters(experiment.filters, base).items():
+            estimator.run(log)  # gains are designed when they are first asked for
             start = time.process_time()
-            estimates = estimator.run(drive.log)
-            cost[i, j] = (time.process_time() - start) / len(settled) * 1e6
-            traces[label] = estimates["beta"]
-            squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[settled] ** 2)
+            beta = estimator.run(log)["beta"]
+            us = (time.process_time() - start) / len(settled) * 1e6
+            numbers[label] = float(np.mean((beta - log.truth["beta"])[settled] ** 2)), us
         facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
-        std = compute_error_bound(record=drive.log.record, **facts)
-        best[i] = np.mean(std[settled] ** 2)
-        if seed == 0:
-            example = (drive, traces)
-    return _EstimationResult(squares, best, cost, example)
+        std = compute_error_bound(record=log.record, **facts)
+        numbers[BOUND] = float(np.mean(std[settled] ** 2)), np.nan
+        results.append(numbers)
+    return results
 
 
-def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run every estimator of both experiments.
-
-    Args:
-        seeds: Number of seeds.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-
-    Returns:
-        Suite.
-    """
-    chunks = split_seeds(seeds, _CHUNK)
-    cases = [SeedChunk(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
-    results = run_cases(measure, cases, "estimation", jobs, console)
-    suite = Suite(
-        "estimation",
-        "Which estimator comes closest to the sideslip angle",
-        "Root mean square error of the sideslip angle from 2 s on. The bound is the standard "
-        "deviation that the optimal filter of the true linear model has on the same arrivals, the "
-        "wind included; no estimator can do better on average. exact-kf is exact about delays and "
-        "trusts its vehicle: with the true one it is the best, with the nominal one it has no "
-        "process noise to doubt it with; joint estimates the tyres' stiffness as it drives. "
-        "tie-vision reports that its pseudo-residual filter is the "
-        "best on Fig. 7 and the bicycle model the worst: the second is so among the tuned filters, "
-        "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
-        "are 95 % over seeds.",
-    )
-    errors, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
-    for e, experiment in enumerate(EXPERIMENTS):
-        chunked = results[e * len(chunks) : (e + 1) * len(chunks)]
-        squares, best, costs = map(np.concatenate, list(zip(*chunked, strict=True))[:3])
-        errors.append((squares, best))
-        _add_rows(suite, experiment, squares, best, np.median(costs, axis=0))
-        examples += [m.example for m in chunked if m.example is not None]
-    suite.verdict = compose_verdict(errors)
-    _draw_figures(suite, errors, examples)
-    return suite
+def _measure(request: Request) -> Results:
+    seeds = request.episodes or 0
+    drives = request.run_seeds(run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
+    return list(map(stack_seeds, drives))
 
 
-def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
-    """Compose the verdict.
+def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:
+    bound = numbers[BOUND][:, 0]
+    return [
+        {
+            "estimator": label,
+            "rmse": interval(squares, root_mean),
+            "rmse_over_bound": interval(squares, ratio_of_roots, bound),
+            "us_per_tick": float(np.median(us)),
+        }
+        for label, (squares, us) in ((label, columns.T) for label, columns in numbers.items())
+    ]
 
-    Args:
-        errors: Squared errors, shape (seeds, filters), and bound, (seeds,), of each experiment.
 
-    Returns:
-        Verdict.
-    """
+def _add_tables(suite: Suite, results: Results) -> None:
+    """Add rows and a table of each experiment, the best estimator first."""
+    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
+        *records, bound = _make_records(numbers)
+        spec, n = _make_env(experiment).spec.to_json(), len(numbers[BOUND])
+        where = {"scenario": experiment.scenario, "spec": spec, "paper": experiment.paper}
+        suite.add_rows(records, experiment.env_id, n=n, **where)
+        title = f"{experiment.paper}: error of the sideslip angle ({n} seeds)"
+        records = sorted([bound, *records], key=lambda record: record["rmse"].value)
+        suite.tables.append(ResultTable(title, _COLUMNS, records, experiment.text))
+
+
+def _compose_verdict(results: Results) -> str:
     firsts, unaided, known = [], [], []
-    for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
-        labels = [filter_.label for filter_ in experiment.filters]
-        by_label = dict(zip(labels, squares.T, strict=True))
-        known_labels = [label for label in labels if label != TRUE_MODEL]
-        leader, *rivals = sorted(known_labels, key=lambda name: by_label[name].mean())
-        smallest = by_label[leader]
-        ratios = {name: interval(smallest, ratio_of_roots, by_label[name]) for name in rivals}
-        over_bound = float(ratio_of_roots(smallest, best))
+    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
+        squares = {label: columns[:, 0] for label, columns in numbers.items()}
+        known_labels = [label for label in squares if label not in (TRUE_MODEL, BOUND)]
+        leader, *rivals = sorted(known_labels, key=lambda name: squares[name].mean())
+        smallest = squares[leader]
+        ratios = {name: interval(smallest, ratio_of_roots, squares[name]) for name in rivals}
+        over_bound = float(ratio_of_roots(smallest, squares[BOUND]))
         first = describe_leader(leader, ratios, "err")
         firsts.append(f"{experiment.brief}: {first}, {over_bound:.2f} times the least possible.")
-        unaided.append(f"{ratio_of_roots(by_label[_UNAIDED], smallest):.1f}")
-        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], smallest):.2f}")
+        unaided.append(f"{ratio_of_roots(squares[_UNAIDED], smallest):.1f}")
+        known.append(f"{ratio_of_roots(squares[TRUE_MODEL], smallest):.2f}")
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         *firsts,
@@ -194,53 +160,25 @@ def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
     )
 
 
-def _add_rows(
-    suite: Suite, experiment: Experiment, squares: Array, best: Array, cost: Array
-) -> None:
-    """Rows and a table of one experiment, best estimator first."""
-    spec = _make_env(experiment).spec
-    columns = {"scenario": experiment.scenario, "spec": spec.to_json() if spec else ""}
-    columns["paper"] = experiment.paper
-    lines = [(float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])]
-    for j, filter_ in enumerate(experiment.filters):
-        error = interval(squares[:, j], root_mean)
-        ratio = interval(squares[:, j], ratio_of_roots, best)
-        us = float(cost[j])
-        numbers = {"rmse": error, "rmse_over_bound": ratio, "us_per_tick": Estimate(us)}
-        columns["estimator"] = filter_.label
-        add_rows(suite, numbers, experiment.env_id, **columns, n=len(squares))
-        texts = error.text(1e3, ".2f")
-        lines.append((error.value, [filter_.label, *texts, f"{ratio.value:.2f}", f"{us:.3f}"]))
-    title = f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)"
-    header = ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick")
-    cells = [texts for _, texts in sorted(lines, key=lambda line: line[0])]
-    suite.tables.append(ResultTable(title, header, cells, experiment.text))
-
-
-def _draw_figures(
-    suite: Suite,
-    errors: Sequence[tuple[Array, Array]],
-    examples: Sequence[tuple[Rollout, dict[str, Array]]],
-) -> None:
-    """Figures of every experiment; nothing where plotly is not installed."""
-    if (figures := import_figures()) is None:
-        return
+def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
+    """Add the errors of every experiment's estimators, and one drive of each."""
     groups, angle = {}, "sideslip angle / mrad"
-    for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
-        labels = [filter_.label for filter_ in experiment.filters]
-        numbers = (interval(column, ratio_of_roots, best) for column in squares.T)
-        ratios = dict(zip(labels, numbers, strict=True))
-        title = f"{experiment.brief} ({experiment.paper})"
-        groups[title] = dict(sorted(ratios.items(), key=lambda pair: pair[1].value))
+    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
+        records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)
+        ratios = {record["estimator"]: record["rmse_over_bound"] for record in records}
+        groups[f"{experiment.brief} ({experiment.paper})"] = ratios
     ratio = "error / the least possible: less is better"
-    bars = figures.draw_groups(groups, ratio, {1.0: "the bound"})
+    bars = draw.draw_groups(groups, ratio, {1.0: BOUND})
     text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
     suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
-    for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
-        t, beta = drive.log.time, drive.log.truth["beta"]
+    for experiment in EXPERIMENTS:
+        env = _make_env(experiment)
+        log = rollout(env, seed=0).log
+        filters, beta = make_filters(experiment.filters, env.unwrapped), log.truth["beta"]
+        traces = {label: filter_.run(log)["beta"] for label, filter_ in filters.items()}
         lines = {"truth": 1e3 * beta} | {label: 1e3 * item for label, item in traces.items()}
         missed = {label: 1e3 * (item - beta) for label, item in traces.items()}
-        over_time = figures.draw_time_series(t, lines, angle)
+        over_time = draw.draw_time_series(log.time, lines, angle)
         if experiment is EXPERIMENTS[0]:
             over_time.update_layout(meta="wide")
             text = f"{experiment.text} The truth lies on top of the estimates."
@@ -248,6 +186,26 @@ def _draw_figures(
         else:
             title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
             suite.figures.append((title, over_time, experiment.text))
-        figure = figures.draw_error_series(t, missed, f"error of the {angle}")
+        figure = draw.draw_time_series(log.time, missed, f"error of the {angle}", zero_line=True)
         title, caption = f"{experiment.paper}: errors (seed 0)", "Estimate minus truth."
         suite.figures.append((title, figure, caption))
+
+
+STUDY = Study(
+    "estimation",
+    "Which estimator comes closest to the sideslip angle",
+    "Root mean square error of the sideslip angle from 2 s on. The bound is the standard "
+    "deviation that the optimal filter of the true linear model has on the same arrivals, the "
+    "wind included; no estimator can do better on average. exact-kf is exact about delays and "
+    "trusts its vehicle: with the true one it is the best, with the nominal one it has no "
+    "process noise to doubt it with; joint estimates the tyres' stiffness as it drives. "
+    "tie-vision reports that its pseudo-residual filter is the "
+    "best on Fig. 7 and the bicycle model the worst: the second is so among the tuned filters, "
+    "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
+    "are 95 % over seeds.",
+    (100, 10),
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    _add_figures,
+)

@@ -7,23 +7,19 @@ our `Vehicle` describes it; the policies were trained on another one.
 
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from ...agents.rollout import iterate_steps
 from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...estimators.registry import describe_error
-from ..control.entries import ADAPTIVE, LEARNED, ControlEntry, make_cars
+from ..control.entries import ADAPTIVE, LEARNED
 from ..control.run import NUMBERS, Chunk, DriveResult, measure
-from ..control.score import compute_log_ratios, survival_mask
 from ..control.tasks import (
     NOMINAL,
     STEERING,
@@ -33,14 +29,19 @@ from ..control.tasks import (
     make_task_seeds,
     vary_scenario,
 )
-from ..harness.results import ResultTable, Suite
-from ..harness.stats import geometric_mean, share
+from ..harness.results import Column, Line, ResultTable, Suite
+from ..harness.stats import share
 from ..harness.verdict import format_verdict
-from .learned import EPISODES as EPISODES
-from .learned import QUICK_EPISODES as QUICK_EPISODES
-from .learned import TransferResult, add_figures, add_tables, collect_results, list_entries
+from ..report.study import Request, Study
+from .learned import (
+    EPISODES,
+    TransferResult,
+    add_figures,
+    add_tables,
+    collect_results,
+    list_entries,
+)
 
-_NAME = "learned-outside"
 OUTSIDE_ID = "sideslip/Outside-v0"
 KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
 """Classes whose car is about as large and as fast as the BMW."""
@@ -48,12 +49,6 @@ MANOEUVRE = "any-friction-sine-with-dwell"
 """The scenario of every class that ends with the initial heading, as a straight road needs."""
 _RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
 """Controllers by whose costs all costs are divided: no gap between oracles scales scores here."""
-_TEXT = (
-    "The passenger car's policies on CommonRoad's single-track, drift and multi-body models of a "
-    "BMW 320i, beside controllers on the same late sensors that are designed for it. No training "
-    "met it."
-)
-_NOT_INSTALLED = " Left out: pip install 'sideslip[outside]'."
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,7 @@ def _run_chunk(chunk: Chunk) -> DriveResult:
     """Drive cars that are stepped one by one; all metrics but cost and failure are NaN."""
     start_time, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
     try:
-        env, agent = make_cars(chunk.entry, len(chunk.seeds))
+        env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
         costs, failures = np.zeros((2, len(chunk.seeds)))
         for step in iterate_steps(env, agent, list(chunk.seeds)):
             costs -= np.where(step.running, step.reward, 0.0)
@@ -118,90 +113,76 @@ def _run_chunk(chunk: Chunk) -> DriveResult:
     return DriveResult(numbers, time.process_time() - start_time)
 
 
-def run(
-    episodes: int = EPISODES,
-    jobs: int | None = None,
-    console: Console | None = None,
-    keep: Path | None = None,
-    quick: bool = False,
-    salt: str = "",
-) -> Suite:
-    """Run every class of `KINDS` on every model.
-
-    Args:
-        episodes: Episodes of each model.
-        jobs: Processes, None for all processors.
-        console: Console of the progress bar, None for none.
-        keep: Folder in which finished cases stay.
-        quick: Whether to run the drift model alone.
-        salt: Salt of the seeds, "" for `make_salt`'s.
-
-    Returns:
-        Suite of all classes, empty where the models are not installed.
-
-    Raises:
-        ValueError: An entry cannot drive.
-    """
-    suite = Suite(_NAME, "Learned policies in cars that are not ours", _TEXT)
-    if find_spec("vehiclemodels") is None:
-        suite.text += _NOT_INSTALLED
-        return suite
-    models = ["drift"] if quick else list(OUTSIDE_PLANTS)
-    entries = [
-        ControlEntry(make_outside_task(kind, model), *pair)
+def _measure(request: Request) -> list[TransferResult]:
+    """Run every class of `KINDS` on every model; ValueError: an entry cannot drive."""
+    models, salt = request.choose(list(OUTSIDE_PLANTS), ["drift"]), request.salt or make_salt()
+    cases = [
+        (make_outside_task(kind, model), entry)
         for model in models
         for kind in KINDS
-        for pair in list_entries(kind)
+        for entry in list_entries(kind)
     ]
-    salt = salt or make_salt()
-    seeds = make_task_seeds(salt, episodes)
     results = measure(
-        entries, seeds, jobs=jobs, console=console, keep=keep, runner=_run_chunk, title=_NAME
-    )
-    transfers = [TransferResult(kind, salt=salt) for kind in KINDS]
-    for item, model in product(transfers, models):
-        task = make_outside_task(item.kind, model)
-        item.drives[model] = [collect_results(results, task, model)]
-    note = "Other seeds on each model. No training met any."
-    for item in transfers:
-        title = f"{item.kind} in a BMW"
-        add_tables(suite, item, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
-        suite.tables.insert(-1, _make_ratio_table(item, title))
-    suite.verdict = _compose_verdict(transfers)
-    add_figures(suite, transfers)
-    return suite
+        cases, make_task_seeds(salt, request.episodes or 0), jobs=request.jobs,
+        console=request.console, keep=request.keep, runner=_run_chunk, title="learned-outside",
+    )  # fmt: skip
+    remark, scenarios = "No training met any.", f"{MANOEUVRE} on a straight road"
+    transfers = []
+    for kind in KINDS:
+        tasks = {model: make_outside_task(kind, model) for model in models}
+        drives = {x: [collect_results(results, task, x)] for x, task in tasks.items()}
+        where = (OUTSIDE_ID, f"{kind} in a BMW", scenarios, f"Other seeds on each model. {remark}")
+        transfers.append(TransferResult(kind, drives, salt, *where))
+    return transfers
+
+
+def _add_tables(suite: Suite, transfers: Sequence[TransferResult]) -> None:
+    """Add each class's rows and tables, those of costs over `_RIVALS` first: they need no gap."""
+    for transfer in transfers:
+        add_tables(suite, [transfer])
+        suite.tables.insert(-2, _make_ratio_table(transfer))
 
 
 def _compose_verdict(transfers: Sequence[TransferResult]) -> str:
     """Compose the verdict: the cost of each class's policies over their rivals' on all models."""
     lines = []
     for transfer in transfers:
-        for _, policy in LEARNED[transfer.kind]:
+        for policy in (entry.agent for entry in LEARNED[transfer.kind]):
             models = transfer.drives
-            ratios = {x: _format_cost_ratio(transfer, policy, x, models) for x in _RIVALS}
-            costs = ", ".join(f"{ratio} % of {rival}'s" for rival, ratio in ratios.items())
+            ratios = {x: transfer.compute_cost_ratio(policy, x, models) for x in _RIVALS}
+            texts = (f"{ratio.inline(100.0, '.0f')} % of {x}'s" for x, ratio in ratios.items())
             fails = 100.0 * share(transfer.select("failure", policy) != 0.0).value
-            lines.append(f"{policy} costs {costs}; {fails:.0f} % fail.")
+            lines.append(f"{policy} costs {', '.join(texts)}; {fails:.0f} % fail.")
     return format_verdict("On CommonRoad's BMW, known to all but the policies:", *lines)
 
 
-def _format_cost_ratio(
-    transfer: TransferResult, controller: str, rival: str, models: Iterable[str]
-) -> str:
-    """Geometric mean (%) of the cost over a rival's, paired, where the rival survives."""
-    logs = []
-    for (results,) in (transfer.drives[model] for model in models):
-        mask = survival_mask(results[rival])
-        logs.append(-compute_log_ratios(results[rival].costs, results[controller])[mask])
-    return geometric_mean(*logs).inline(100.0, ".0f")
-
-
-def _make_ratio_table(transfer: TransferResult, title: str) -> ResultTable:
+def _make_ratio_table(transfer: TransferResult) -> ResultTable:
     """Table of what everybody costs on each model over `_RIVALS`."""
-    pairs, cells = list(product(transfer.drives, _RIVALS)), []
-    for _, name in list_entries(transfer.kind):
-        ratios = (name != x and _format_cost_ratio(transfer, name, x, [m]) for m, x in pairs)
-        cells.append([name, *(ratio or "" for ratio in ratios)])
-    header = [f"{model}, % of {rival}" for model, rival in pairs]
+    pairs, records = list(product(transfer.drives, _RIVALS)), list[Line]()
+    columns = [Column(f"{model}, % of {x}", scale=100.0, form=".0f") for model, x in pairs]
+    for name in (entry.agent for entry in list_entries(transfer.kind)):
+        keyed = zip(columns, pairs, strict=True)
+        ratios = {
+            column.key: transfer.compute_cost_ratio(name, x, [model])
+            for column, (model, x) in keyed
+            if x != name
+        }
+        records.append({"controller": name} | ratios)
     note = "Geometric means, paired, where the one compared with survives; a failure counts 20."
-    return ResultTable(f"{title}: cost over others'", ("controller", *header), cells, note)
+    title = f"{transfer.title}: cost over others'"
+    return ResultTable(title, ("controller", *columns), records, note)
+
+
+STUDY = Study(
+    "learned-outside",
+    "Learned policies in cars that are not ours",
+    "The passenger car's policies on CommonRoad's single-track, drift and multi-body models of a "
+    "BMW 320i, beside controllers on the same late sensors that are designed for it. No training "
+    "met it.",
+    EPISODES,
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    add_figures,
+    ("vehiclemodels", "Left out: pip install 'sideslip[outside]'."),
+)

@@ -4,7 +4,7 @@ Lessons of `sideslip distill` and starts of `sideslip train -i`: a class's tasks
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,12 +23,11 @@ from ..control.entries import (
     ADAPTIVE,
     ORACLE_NAMES,
     REFERENCE_FILTER,
-    ControlEntry,
-    make_cars,
-    make_estimate_options,
+    ControlCase,
+    Entry,
 )
 from ..control.run import Chunk, DriveResult, run_chunk
-from ..control.score import compute_log_ratios, make_spec
+from ..control.score import compute_log_ratios
 from ..control.tasks import (
     NOMINAL,
     ORACLES,
@@ -59,9 +58,89 @@ class PolicyEvaluation:
     salt: str  # salt of the seeds, "" where the caller chose them
     seeds: list[int]  # seeds of the episodes
     reference: str  # reference of the env
-    entries: dict[str, ControlEntry]  # entries by name
+    task: ControlTask  # task that they drive
+    entries: dict[str, Entry]  # entries by name
     drives: dict[str, DriveResult]  # episodes by name
     left_out: dict[str, str]  # why an entry is not among them, by name
+
+    def summarise(self) -> JsonMap:
+        """Summarise for a card: salt, episodes, and each mean cost with its 95 % interval."""
+        costs = {}
+        for name, drive in self.drives.items():
+            numbers = (round(number, 6) for number in interval(drive.costs))
+            costs[name] = dict(zip(("mean", "low", "high"), numbers, strict=True))
+        return {"salt": self.salt, "episodes": len(self.seeds), "cost": costs}
+
+    def make_suite(self) -> Suite:
+        """Make a suite of table and rows, and of the first episode over time and in motion."""
+        from ..control.report import make_time_explorer
+
+        name, card = self.policy.name, self.policy.card
+        task = self.task
+        text = (
+            f"{len(self.seeds)} episodes of {task.scenario}, the same seeds for all. "
+            f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
+            f"steps of {card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
+        )
+        if self.reference != card.reference:
+            text += f" Here it is judged by another reference, {self.reference}: by another cost."
+        suite = Suite("enjoy", f"{name} on {task.env_id}", text, tables=[self._make_table()])
+        self._add_rows(suite)
+        driven = {(label,): drive.series for label, drive in self.drives.items()}
+        series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
+        explorer = make_time_explorer("The first seed, side by side", (), series, name)
+        suite.explorers.append(explorer)
+        fails = f"It fails in {self._compute_failures(name):.0f} % of the episodes."
+        suite.verdict = format_verdict(
+            *(
+                f"{name} costs {self._format_cost_ratio(other)} of {other}, seed by seed."
+                for other in self.drives
+                if other != name
+            ),
+            f"{fails} Not said: other cars, scenarios and seeds than these {len(self.seeds)}.",
+        )
+        return suite
+
+    def _compute_failures(self, name: str) -> float:
+        """Compute the percentage of episodes that fail."""
+        return float(100.0 * np.mean(self.drives[name]["failure"] != 0.0))
+
+    def _format_cost_ratio(self, other: str) -> str:
+        costs, others = (self.drives[name].costs for name in (self.policy.name, other))
+        return format_percent(geometric_mean(np.log(compute_cost_ratios(costs, others))))
+
+    def _make_table(self) -> ResultTable:
+        """Table of what the policy costs over each other's, and of everybody's motion."""
+        first, cells = self.policy.name, []
+        for name, drive in self.drives.items():
+            ratio, better = "", ""
+            if name != first:
+                ratio = self._format_cost_ratio(name)
+                win_rate = compute_win_rate(self.drives[first].costs, drive.costs)
+                better = f"{100.0 * win_rate.value:.0f} %"
+            slip, step = 1e3 * drive["rms_slip"].mean(), drive["largest_step"].mean()
+            fails = f"{self._compute_failures(name):.1f} %"
+            cells.append([name, ratio, better, f"{slip:.2f}", f"{step:.0f}", fails])
+        header = ("controller", "cost ratio", "better", "RMS slip", "step", "fails")
+        note = (
+            f"{first}'s cost over each other's: paired geometric means with 95 % intervals. "
+            f"better: share of the seeds on which {first} costs less. Slip in mrad. step: "
+            "the largest between two decisions, in N m."
+        )
+        left_out = [f"{name} was not driven: {error}." for name, error in self.left_out.items()]
+        return ResultTable("What it costs", header, cells, " ".join([note, *left_out]))
+
+    def _add_rows(self, suite: Suite) -> None:
+        """Add rows of every entry: cost, slip, effort and steps."""
+        for name, outcome in self.drives.items():
+            entry = self.entries[name]
+            task, is_policy = self.task, name == self.policy.name
+            labels = {"estimator": entry.estimator, "scenario": task.scenario, "salt": self.salt}
+            labels |= {"controller": name if is_policy else entry.agent}
+            metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
+            numbers = {metric: interval(outcome[metric]) for metric in metrics}
+            labels |= {"spec": ControlCase(task, entry).spec}
+            add_rows(suite, numbers, task.env_id, n=len(self.seeds), **labels)
 
 
 def evaluate_policy(
@@ -96,35 +175,18 @@ def evaluate_policy(
     seeds = (
         make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
     )
-    rivals = {f"{_CLASSICAL} on {FILTER}": (FILTER, _CLASSICAL), "none": ("", "none")}
+    rivals = {f"{_CLASSICAL} on {FILTER}": Entry(_CLASSICAL, FILTER), "none": Entry("none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
-    contestants = {loaded.name: (card.estimator, policy)} | rivals
-    task = ControlTask(env_id=home, scenario=base.scenario.name)
-    entries = {name: ControlEntry(task, *pair, options) for name, pair in contestants.items()}
-    chunks = [Chunk(entry, tuple(seeds), keep=True) for entry in entries.values()]
+    entries = {loaded.name: Entry(policy, card.estimator)} | rivals
+    task = ControlTask(env_id=home, scenario=base.scenario.name, changes=options)
+    chunks = [Chunk(task, entry, tuple(seeds), keep=True) for entry in entries.values()]
     results = dict(zip(entries, run_cases(run_chunk, chunks, loaded.name, jobs=1), strict=True))
     errors = {name: outcome.error for name, outcome in results.items() if outcome.error}
     if failed := [name for name in (loaded.name, "none") if name in errors]:
         raise ValueError(f"{failed[0]} cannot drive {home}: {errors[failed[0]]}")
     drives = {name: outcome for name, outcome in results.items() if name not in errors}
-    return PolicyEvaluation(loaded, salt, seeds, base.reference, entries, drives, errors)
-
-
-def summarise_evaluation(result: PolicyEvaluation) -> JsonMap:
-    """Summarise an evaluation for a card.
-
-    Args:
-        result: Episodes of all entries.
-
-    Returns:
-        Salt, number of episodes, and each entry's mean cost with its 95 % interval.
-    """
-    costs = {}
-    for name, drive in result.drives.items():
-        mean, low, high = (round(number, 6) for number in interval(drive.costs))
-        costs[name] = {"mean": mean, "low": low, "high": high}
-    return {"salt": result.salt, "episodes": len(result.seeds), "cost": costs}
+    return PolicyEvaluation(loaded, salt, seeds, base.reference, task, entries, drives, errors)
 
 
 def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation:
@@ -139,87 +201,8 @@ def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation
     """
     result = evaluate_policy(str(path), episodes)
     policy = result.policy
-    save_policy(path, policy.network, replace(policy.card, evaluation=summarise_evaluation(result)))
+    save_policy(path, policy.network, replace(policy.card, evaluation=result.summarise()))
     return result
-
-
-def make_suite(result: PolicyEvaluation) -> Suite:
-    """Make a suite of table and rows, and of the first episode over time and in motion.
-
-    Args:
-        result: Episodes of all entries.
-
-    Returns:
-        Suite.
-    """
-    name, card = result.policy.name, result.policy.card
-    entry = result.entries[name]
-    text = (
-        f"{len(result.seeds)} episodes of {entry.task.scenario}, the same seeds for all. "
-        f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
-        f"steps of {card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
-    )
-    if result.reference != card.reference:
-        text += f" Here it is judged by another reference, {result.reference}: by another cost."
-    suite = Suite("enjoy", f"{name} on {entry.task.env_id}", text, tables=[_make_table(result)])
-    _add_rows(suite, result)
-    from ..control.report import make_time_explorer
-
-    driven = {(label,): drive.series for label, drive in result.drives.items()}
-    series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
-    suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
-    suite.verdict = _compose_verdict(result)
-    return suite
-
-
-def _compose_verdict(result: PolicyEvaluation) -> str:
-    """Costs of the policy over the others', and how often it fails."""
-    name = result.policy.name
-    fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
-    lines = [
-        f"{name} costs {_format_cost_ratio(result, other)} of {other}, seed by seed."
-        for other in result.drives
-        if other != name
-    ]
-    limits = f"Not said: other cars, scenarios and seeds than these {len(result.seeds)}."
-    return format_verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
-
-
-def _format_cost_ratio(result: PolicyEvaluation, other: str) -> str:
-    costs, others = (result.drives[name].costs for name in (result.policy.name, other))
-    return format_percent(geometric_mean(np.log(compute_cost_ratios(costs, others))))
-
-
-def _make_table(result: PolicyEvaluation) -> ResultTable:
-    """Table of what the policy costs over each other's, and of everybody's motion."""
-    first = result.policy.name
-    costs, cells = result.drives[first].costs, []
-    for name, outcome in result.drives.items():
-        ratio = _format_cost_ratio(result, name) if name != first else ""
-        better = f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %" if ratio else ""
-        slip, step = 1e3 * outcome["rms_slip"].mean(), outcome["largest_step"].mean()
-        fails = 100.0 * np.mean(outcome["failure"] != 0.0)
-        cells.append([name, ratio, better, f"{slip:.2f}", f"{step:.0f}", f"{fails:.1f} %"])
-    header = (f"{first} costs, of it", "better", "RMS slip", "step", "fails")
-    note = (
-        f"{first}'s cost over each other's: paired geometric means with 95 % intervals. "
-        f"better: share of the seeds on which {first} costs less. Slip in mrad. step: "
-        "the largest between two decisions, in N m."
-    )
-    left_out = [f"{name} was not driven: {error}." for name, error in result.left_out.items()]
-    return ResultTable("What it costs", ("controller", *header), cells, " ".join([note, *left_out]))
-
-
-def _add_rows(suite: Suite, result: PolicyEvaluation) -> None:
-    """Add rows of every entry: cost, slip, effort and steps."""
-    for name, outcome in result.drives.items():
-        entry = result.entries[name]
-        task, is_policy = entry.task, name == result.policy.name
-        labels = {"estimator": entry.estimator, "scenario": task.scenario, "salt": result.salt}
-        labels |= {"controller": name if is_policy else entry.controller, "spec": make_spec(entry)}
-        metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
-        numbers = {metric: interval(outcome[metric]) for metric in metrics}
-        add_rows(suite, numbers, task.env_id, n=len(result.seeds), **labels)
 
 
 _JOINT, _RIVAL = "joint, friction", "adaptive-nmpc"
@@ -234,57 +217,11 @@ _WITHOUT_FILTER = (*ORACLE_NAMES, *(name for names in ORACLES.values() for name 
 FILTERS = ("", "joint")
 
 
-def list_tasks(kind: str) -> list[ControlTask]:
-    """List the scored tasks of a class; ValueError for an unknown one.
-
-    Args:
-        kind: Class of tasks.
-
-    Returns:
-        Tasks.
-    """
+def _list_tasks(kind: str) -> list[ControlTask]:
+    """List the scored tasks of a class; ValueError for an unknown one."""
     tasks = list_scored_tasks()
     check_choice("class of contests", kind, list(dict.fromkeys(task.kind for task in tasks)))
     return [task for task in tasks if task.kind == kind]
-
-
-def make_card(
-    kind: str,
-    estimator: str = "",
-    teacher: str = _RIVAL,
-    observation_options: Mapping[str, Any] | None = None,
-    **rest: Any,
-) -> Card:
-    """Make the card of a policy for a class of tasks in the first one's env.
-
-    Args:
-        kind: Class of tasks.
-        estimator: Estimator that the policy reads, one of `FILTERS`.
-        teacher: Name of its teacher, whose filter it shares where that is `joint`.
-        observation_options: Options of the observation.
-        **rest: Other fields of the card.
-
-    Returns:
-        Card.
-    """
-    check_choice("estimator", estimator, FILTERS)
-    for name in observation_options or {}:
-        check_choice("option", name, OBSERVATION_OPTIONS)
-    first = list_tasks(kind)[0]
-    options = _make_estimate_options(first, teacher) if estimator else {}
-    env_options = first.env_options | dict(observation_options or {})
-    return Card.from_env_id(first.env_id, env_options, estimator, options, **rest)
-
-
-def _make_estimate_options(task: ControlTask, teacher: str) -> JsonMap:
-    """The filter of a teacher on `joint`, else of the rival's, with more of its states."""
-    filters = {controller: name for name, controller in ADAPTIVE.items()}
-    controller = teacher if teacher in filters else _RIVAL
-    entry = ControlEntry(task, filters[controller], controller)
-    options = make_estimate_options(entry)["options"]
-    has_friction = "inverse_friction_sd" in options
-    known = [name for name in _OUTPUTS if name != "inverse_friction" or has_friction]
-    return {"outputs": known, "std": True, "options": options}
 
 
 def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
@@ -304,54 +241,78 @@ def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
         }
 
 
-def make_lessons(
-    kind: str,
-    teacher: str,
-    estimator: str,
-    cars: int,
-    varied: int = 0,
-    seed: int = 0,
-    observation_options: Mapping[str, Any] | None = None,
-) -> "list[DistillTask]":
-    """Make a lesson for each task of a class, and more of each in which the scenario varies.
-
-    Args:
-        kind: Class of tasks.
-        teacher: Baseline, controller with its filter of the benchmark, or policy with its card's.
-        estimator: Estimator of the student.
-        cars: Cars of each task's lesson.
-        varied: Further lessons by `VARIED`, which share as many cars, rounded up; no filter and no
-            teacher knows of the changes.
-        seed: Seed of what is drawn for them.
-        observation_options: Options of what the student observes.
-
-    Returns:
-        Lessons of all tasks.
+@dataclass(frozen=True)
+class Lessons:
+    """The lessons of a class of tasks: what a student drives and reads, and who teaches it.
 
     Raises:
-        ValueError: An unknown name, or an observation that lacks what the teacher needs.
+        ValueError: An unknown name.
     """
-    from ...agents.training.distill import DistillTask
 
-    rng = np.random.default_rng(seed)
-    reads = {controller: name for name, controller in ADAPTIVE.items()}
-    reads |= dict.fromkeys(_WITHOUT_FILTER, "")
-    if is_policy(teacher):
-        reads[teacher] = load_policy(teacher).card.estimator
-    lessons = []
-    for task in list_tasks(kind):
-        for change in _draw_changes(varied, rng):
-            scenario_options = {"scenario": vary_scenario(task, change)} if change else {}
-            name = reads.get(teacher, REFERENCE_FILTER)
-            entry = ControlEntry(task, name, teacher, scenario_options)
-            count = -(-cars // varied) if change else cars
-            twins, agent = make_cars(entry, count)
-            options = task.env_options | scenario_options | dict(observation_options or {})
-            env: Any = gym.make_vec(task.env_id, num_envs=count, **options)
-            if estimator:
-                env = EstimateObservation(env, estimator, **_make_estimate_options(task, teacher))
-            lessons.append(DistillTask(env, twins, agent))
-    return lessons
+    kind: str  # class of tasks
+    estimator: str = ""  # that the student reads, one of `FILTERS`
+    teacher: str = _RIVAL
+    """Baseline, controller with its filter of the benchmark, or policy with its card's. The student
+    shares a teacher's filter where that is `joint`."""
+    cars: int = 6  # of each task's lesson
+    varied: int = 0
+    """Further lessons of each task by `VARIED`, which share as many cars, rounded up; no filter and
+    no teacher knows of the changes."""
+    seed: int = 0  # of what is drawn for them
+    observation_options: Mapping[str, Any] = field(default_factory=dict)  # what is observed
+
+    def __post_init__(self) -> None:
+        check_choice("estimator", self.estimator, FILTERS)
+        for name in self.observation_options:
+            check_choice("option", name, OBSERVATION_OPTIONS)
+
+    def make_card(self, **rest: Any) -> Card:
+        """Make the card of a policy for the class, in the first task's env.
+
+        Args:
+            **rest: Other fields of the card.
+
+        Returns:
+            Card.
+        """
+        first = _list_tasks(self.kind)[0]
+        options = self._make_estimate_options(first) if self.estimator else {}
+        env_options = first.env_options | dict(self.observation_options)
+        return Card.from_env_id(first.env_id, env_options, self.estimator, options, **rest)
+
+    def make_tasks(self) -> "list[DistillTask]":
+        """Make a lesson for each task, and more of each in which the scenario varies."""
+        from ...agents.training.distill import DistillTask
+
+        rng, teacher, lessons = np.random.default_rng(self.seed), self.teacher, []
+        reads = {controller: name for name, controller in ADAPTIVE.items()}
+        reads |= dict.fromkeys(_WITHOUT_FILTER, "")
+        if is_policy(teacher):
+            reads[teacher] = load_policy(teacher).card.estimator
+        for task in _list_tasks(self.kind):
+            for change in _draw_changes(self.varied, rng):
+                scenario_options = {"scenario": vary_scenario(task, change)} if change else {}
+                name = reads.get(teacher, REFERENCE_FILTER)
+                count = -(-self.cars // self.varied) if change else self.cars
+                varied_task = replace(task, changes=scenario_options)
+                twins, agent = Entry(teacher, name).make(varied_task, count)
+                options = task.env_options | scenario_options | dict(self.observation_options)
+                env: Any = gym.make_vec(task.env_id, num_envs=count, **options)
+                if self.estimator:
+                    estimate_options = self._make_estimate_options(task)
+                    env = EstimateObservation(env, self.estimator, **estimate_options)
+                lessons.append(DistillTask(env, twins, agent))
+        return lessons
+
+    def _make_estimate_options(self, task: ControlTask) -> JsonMap:
+        """The filter of a teacher on `joint`, else of the rival's, with more of its states."""
+        filters = {controller: name for name, controller in ADAPTIVE.items()}
+        controller = self.teacher if self.teacher in filters else _RIVAL
+        entry = Entry(controller, filters[controller])
+        options = ControlCase(task, entry).estimate_options["options"]
+        has_friction = "inverse_friction_sd" in options
+        known = [name for name in _OUTPUTS if name != "inverse_friction" or has_friction]
+        return {"outputs": known, "std": True, "options": options}
 
 
 def prepare_start(
@@ -387,7 +348,7 @@ def prepare_start(
         if has_scenarios and varied:
             raise ValueError("--varied is of a policy's own contests: without other scenarios")
         if kind is not None and not has_scenarios:
-            tasks, rng = list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
+            tasks, rng = _list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
             fields["scenarios"] = [
@@ -412,10 +373,10 @@ def evaluate_card(path: Path, kind: str, episodes: int) -> JsonMap:
         The card's evaluation.
     """
     policy, policy_evaluation = load_policy(path), evaluate_policy(str(path), episodes)
-    tasks, evaluate = list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
+    tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
     task_costs = run_cases(evaluate, tasks, "contests", jobs=1)
     costs = dict(zip((task.scenario for task in tasks), task_costs, strict=True))
-    record = summarise_evaluation(policy_evaluation) | {"cost in % of nominal": costs}
+    record = policy_evaluation.summarise() | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=record))
     return record
 
@@ -425,12 +386,12 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     policy = load_policy(path)
     seeds = tuple(make_salted_seeds(policy.salt, episodes, task.seed_text))
     entries = {
-        "policy": ControlEntry(task, policy.card.estimator, str(path)),
-        NOMINAL: ControlEntry(task, "", NOMINAL),
-        _RIVAL: ControlEntry(task, _JOINT, _RIVAL),
-        PARAMETERS: ControlEntry(task, "", PARAMETERS),
+        "policy": Entry(str(path), policy.card.estimator),
+        NOMINAL: Entry(NOMINAL),
+        _RIVAL: Entry(_RIVAL, _JOINT),
+        PARAMETERS: Entry(PARAMETERS),
     }
-    results = {name: run_chunk(Chunk(entry, seeds)) for name, entry in entries.items()}
+    results = {name: run_chunk(Chunk(task, entry, seeds)) for name, entry in entries.items()}
     for name, result in results.items():
         if result.error:
             raise ValueError(f"{name} cannot drive {task.name}: {result.error}")

@@ -7,24 +7,21 @@ friction. A car is saved that does not fail and ends with a sideslip angle below
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.scenarios.draws import KMH
-from ..control.entries import REFERENCE_FILTER, ControlEntry, make_cars
-from ..control.run import get_control_period
+from ..control.entries import REFERENCE_FILTER, Entry
 from ..control.tasks import YAW, ControlTask
-from ..harness.parallel import run_cases
-from ..harness.results import ResultTable, ShareMap, Suite
+from ..harness.results import Column, ResultTable, ShareMap, Suite
 from ..harness.stats import interval, mean_share
 from ..harness.verdict import format_verdict, summarise_names
-from ..report.study import add_rows, import_figures
+from ..report.study import Request, Study
 
-NAME = "recovery"
 _READING = ("two-dof", "esc", "sliding-mode", "lqr")
 ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
 CONTROLLERS = ("none", *_READING, "nominal", *ORACLES)
@@ -33,8 +30,8 @@ _PULSES = tuple((side, 0.05 * 1.4**k) for side in (-1.0, 1.0) for k in range(10)
 """Full yaw moment to the right or left, for how long (s), before an oracle goes on."""
 _TRIES = 5  # in a batch
 _CAUGHT = 0.05  # rad
-SEEDS, QUICK_SEEDS = 16, 4
-_POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
+SEEDS = 16, 4  # of a usual and of a quick run
+POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
 MAX_START = (0.45, 1.0)  # rad and rad/s, where the grid ends
 FIRST_SEED = 2**28
 
@@ -50,16 +47,6 @@ CARS: dict[str, tuple[ControlTask, dict[str, Any]]] = {
     )
 }
 """The task of each car, whose class has the tuned options, and the scenario."""
-
-_TEXT = (
-    "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
-    f"failure within 5 s, and below {_CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
-    "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
-    "have to find the slide first; the two oracles know it, and the car. clairvoyant: whatever any "
-    f"of them saves, or one of {len(_PULSES)} tries with full moment to one side for 0.05 to "
-    "1 s and an oracle from then on: of such pieces the run that just saves a car is made "
-    "(Pontryagin), so that this is a lower bound of what can be saved, and probably near it."
-)
 
 
 @dataclass(frozen=True)
@@ -91,17 +78,7 @@ class _PulseThenAgent:
         episode_start: object = None,
         deterministic: bool = True,
     ) -> tuple[Array, tuple[int, Any]]:
-        """Return the agent's action, the pulse's while that lasts.
-
-        Args:
-            observation: Observations, shape (rows, k).
-            state: Count of decisions and the agent's memory, None at the start.
-            episode_start: Whether an episode starts, for the agent.
-            deterministic: Whether the agent draws nothing.
-
-        Returns:
-            Actions, shape (rows, 1), and the next state.
-        """
+        """Return the agent's action, the pulse's while that lasts, and the next state."""
         count, inner = state or (0, None)
         action, inner = self.agent.predict(observation, inner, episode_start, deterministic)
         combined = np.where(count < self.decisions, self.share, np.ravel(action))
@@ -125,10 +102,10 @@ def _compute_recovery_mask(case: RecoveryCase) -> Array:
     states = [{"v_y": v_x * math.tan(b), "gamma": g} for g, b in starts for _ in indices]
     seeds = [FIRST_SEED + i for i in indices] * len(starts)
     reads = REFERENCE_FILTER if case.controller in _READING else ""
-    entry = ControlEntry(task, reads, case.controller, {"scenario": scenario})
-    env, agent = make_cars(entry, len(states))
+    task = replace(task, changes={"scenario": scenario})
+    env, agent = Entry(case.controller, reads).make(task, len(states))
     share, seconds = np.repeat(case.pulses, len(states) // tries, axis=0).T
-    agent = _PulseThenAgent(agent, share, np.round(seconds / get_control_period(entry)))
+    agent = _PulseThenAgent(agent, share, np.round(seconds / task.control_period))
     lost, last = np.zeros(len(states), np.bool_), np.zeros(len(states))
     for step in iterate_steps(env, agent, seeds, {"state": states}):
         lost |= step.running & (step.info["failure"] != 0)
@@ -139,46 +116,26 @@ def _compute_recovery_mask(case: RecoveryCase) -> Array:
     return np.asarray(caught.max(axis=0))
 
 
-def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run the maps of every controller on both cars.
-
-    Args:
-        quick: Whether the grid is coarse and the seeds are few.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-
-    Returns:
-        Suite.
-    """
-    points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (_POINTS, SEEDS)
-    cases = [RecoveryCase(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
+def _measure(request: Request) -> dict[str, dict[str, Array]]:
+    """Masks of `_compute_recovery_mask` by car and controller."""
+    grid = request.choose(*POINTS), request.choose(*SEEDS)
+    cases = [RecoveryCase(car, name, *grid) for car in CARS for name in CONTROLLERS]
     starts = [_PULSES[k : k + _TRIES] for k in range(0, len(_PULSES), _TRIES)]
-    cases += [RecoveryCase(car, ORACLES[0], points, seeds, item) for car in CARS for item in starts]
-    masks_by_case = run_cases(_compute_recovery_mask, cases, NAME, jobs, console)
-    results = dict(zip(cases, masks_by_case, strict=True))
-    suite = Suite(NAME, "From where the car is still saved", _TEXT)
-    beta, gamma = (np.degrees(axis) for axis in _make_grid(points))
-    cars = {car: {name: results[RecoveryCase(car, name, points, seeds)] for name in CONTROLLERS}
-            for car in CARS}  # fmt: skip
-    for car, masks in cars.items():
+    cases += [RecoveryCase(car, ORACLES[0], *grid, item) for car in CARS for item in starts]
+    masks = request.run_cases(_compute_recovery_mask, cases, "recovery")
+    results = dict(zip(cases, masks, strict=True))
+    cars = {}
+    for car in CARS:
+        cars[car] = {name: results[RecoveryCase(car, name, *grid)] for name in CONTROLLERS}
         car_masks = [item for case, item in results.items() if case.car == car]
-        masks[CLAIRVOYANT] = np.maximum.reduce(car_masks)
-    suite.verdict = compose_verdict(cars)
-    for car, masks in cars.items():
-        _add_table(suite, car, masks)
-        shares = {name: item.mean(axis=2) for name, item in masks.items()}
-        labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
-        suite.maps.append(ShareMap(f"{car}: share of cars saved", beta, gamma, shares, *labels))
-    _draw_figures(suite)
-    return suite
+        cars[car][CLAIRVOYANT] = np.maximum.reduce(car_masks)
+    return cars
 
 
-def _draw_figures(suite: Suite) -> None:
-    """The maps, those of the best first; nothing where plotly is not installed."""
-    if (figures := import_figures()) is None:
-        return
+def _add_figures(suite: Suite, _: object, draw: ModuleType) -> None:
+    """Add the maps, those of the best first."""
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
-    suite.figures = [(item.title, figures.draw_share_maps(item), text) for item in suite.maps]
+    suite.figures = [(item.title, draw.draw_share_maps(item), text) for item in suite.maps]
     first, best = suite.maps[0], suite.verdict.splitlines()[1:-2]
     shown = ["none"]
     for group in (_READING, ORACLES, (CLAIRVOYANT,)):
@@ -186,18 +143,10 @@ def _draw_figures(suite: Suite) -> None:
         shown += sorted(names, key=lambda name: -float(first.shares[name].mean()))[:1]
     selected = replace(first, shares={name: first.shares[name] for name in shown})
     title = f"From where is a car still saved? ({first.title})"
-    suite.answers.append((title, figures.draw_share_maps(selected), " ".join([*best[:1], text])))
+    suite.answers.append((title, draw.draw_share_maps(selected), " ".join([*best[:1], text])))
 
 
-def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
-    """Compose the verdict.
-
-    Args:
-        cars: Masks of `_compute_recovery_mask` by car and controller.
-
-    Returns:
-        Verdict.
-    """
+def _compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
     firsts, knowing, clairvoyant_shares = list[str](), list[str](), list[str]()
     for car, masks in cars.items():
         share = {name: values.mean(axis=(0, 1)) for name, values in masks.items()}  # (seeds,)
@@ -222,20 +171,50 @@ def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
     )
 
 
-def _add_table(suite: Suite, car: str, masks: Mapping[str, Array]) -> None:
-    """A table and rows of a car; the seeds are what varies, the starts are the same for all."""
-    cells = []
-    shares = {name: mask.mean(axis=(0, 1)) for name, mask in masks.items()}
-    for name, share in shares.items():
-        number, difference = mean_share(share), interval(share - shares["none"])
-        cells.append([name, *number.text(1e2, ".1f"), *difference.text(1e2, ".1f")])
-        columns = {"scenario": car, "controller": name}
-        add_rows(suite, {"saved_rate": number}, YAW, n=len(share), **columns)
-    header = ("controller", "saved / %", "95 % interval", "above none / %", "95 % interval")
-    starts = next(iter(masks.values())).shape
-    note = (
-        f"Of {starts[0] * starts[1]} starts up to {np.degrees(MAX_START[0]):.0f} deg and "
-        f"{np.degrees(MAX_START[1]):.0f} deg/s, {starts[2]} seeds each; intervals over the seeds, "
-        "paired against none."
-    )
-    suite.tables.append(ResultTable(car, header, cells, note))
+def _add_tables(suite: Suite, cars: Mapping[str, Mapping[str, Array]]) -> None:
+    """Add table, rows and maps; the seeds are what varies, the starts are the same for all."""
+    for car, masks in cars.items():
+        shares = {name: mask.mean(axis=(0, 1)) for name, mask in masks.items()}
+        records = [
+            {
+                "controller": name,
+                "saved_rate": mean_share(share),
+                "above none": interval(share - shares["none"]),
+            }
+            for name, share in shares.items()
+        ]
+        n_gamma, n_beta, seeds = masks["none"].shape
+        suite.add_rows(records, YAW, scenario=car, n=seeds)
+        note = (
+            f"Of {n_gamma * n_beta} starts up to {np.degrees(MAX_START[0]):.0f} deg and "
+            f"{np.degrees(MAX_START[1]):.0f} deg/s, {seeds} seeds each; intervals over the seeds, "
+            "paired against none."
+        )
+        suite.tables.append(ResultTable(car, _COLUMNS, records, note))
+        beta, gamma = (np.degrees(axis) for axis in _make_grid((n_beta, n_gamma)))
+        by_start = {name: item.mean(axis=2) for name, item in masks.items()}
+        labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
+        suite.maps.append(ShareMap(f"{car}: share of cars saved", beta, gamma, by_start, *labels))
+
+
+_COLUMNS = (
+    "controller",
+    Column("saved_rate", "saved / %", 100.0, ".1f"),
+    Column("above none", "above none / %", 100.0, ".1f"),
+)
+STUDY = Study(
+    "recovery",
+    "From where the car is still saved",
+    "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
+    f"failure within 5 s, and below {_CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
+    "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
+    "have to find the slide first; the two oracles know it, and the car. clairvoyant: whatever any "
+    f"of them saves, or one of {len(_PULSES)} tries with full moment to one side for 0.05 to "
+    "1 s and an oracle from then on: of such pieces the run that just saves a car is made "
+    "(Pontryagin), so that this is a lower bound of what can be saved, and probably near it.",
+    SEEDS,
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    _add_figures,
+)

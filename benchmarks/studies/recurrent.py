@@ -5,32 +5,27 @@ filter's actions with as many steps; PPO learns from rewards. The gap is what a 
 the optimum, less one, from its actions' errors (`Optimum.excess`), which scatters little.
 """
 
-import contextlib
-import hashlib
 import json
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
 
 from ...agents.optimum import Lqg, Optimum, compute_optimum, wrap_optimal_estimate
-from ...envs.io import atomic_file
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import Array
-from ..harness.parallel import run_cases
-from ..harness.results import ResultTable, Suite
+from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, interval
 from ..harness.verdict import format_percent, format_verdict
-from ..report.study import add_rows, import_figures
+from ..report.study import CaseStorage, Request, Study
 
 ID = "sideslip/LinearYawVision-v0"
 PERIOD, _STEP = 0.04, 0.01  # s, of pictures and of control
@@ -47,7 +42,7 @@ REPEATED, SEEDS = "100 ms", 3
 _SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
 FILTER, PPO, LQG_FACTOR = "lqg", "ppo", 8
 """The optimum's own policy, as a check, on so many times the episodes; learning from rewards."""
-EPISODES, QUICK_EPISODES = 64, 16
+_EPISODES = 64, 16  # of a usual and of a quick run
 
 
 @dataclass(frozen=True)
@@ -99,16 +94,15 @@ def _compute_best(condition: str, budget: Budget) -> Optimum:
     return compute_optimum(gym.make(ID, **options), n)
 
 
-def _make_cases(quick: bool, episodes: int | None = None) -> list[MemoryCase]:
-    """Make the cases of a run, the repeated seeds last; arguments as of `run`."""
+def _make_cases(quick: bool, episodes: int = 1) -> list[MemoryCase]:
+    """Make the cases of a run, the repeated seeds last."""
     from ...agents.training.recurrent import MEMORIES
 
     budget, conditions = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
-    count = episodes or (QUICK_EPISODES if quick else EPISODES)
     pairs = product(conditions, (FILTER, *MEMORIES))
-    cases = [MemoryCase(name, condition, 0, budget, count) for condition, name in pairs]
+    cases = [MemoryCase(name, condition, 0, budget, episodes) for condition, name in pairs]
     if not quick:
-        cases.append(MemoryCase(PPO, REPEATED, 0, budget, count))
+        cases.append(MemoryCase(PPO, REPEATED, 0, budget, episodes))
         memories = [case for case in cases if case.learner in MEMORIES]
         repeated = [case for case in memories if case.condition == REPEATED]
         cases += [replace(item, seed=seed) for seed in range(1, SEEDS) for item in repeated]
@@ -117,7 +111,6 @@ def _make_cases(quick: bool, episodes: int | None = None) -> list[MemoryCase]:
 
 _FIRST_SEED = 2**30
 _NOISE = 0.3  # of what shakes the teacher in the first round
-_LETTERS = 24  # of a kept case's name
 
 
 class MemoryResult(NamedTuple):
@@ -132,17 +125,6 @@ class MemoryResult(NamedTuple):
     def gap(self) -> Estimate:
         """Compute the gap from the actions' errors."""
         return interval(self.excess / self.best)
-
-    def compute_paired_gap(self, reference: "MemoryResult") -> Estimate:
-        """Compute the gap from the costs.
-
-        Args:
-            reference: Result of the optimum's own policy on the same seeds.
-
-        Returns:
-            Gap with its interval.
-        """
-        return interval((self.costs - reference.costs[: len(self.costs)]) / self.best)
 
 
 def _evaluate_agent(
@@ -213,84 +195,34 @@ def _train_ppo(case: MemoryCase, cars: Any) -> Any:
     from ...agents.learned.policy import PolicyController, load_policy
     from ...agents.training.callbacks import POLICY
     from ...agents.training.config import TrainingTask
-    from ...agents.training.trainer import train
+    from ...agents.training.trainer import Trainer
 
     task = TrainingTask(ID, env_options=case.options, seed=case.seed)
     with tempfile.TemporaryDirectory() as folder:
-        train(task, case.budget.ppo, folder)
+        Trainer(task, case.budget.ppo, folder).train()
         return PolicyController(cars, load_policy(Path(folder) / POLICY))
 
 
-@dataclass(frozen=True)
-class CaseCache:
-    """`_run_case` behind a folder of results; None keeps nothing."""
-
-    folder: Path | None
-
-    def __call__(self, case: MemoryCase) -> MemoryResult:
-        """Return the case's result, from the folder if it is there."""
-        if self.folder is None:
-            return _run_case(case)
-        sources = Path(__file__).read_text()  # beside agents and case, all that numbers depend on
-        text = hash_experiment() + sources + json.dumps(asdict(case) | case.options)
-        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
-        # a damaged file is measured anew
-        with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as saved:
-            return MemoryResult(*(saved[name] for name in MemoryResult._fields))
-        result = _run_case(case)
-        with contextlib.suppress(OSError):  # a full disk loses the file, not the run
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(path) as file:
-                np.savez_compressed(file, **result._asdict())
-        return result
+def _describe_case(case: MemoryCase) -> str:
+    sources = Path(__file__).read_text()  # beside agents and case, all that numbers depend on
+    return hash_experiment() + sources + json.dumps(asdict(case) | case.options)
 
 
-NAME = "memory"
-_TEXT = (
-    "A linear car of known tyres whose sideslip angle a yaw moment keeps small, pictures every "
-    "40 ms: the best policy and its cost are computed. Each kind of memory imitates the optimal "
-    "filter's actions where it drives itself (DAgger), all with the same drives and passes; what "
-    "is left is the price of what it does not remember, or has not learned. Gap: cost over the "
-    "optimum, less one. An error of an action costs S (u - u*)^2, so the gap is their sum; beside "
-    "it stands the plain difference of the costs to the optimal policy on the same seeds."
+_STORAGE = CaseStorage[MemoryCase, MemoryResult](
+    _describe_case, MemoryResult._asdict, lambda _, arrays: MemoryResult(**arrays)
 )
-
 Results = Mapping[str, Mapping[str, Sequence[MemoryResult]]]
 """Results of each training seed, by learner and condition."""
 
 
-def run(
-    quick: bool = False,
-    episodes: int | None = None,
-    jobs: int | None = None,
-    console: Console | None = None,
-    keep: Path | None = None,
-) -> Suite:
-    """Train and judge all in every condition; quick: in one, little, and without PPO.
-
-    Args:
-        quick: Whether the run is quick.
-        episodes: Episodes that judge a policy.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-        keep: Folder in which finished cases stay.
-
-    Returns:
-        Suite with verdict, tables and a figure.
-    """
-    suite = Suite(NAME, "Memory where the optimum is known", _TEXT)
-    if find_spec("torch") is None:
-        suite.verdict = 'Not trained: it needs torch, pip install "sideslip[train]".'
-        return suite
-    cases = _make_cases(quick, episodes)
-    outcomes = run_cases(CaseCache(keep and keep.absolute()), cases, NAME, jobs, console)
+def _measure(request: Request) -> Results:
+    """Train and judge all in every condition; quick: in one, little, and without PPO."""
+    cases = _make_cases(request.quick, request.episodes or 1)
+    outcomes = request.run_cases(_run_case, cases, "memory", _STORAGE)
     results: dict[str, dict[str, list[MemoryResult]]] = {}
     for case, outcome in zip(cases, outcomes, strict=True):
         results.setdefault(case.learner, {}).setdefault(case.condition, []).append(outcome)
-    suite.verdict = _make_verdict(results)
-    _add_tables(suite, results)
-    _draw(suite, results)
-    return suite
+    return results
 
 
 def _average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
@@ -329,31 +261,30 @@ def _compute_lqg_gap(result: MemoryResult) -> Estimate:
     return interval(result.costs / result.best - 1.0)
 
 
-def _format_gap(number: Estimate) -> str:
-    return number.inline(100.0, ".1f")
+def _compute_paired_gap(result: MemoryResult, reference: MemoryResult) -> Estimate:
+    """Compute the gap from the costs, beside the optimum's own policy's on the same seeds."""
+    return interval((result.costs - reference.costs[: len(result.costs)]) / result.best)
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
     """Add rows and the tables of gaps and of trainings."""
-    conditions = list(results[FILTER])
     reference = {condition: runs[0] for condition, runs in results[FILTER].items()}
-    gaps, trainings = [], []
+    gaps, trainings = list[Line](), list[list[object]]()
     for learner, learner_runs in results.items():
         numbers = {
             name: _compute_lqg_gap(runs[0]) if learner == FILTER else _average_seeds(runs).gap()
             for name, runs in learner_runs.items()
         }
-        texts = [_format_gap(numbers[name]) if name in numbers else "" for name in conditions]
-        gaps.append([learner, *texts])
+        gaps.append({"memory": learner} | numbers)
         for condition, number in numbers.items():
             n = len(learner_runs[condition][0].costs)
-            add_rows(suite, {"gap": number}, ID, scenario=condition, controller=learner, n=n)
+            suite.add_rows([{"gap": number}], ID, scenario=condition, controller=learner, n=n)
         if learner != FILTER:
             runs = learner_runs[REPEATED]
-            seeds = ", ".join(f"{100.0 * result.gap().value:.1f}" for result in runs)
-            plain = _format_gap(_average_seeds(runs).compute_paired_gap(reference[REPEATED]))
+            plain = _compute_paired_gap(_average_seeds(runs), reference[REPEATED])
             spent = np.mean([run.seconds for item in learner_runs.values() for run in item])
-            trainings.append([learner, seeds, plain, f"{runs[0].steps:.0f}", f"{spent:.0f}"])
+            seeds, steps = tuple(result.gap().value for result in runs), float(runs[0].steps)
+            trainings.append([learner, seeds, plain, steps, float(spent)])
     n = len(reference[REPEATED].costs) // LQG_FACTOR
     optima = ", ".join(f"{name} {1e3 * run.best:.1f}" for name, run in reference.items())
     note = (
@@ -361,19 +292,23 @@ def _add_tables(suite: Suite, results: Results) -> None:
         f"{FILTER}: the optimal policy's plain costs on {n * LQG_FACTOR}. "
         f"The optimum in 10^-3: {optima}."
     )
-    suite.tables.append(ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note))
-    header = ("memory", "gap of each seed / %", "plain costs / %", "steps", "CPU-s")
+    columns = ("memory", *(Column(name, scale=100.0, form=".1f") for name in reference))
+    suite.tables.append(ResultTable("Cost over the optimum", columns, gaps, note))
+    percents = (
+        Column(f"{x} / %", scale=100.0, form=".1f") for x in ("gaps of seeds", "plain costs")
+    )
     title, text = f"Trainings, at {REPEATED}", "CPU-s: mean of all conditions. "
     text += "plain costs: over lqg's."
-    suite.tables.append(ResultTable(title, header, trainings, text))
+    columns = ("memory", *percents, Column("steps", form=".0f"), Column("CPU-s", form=".0f"))
+    suite.tables.append(ResultTable(title, columns, trainings, text))
 
 
-def _draw(suite: Suite, results: Results) -> None:
-    """The gap over the delay; nothing where plotly is not installed or there is one delay only."""
+def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
+    """Add the gap over the delay; nothing where there is one delay only."""
     late = {name: camera for name, camera in CONDITIONS.items() if "loss" not in camera}
     measured = [(1e3 * late[name]["delays"][0], name) for name in late if name in results[FILTER]]
     delays = dict(sorted(measured))
-    if len(delays) < 2 or (figures := import_figures()) is None:
+    if len(delays) < 2:
         return
     series = {}
     for learner in results:
@@ -381,6 +316,24 @@ def _draw(suite: Suite, results: Results) -> None:
             gaps = [_average_seeds(results[learner][name]).gap() for name in delays.values()]
             series[learner] = tuple(100.0 * np.array(gaps).T)
     labels = ("delay of the pictures / ms", "cost over the optimum / %")
-    figure = figures.draw_curves(np.array(list(delays)), series, *labels, log="y")
+    figure = draw.draw_curves(np.array(list(delays)), series, *labels, log="y")
     question = "How much of the optimum does each memory find?"
     suite.answers.append((question, figure, suite.verdict.splitlines()[0]))
+
+
+STUDY = Study(
+    "memory",
+    "Memory where the optimum is known",
+    "A linear car of known tyres whose sideslip angle a yaw moment keeps small, pictures every "
+    "40 ms: the best policy and its cost are computed. Each kind of memory imitates the optimal "
+    "filter's actions where it drives itself (DAgger), all with the same drives and passes; what "
+    "is left is the price of what it does not remember, or has not learned. Gap: cost over the "
+    "optimum, less one. An error of an action costs S (u - u*)^2, so the gap is their sum; beside "
+    "it stands the plain difference of the costs to the optimal policy on the same seeds.",
+    _EPISODES,
+    _measure,
+    _add_tables,
+    _make_verdict,
+    _add_figures,
+    ("torch", 'Not trained: it needs torch, pip install "sideslip[train]".'),
+)

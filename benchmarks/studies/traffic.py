@@ -4,13 +4,11 @@
 `lane-keeping-v0`, driven by `lane-keeping` on our filters and on highway-env's observation.
 """
 
-from collections.abc import Mapping
-from importlib.util import find_spec
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from ...agents import make_agent
 from ...agents.baselines import make_oracle
@@ -20,58 +18,49 @@ from ...envs.task import FAILURES
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..control.entries import (
     REFERENCE_FILTER,
-    ControlEntry,
-    make_agent_options,
-    make_estimate_options,
+    ControlCase,
+    Entry,
 )
 from ..control.tasks import ORACLES, STATE, ControlTask
 from ..harness.drives import call_quietly, make_env
-from ..harness.parallel import run_cases, split_seeds
-from ..harness.results import ResultTable, Suite
+from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
 from ..harness.verdict import format_percent, format_verdict
-from ..report.study import add_rows
+from ..report.study import Request, Study
 
-_NAME, ID = "highway", "sideslip/Highway-v0"
+ID = "sideslip/Highway-v0"
 _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = ORACLES[STATE][0]
 _READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
 CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
-SEEDS, QUICK_SEEDS, _CHUNK = 64, 16, 8
+_SEEDS, _DRIVES, _CHUNK = (64, 16), (4, 1), 8  # of a usual and of a quick run
 FIRST_SEED = 2**29
 _ENDS = ("spin", "collision", "departure")
 
 KEEPING = "lane-keeping-v0"
 _RETURNED, _NEWEST = "its observation, as step returns it", "its observation, after the step"
 READERS = ("multirate-residual-kf", "exact-kf", _RETURNED, _NEWEST)
-DRIVES, QUICK_DRIVES = 4, 1
-_TEXT = """\
-A vehicle ahead brakes hard on a wet road (friction 0.4 to 0.7), and a startled driver swerves \
-around it and back, late. The yaw moment is the controller's; nobody but the oracle knows state, \
-tyres and friction. Others are highway-env's IDM vehicles.
-
-highway-env's own lane keeping: our record (gyro, camera 30 ms late) built from its car, our \
-filters and `lane-keeping` on it, beside the noisy state that highway-env observes itself."""
 
 
-def _simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
-    """Run a controller on some seeds: cost, failure and largest slip (rad), shape (seeds, 3)."""
+def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
+    """Run a controller on some seeds: cost, failure and largest slip (rad) of each."""
     controller, seeds = case
-    entry = ControlEntry(_TASK, _READS.get(controller, REFERENCE_FILTER), controller)
-    if entry.oracle:
-        env, agent = make_oracle(entry.oracle, ID, options=entry.best, **entry.env_options)
+    entry = Entry(controller, _READS.get(controller, REFERENCE_FILTER))
+    contest = ControlCase(_TASK, entry)
+    if entry.is_oracle:
+        env, agent = make_oracle(contest.driver, ID, options=contest.options, **contest.env_options)
     else:
         name, options = "", dict[str, Any]()
         if entry.estimator:
-            name, options = "exact-kf", make_estimate_options(entry)
-        env = make_env(ID, name, options, **entry.env_options)
-        agent = make_agent(controller, env, **make_agent_options(entry))
+            name, options = "exact-kf", contest.estimate_options
+        env = make_env(ID, name, options, **contest.env_options)
+        agent = make_agent(controller, env, **contest.agent_options)
     rows = []
     for seed in seeds:
         steps = list(iterate_steps(env, agent, FIRST_SEED + seed))
         slip = max(abs(step.info["beta"]) for step in steps)
         rows.append([-sum(step.reward for step in steps), steps[-1].info["failure"], slip])
-    return np.array(rows)
+    return rows
 
 
 def _keep_lane(case: tuple[str, int]) -> Array:
@@ -98,37 +87,17 @@ def _keep_lane(case: tuple[str, int]) -> Array:
     return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)
 
 
-def run(
-    seeds: int = SEEDS,
-    drives: int = DRIVES,
-    jobs: int | None = None,
-    console: Console | None = None,
-) -> Suite:
-    """Answer both questions.
+Results = tuple[Mapping[str, Array], Mapping[str, Array]]
+"""Of `_simulate_swerve` by controller, and of `_keep_lane` by reader."""
 
-    Args:
-        seeds: Seeds of the swerve.
-        drives: Drives of the lane keeping.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
 
-    Returns:
-        Suite; without rows where highway-env is not installed.
-    """
-    suite = Suite(_NAME, "Swerving among other vehicles, on highway-env's roads", _TEXT)
-    if find_spec("highway_env") is None:
-        suite.verdict = 'Not driven: it needs highway-env, pip install "sideslip[highway]".'
-        return suite
-    chunks = split_seeds(seeds, _CHUNK)
-    cases, lane_cases = list(product(CONTROLLERS, chunks)), list(product(READERS, range(drives)))
-    parts = iter(run_cases(_simulate_swerve, cases, _NAME, jobs, console))
-    swerves = {name: np.concatenate([next(parts) for _ in chunks]) for name in CONTROLLERS}
-    rows = iter(run_cases(_keep_lane, lane_cases, KEEPING, jobs, console))
+def _measure(request: Request) -> Results:
+    seeds, drives = request.choose(*_SEEDS), request.choose(*_DRIVES)
+    swerves = request.run_seeds(_simulate_swerve, CONTROLLERS, seeds, _CHUNK, "highway")
+    lane_cases = list(product(READERS, range(drives)))
+    rows = iter(request.run_cases(_keep_lane, lane_cases, KEEPING))
     lanes = {reader: np.array([next(rows) for _ in range(drives)]) for reader in READERS}
-    _add_swerves(suite, swerves)
-    _add_lanes(suite, lanes)
-    suite.verdict = _compose_verdict(swerves, lanes)
-    return suite
+    return dict(zip(CONTROLLERS, map(np.array, swerves), strict=True)), lanes
 
 
 def _compute_end_rate(numbers: Array, cause: str) -> Estimate:
@@ -136,8 +105,8 @@ def _compute_end_rate(numbers: Array, cause: str) -> Estimate:
     return share(numbers[:, 1] == FAILURES.index(cause))
 
 
-def _compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
-    """Compose the verdict from `simulate_swerve` by controller and `keep_lane` by reader."""
+def _compose_verdict(results: Results) -> str:
+    swerves, lanes = results
     success = {name: _compute_end_rate(numbers, "none") for name, numbers in swerves.items()}
     names = [name for name in success if name not in ("none", ORACLE)]
     rivals = sorted(names, key=lambda name: -success[name].value)
@@ -158,40 +127,64 @@ def _compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -
     )
 
 
-def _add_swerves(suite: Suite, swerves: Mapping[str, Array]) -> None:
-    cells, free = [], swerves["none"]
+def _add_tables(suite: Suite, results: Results) -> None:
+    """Add rows and tables of the swerves, and of the lane keeping."""
+    records, (swerves, lanes) = list[Line](), results
+    free = swerves["none"]
     for controller, numbers in swerves.items():
-        success = _compute_end_rate(numbers, "none")
-        cost = interval(numbers[:, 0], ratio_of_means, free[:, 0])
-        slip = interval(numbers[:, 2])
-        ends = {cause: _compute_end_rate(numbers, cause) for cause in _ENDS}
-        rates = (f"{100.0 * rate.value:.1f}" for rate in ends.values())
-        texts = (*success.text(1e2, ".1f"), *rates, *cost.text(1e2, ".0f"))
-        cells.append([controller, *texts, f"{np.degrees(slip.value):.2f}"])
-        metrics = {"success_rate": success, "ratio": cost, "peak_slip": slip}
-        metrics |= {f"{cause}_rate": rate for cause, rate in ends.items()}
-        columns = {"controller": controller, "estimator": _READS.get(controller, REFERENCE_FILTER)}
-        add_rows(suite, metrics, ID, scenario=_TASK.scenario, n=len(numbers), **columns)
-    header = ("controller", "success / %", "95 % interval", *(f"{cause} / %" for cause in _ENDS))
-    more = ("cost / none's / %", "95 % interval", "peak slip / deg")
+        record = {
+            "controller": controller,
+            "estimator": _READS.get(controller, REFERENCE_FILTER),
+            "success_rate": _compute_end_rate(numbers, "none"),
+            "ratio": interval(numbers[:, 0], ratio_of_means, free[:, 0]),
+            "peak_slip": interval(numbers[:, 2]),
+        }
+        rates = {f"{cause}_rate": _compute_end_rate(numbers, cause) for cause in _ENDS}
+        records.append(record | rates)
+    suite.add_rows(records, ID, scenario=_TASK.scenario, n=len(free))
     note = (
         f"The same {len(free)} seeds for all; Wilson's intervals; costs are means with failures "
         "charged to the end, paired."
     )
     title = "An evasive lane change on a wet road"
-    suite.tables.append(ResultTable(title, (*header, *more), cells, note))
-
-
-def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
-    cells = []
+    suite.tables.append(ResultTable(title, _SWERVE_COLUMNS, records, note))
+    records = []
     for reader, numbers in lanes.items():
-        slip, rate, heading, preview_offset, offset = (interval(column) for column in numbers.T)
-        shown = [f"{1e3 * error.value:.1f}" for error in (slip, rate, heading)]
-        texts = (f"{100.0 * preview_offset.value:.1f}", *offset.text(1.0, ".2f"))
-        cells.append([reader, *shown, *texts])
-        columns = {"controller": "lane-keeping", "estimator": reader, "scenario": KEEPING}
-        add_rows(suite, {"rmse": slip, "offset": offset}, ID, n=len(numbers), **columns)
-    header = ("reads", "slip / mrad", "yaw rate / (mrad/s)", "heading / mrad", "y_l / cm")
-    where = ("off the centre / m", "95 % interval")
+        slip, *errors, offset = map(interval, numbers.T)
+        record = {"estimator": reader, "rmse": slip, "offset": offset}
+        records.append(record | dict(zip(("rate", "heading", "y_l"), errors, strict=True)))
+    drives = len(lanes[_NEWEST])
+    suite.add_rows(records, ID, controller="lane-keeping", scenario=KEEPING, n=drives)
     note = "RMS errors of what the controller reads, and where the car was, from half time on."
-    suite.tables.append(ResultTable("highway-env's lane keeping", (*header, *where), cells, note))
+    suite.tables.append(ResultTable("highway-env's lane keeping", _LANE_COLUMNS, records, note))
+
+
+_SWERVE_COLUMNS = (
+    "controller",
+    Column("success_rate", "success / %", 100.0, ".1f"),
+    *(Column(f"{cause}_rate", f"{cause} / %", 100.0, ".1f", interval=False) for cause in _ENDS),
+    Column("ratio", "cost / none's / %", 100.0, ".0f"),
+    Column("peak_slip", "peak slip / deg", 180.0 / np.pi, ".2f", interval=False),
+)
+_LANE_COLUMNS = (
+    Column("estimator", "reads"),
+    Column("rmse", "slip / mrad", 1e3, ".1f", interval=False),
+    Column("rate", "yaw rate / (mrad/s)", 1e3, ".1f", interval=False),
+    Column("heading", "heading / mrad", 1e3, ".1f", interval=False),
+    Column("y_l", "y_l / cm", 100.0, ".1f", interval=False),
+    Column("offset", "off the centre / m", form=".2f"),
+)
+STUDY = Study(
+    "highway",
+    "Swerving among other vehicles, on highway-env's roads",
+    "A vehicle ahead brakes hard on a wet road (friction 0.4 to 0.7), and a startled driver "
+    "swerves around it and back, late. The yaw moment is the controller's; nobody but the oracle "
+    "knows state, tyres and friction. Others are highway-env's IDM vehicles.\n\n"
+    "highway-env's own lane keeping: our record (gyro, camera 30 ms late) built from its car, our "
+    "filters and `lane-keeping` on it, beside the noisy state that highway-env observes itself.",
+    _SEEDS,
+    _measure,
+    _add_tables,
+    _compose_verdict,
+    needs=("highway_env", 'Not driven: it needs highway-env, pip install "sideslip[highway]".'),
+)

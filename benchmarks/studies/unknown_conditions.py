@@ -8,12 +8,10 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
 from scipy.stats import norm
 
 from ...agents.baselines import compute_range_rms
@@ -25,7 +23,7 @@ from ...estimators.analysis.bound import Gust, VehicleChange, compute_error_boun
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
-from ..harness.parallel import run_cases, split_seeds
+from ..report.study import Request
 
 CAMERA, GPS, _FUSION = (f"sideslip/Yaw{sensors}-v0" for sensors in ("Vision", "Gps", "Fusion"))
 _KMH = 1.0 / 3.6
@@ -246,89 +244,69 @@ _Z = norm.ppf(0.5 + 0.5 * np.array(LEVELS))
 _CHUNK = 16
 
 
-class _SeedResult(NamedTuple):
-    """Results of an episode."""
-
-    seed: int
-    squares: Array  # mean squared errors (rad2), shape (filters,)
-    best: float  # mean square of the bound (rad2), NaN where there is none
-    nees: Array  # normalised squared errors, shape (filters,)
-    inside: Array  # fractions of the errors within `LEVELS`, shape (filters, levels)
-    variances: Array  # the filters' own variances (rad2), shape (filters,)
-
-
 @dataclass
 class ConditionResult:
-    """Results of the seeds whose episodes did not end early, as those of `_SeedResult`."""
+    """Results of the seeds whose episodes did not end early, shape (seeds,) by filter."""
 
-    labels: tuple[str, ...]  # labels of the filters
-    seeds: tuple[int, ...]  # seeds of the episodes
-    squares: Array  # shape (seeds, filters)
-    best: Array  # shape (seeds,)
-    nees: Array  # shape (seeds, filters)
-    inside: Array  # shape (seeds, filters, levels)
-    variances: Array  # shape (seeds, filters)
+    condition: Condition
+    seeds: list[int]  # seeds of the episodes
+    squares: dict[str, Array]  # mean squared errors (rad2)
+    nees: dict[str, Array]  # normalised squared errors
+    variances: dict[str, Array]  # the filters' own variances (rad2)
+    inside: dict[str, Array]  # fractions of the errors within `LEVELS`, shape (seeds, levels)
+    best: Array  # mean squares of the bound (rad2), NaN where there is none
     left_out: int  # number of episodes that ended early
-
-    def select(self, label: str) -> tuple[Array, Array, Array]:
-        """Select the numbers of a filter.
-
-        Args:
-            label: Label of the filter.
-
-        Returns:
-            Squares (seeds,), NEES (seeds,) and fractions (seeds, levels).
-        """
-        at = self.labels.index(label)
-        return self.squares[:, at], self.nees[:, at], self.inside[:, at]
 
 
 def measure_all(
-    conditions: Sequence[Condition],
-    seeds: int,
-    title: str,
-    jobs: int | None = None,
-    console: Console | None = None,
+    request: Request, conditions: Sequence[Condition], seeds: int, title: str
 ) -> list[ConditionResult]:
     """Measure every condition on the same seeds.
 
     Args:
+        request: Options of the run.
         conditions: Conditions to measure.
         seeds: Number of seeds.
         title: Title of the progress bar.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
 
     Returns:
         Result of each condition.
     """
-    chunks = split_seeds(seeds, _CHUNK)
-    done = iter(run_cases(_measure_chunk, list(product(conditions, chunks)), title, jobs, console))
-    return [_join_results(item, [x for _ in chunks for x in next(done)]) for item in conditions]
+    drives = request.run_seeds(_measure_seeds, conditions, seeds, _CHUNK, title)
+    return list(map(_stack_results, conditions, drives))
 
 
-def _join_results(condition: Condition, parts: Sequence[_SeedResult | None]) -> ConditionResult:
-    labels, driven = tuple(condition.all_filters), [part for part in parts if part is not None]
-    shape = (-1, len(labels))
+def _stack_results(
+    condition: Condition, drives: Sequence[dict[str, list[float]] | None]
+) -> ConditionResult:
+    seeds = [seed for seed, drive in enumerate(drives) if drive is not None]
+    driven, names = [drive for drive in drives if drive is not None], [*condition.all_filters, ""]
+    # (numbers, seeds) of each filter
+    numbers = {
+        name: np.reshape([x[name] for x in driven], (-1, 3 + len(LEVELS))).T for name in names
+    }
+    best = numbers.pop("")[0]
+    by_name = ({name: item[i] for name, item in numbers.items()} for i in range(3))
+    squares, nees, variances = by_name
+    inside = {name: item[3:].T for name, item in numbers.items()}
     return ConditionResult(
-        labels,
-        tuple(part.seed for part in driven),
-        np.reshape([part.squares for part in driven], shape),
-        np.array([part.best for part in driven]),
-        np.reshape([part.nees for part in driven], shape),
-        np.reshape([part.inside for part in driven], (*shape, len(LEVELS))),
-        np.reshape([part.variances for part in driven], shape),
-        len(parts) - len(driven),
+        condition, seeds, squares, nees, variances, inside, best, len(drives) - len(driven)
     )
 
 
-def _measure_chunk(case: tuple[Condition, Sequence[int]]) -> list[_SeedResult | None]:
-    """Drive some seeds of a condition, and run its filters over the records; None: ended early."""
+def _measure_seeds(
+    case: tuple[Condition, Sequence[int]],
+) -> list[dict[str, list[float]] | None]:
+    """Drive some seeds of a condition, and run its filters over the records; None: ended early.
+
+    Mean squared error, NEES, variance and fractions within `LEVELS` of each filter; the mean square
+    of the bound stands under "".
+    """
     condition, seeds = case
     scenario = LINEAR | dict(condition.scenario)
     car = condition.vehicle
     env: Any = gym.make(condition.env_id, scenario=scenario, control_period=10, vehicle=car)
-    filters, results = dict[str, Estimator](), list[_SeedResult | None]()
+    filters, results = dict[str, Estimator](), list[dict[str, list[float]] | None]()
     for seed in seeds:
         episode = _run_episode(env, seed)
         if episode is None:
@@ -338,19 +316,19 @@ def _measure_chunk(case: tuple[Condition, Sequence[int]]) -> list[_SeedResult | 
         settled = log.time >= condition.since - 1e-9
         if not filters or _TRUE in filters:  # else only clocks differ, and the log has them
             filters = _make_filters(condition, env.unwrapped, log)
-        felt, errors, sds = _delay_gyro(log, condition.gyro_late), [], []
-        for filter_ in filters.values():
+        felt, numbers = _delay_gyro(log, condition.gyro_late), dict[str, list[float]]()
+        for label, filter_ in filters.items():
             estimates = filter_.run(felt)
-            errors.append((estimates["beta"] - log.truth["beta"])[settled])
-            sds.append(estimates.std[settled, estimates.names.index("beta")])
-        sizes, best = np.abs(errors) / sds, np.nan
-        squares, variances = (np.mean(np.square(x), axis=1) for x in (errors, sds))
-        inside = np.mean(sizes[:, :, None] < _Z, axis=1)
+            error = (estimates["beta"] - log.truth["beta"])[settled]
+            sd = estimates.std[settled, estimates.names.index("beta")]
+            size = np.abs(error) / sd
+            squares = (float(np.mean(np.square(x))) for x in (error, size, sd))
+            numbers[label] = [*squares, *np.mean(size[:, None] < _Z, axis=0)]
+        best = np.nan
         if condition.bounded:
             bound = _compute_bound(env.unwrapped, log, cars, condition.gyro_late)
             best = float(np.mean(bound[settled] ** 2))
-        nees = np.mean(sizes**2, axis=1)
-        results.append(_SeedResult(seed, squares, best, nees, inside, variances))
+        results.append(numbers | {"": [best] * (3 + len(LEVELS))})
     return results
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from ... import __version__
 from ...agents.baselines import NOMINAL, ORACLES, Options
@@ -24,13 +23,13 @@ from ...agents.design.pi import POLE
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import Array
 from ...envs.validation import check_choice
-from ..control.entries import ADAPTIVE, REFERENCE_FILTER, ControlEntry
+from ..control.entries import ADAPTIVE, REFERENCE_FILTER, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import ControlTask, list_candidates, list_scored_tasks
 from ..harness.parallel import count_cores, run_cases
 from ..harness.results import Suite, write_text
-from .estimator import STORAGE
+from .estimator import SearchOptions
 from .study import create_study, make_result_table, run_search
 
 KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")
@@ -202,7 +201,7 @@ def _run_contestant(
     """Run a controller on a task with some options, an episode for each seed."""
     follows = {controller: estimator for estimator, controller in ADAPTIVE.items()}
     estimator = "" if name in ORACLES else follows.get(name, REFERENCE_FILTER)
-    return run_chunk(Chunk(ControlEntry(contest, estimator, name, tuned=options), seeds))
+    return run_chunk(Chunk(contest, Entry(name, estimator, options), seeds))
 
 
 @lru_cache(maxsize=64)
@@ -244,42 +243,29 @@ def _evaluate_trials(
     return results
 
 
-def tune(
-    task: ControllerTuning,
-    trials: int = _TRIALS,
-    storage: str = STORAGE,
-    seed: int = 0,
-    jobs: int | None = None,
-    console: Console | None = None,
-) -> dict[str, Any]:
-    """Search for the best options; a search that was stopped goes on.
+def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
+    """Search for the best options by TPE; a search that was stopped goes on.
 
     Args:
         task: Search.
-        trials: Trials of the study, the finished ones included.
-        storage: RDB URL or SQLite file.
-        seed: Seed of the sampler.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
+        search: Options of the search, but for its sampler.
 
     Returns:
         The study's log as JSON types.
 
     Raises:
-        ValueError: The controller cannot drive a task, there are no trials, the storage fails, or
-            no trial that drove all seeds is finite.
+        ValueError: The controller cannot drive a task, the storage fails, or no trial that drove
+            all seeds is finite.
     """
-    if trials < 1:
-        raise ValueError(f"trials must be at least 1, got {trials}")
     options = task.options(task.start)
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
         if error := _run_contestant(contest, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
-    study = create_study(task, storage, "tpe", seed)
+    study = create_study(task, search.storage, "tpe", search.seed)
     if not study.trials:
         study.enqueue_trial(task.start)
-    evaluate = partial(_evaluate_trials, task, jobs or count_cores())
-    run_search(study, task, trials, evaluate, len(task.seeds), console)
+    evaluate = partial(_evaluate_trials, task, search.jobs or count_cores())
+    run_search(study, task, search, evaluate, len(task.seeds))
     return _make_log(task, study.trials)
 
 

@@ -39,6 +39,34 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 
 
 @dataclass(frozen=True)
+class SearchOptions:
+    """How long a study is searched, and by whom.
+
+    Attributes:
+        trials: Trials of the study, the finished ones included.
+        storage: RDB URL or SQLite file.
+        sampler: Name in `SAMPLERS`.
+        seed: Seed of the sampler.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Raises:
+        ValueError: There are no trials.
+    """
+
+    trials: int
+    storage: str = STORAGE
+    sampler: str = SAMPLERS[0]
+    seed: int = 0
+    jobs: int | None = None
+    console: Console | None = None
+
+    def __post_init__(self) -> None:
+        if self.trials < 1:
+            raise ValueError(f"trials must be at least 1, got {self.trials}")
+
+
+@dataclass(frozen=True)
 class EstimatorTuning:
     """A search of an estimator's options that are most accurate on drives of scenarios."""
 

@@ -15,7 +15,6 @@ from typing import Protocol
 
 import joblib
 import numpy as np
-from rich.console import Console
 
 from ...envs.numerics import require_extra
 from ...envs.record import Array
@@ -28,6 +27,7 @@ from .estimator import (
     SAMPLERS,
     STORAGE,
     EstimatorTuning,
+    SearchOptions,
     compute_objective,
     compute_squares,
     simulate,
@@ -53,26 +53,16 @@ class _Question(Protocol):
     def search(self) -> Mapping[str, tuple[float, float]]: ...
 
 
-_Evaluate = Callable[[list[LoggedEpisode], dict[str, float]], float]
-"""From drives and numbers to the objective."""
-
-
 @functools.lru_cache(maxsize=1)
 def _load_drives(path: str) -> list[LoggedEpisode]:
     drives: list[LoggedEpisode] = joblib.load(path)
     return drives
 
 
-def _evaluate_file(path: str, evaluate: _Evaluate, values: dict[str, float]) -> float:
-    return evaluate(_load_drives(path), values)
-
-
-def _evaluate_trial(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: dict[str, float]
-) -> float:
-    """Evaluate the objective of some numbers; infinite if unstable."""
+def _evaluate_file(path: str, task: EstimatorTuning, values: dict[str, float]) -> float:
+    """Evaluate the objective of some numbers on a file's drives; infinite if unstable."""
     try:
-        return compute_objective(compute_squares(task, drives, values))
+        return compute_objective(compute_squares(task, _load_drives(path), values))
     except ValueError:  # a filter that diverges, a covariance that is none
         return math.inf
 
@@ -114,80 +104,53 @@ def _search(
     study: "optuna.Study",
     task: EstimatorTuning,
     drives: Sequence[LoggedEpisode],
-    trials: int,
-    jobs: int | None = None,
-    console: Console | None = None,
+    search: SearchOptions,
 ) -> dict[str, float]:
     """Search on training drives until the study has so many trials; the best numbers, 3 digits.
 
     Raises ValueError for a storage that fails and where no trial gave a stable filter.
     """
-    evaluate = functools.partial(_evaluate_trial, task)
-    search_on_drives(study, task, trials, evaluate, drives, jobs, console)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "drives")  # from which workers read them
+        joblib.dump(list(drives), path)
+        evaluate = functools.partial(_evaluate_file, path, task)
+        n_jobs = min(search.jobs or count_cores(), BATCH)
+
+        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+            return [(x, len(drives)) for x in run_cases(evaluate, batch, jobs=n_jobs)]
+
+        run_search(study, task, search, evaluate_batch, len(drives))
     with _convert_storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):
         compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
-        raise ValueError(f"none of {trials} trials of {task.estimator} gave finite estimates")
+        text = f"none of {search.trials} trials of {task.estimator} gave finite estimates"
+        raise ValueError(text)
     return {name: float(f"{v:.3g}") for name, v in best.params.items()}
-
-
-def search_on_drives(
-    study: "optuna.Study",
-    task: _Question,
-    trials: int,
-    evaluate: _Evaluate,
-    drives: Sequence[LoggedEpisode],
-    jobs: int | None = None,
-    console: Console | None = None,
-) -> None:
-    """Run trials, each on all drives, which workers read from a file.
-
-    Args:
-        study: Study.
-        task: Its question.
-        trials: Trials of the study, the finished ones included.
-        evaluate: Function of the drives and a trial's numbers, importable by workers.
-        drives: Drives.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "drives")
-        joblib.dump(list(drives), path)
-        n_jobs = min(jobs or count_cores(), BATCH)
-
-        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-            evaluate_values = functools.partial(_evaluate_file, path, evaluate)
-            return [(x, len(drives)) for x in run_cases(evaluate_values, batch, jobs=n_jobs)]
-
-        run_search(study, task, trials, evaluate_batch, len(drives), console)
 
 
 def run_search(
     study: "optuna.Study",
     task: _Question,
-    trials: int,
+    search: SearchOptions,
     evaluate: Callable[[Sequence[dict[str, float]]], Sequence[tuple[float, int]]],
     n_drives: int,
-    console: Console | None = None,
 ) -> None:
     """Run batches of trials until the study has so many, those it holds included.
 
     Args:
         study: Study.
         task: Its question.
-        trials: Trials of the study, the finished ones included.
+        search: Options of the search.
         evaluate: Function of the numbers of a batch: value, and drives it is the mean of, of each.
         n_drives: Drives of a complete trial; one of fewer counts as pruned.
-        console: Where progress is shown.
     """
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(*limits, log=True)
         for name, limits in task.search.items()
     }
-    with _silence_optuna(), _convert_storage_errors(study.study_name), Bar(console) as bar:
-        done = _list_finished(study, task)
+    with _silence_optuna(), _convert_storage_errors(study.study_name), Bar(search.console) as bar:
+        done, trials = _list_finished(study, task), search.trials
         shown = bar.add_task(_format_best(study), total=trials, completed=len(done), unit="trials")
         while len(done) < trials:
             batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
@@ -261,47 +224,33 @@ _EDGE = 1.25  # times an end of its range or less: the number counts as being th
 
 
 def run(
-    task: EstimatorTuning,
-    trials: int = 200,
-    test_seeds: int = 20,
-    storage: str = STORAGE,
-    sampler: str = SAMPLERS[0],
-    seed: int = 0,
-    jobs: int | None = None,
-    console: Console | None = None,
+    task: EstimatorTuning, search: SearchOptions, test_seeds: int = 20
 ) -> tuple[Suite, dict[str, float]]:
     """Search on the task's seeds, and judge on others.
 
     Args:
         task: Tuning.
-        trials: Trials of the study, the finished ones included.
+        search: Options of the search.
         test_seeds: Number of test seeds, from 0 on.
-        storage: RDB URL or SQLite file.
-        sampler: Name in `SAMPLERS`.
-        seed: Seed of the sampler.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
 
     Returns:
         Suite and the numbers.
 
     Raises:
-        ValueError: There are no trials or test seeds, the storage fails, or no trial gave a stable
-            filter.
+        ValueError: There are no test seeds, the storage fails, or no trial gave a stable filter.
     """
-    if trials < 1:
-        raise ValueError(f"trials must be at least 1, got {trials}")
     if not 1 <= test_seeds <= task.seeds[0]:
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
-    study = create_study(task, storage, sampler, seed)
-    training = simulate(task, task.seeds, "training drives", jobs, console)
-    numbers = _search(study, task, training, trials, jobs, console)
-    test = simulate(task, range(test_seeds), "test drives", jobs, console)
+    study = create_study(task, search.storage, search.sampler, search.seed)
+    shown = search.jobs, search.console
+    training = simulate(task, task.seeds, "training drives", *shown)
+    numbers = _search(study, task, training, search)
+    test = simulate(task, range(test_seeds), "test drives", *shown)
     suite = Suite(
         "tune",
         f"Tuning {task.estimator} on {task.subject}",
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % intervals; "
-        f"{trials} trials. The default is make_estimator with no more than what is held "
+        f"{search.trials} trials. The default is make_estimator with no more than what is held "
         "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
         "least.",
         tables=[

@@ -1,28 +1,18 @@
 """`TensorVectorEnv`: what environments on tensors share, whichever engine steps their cars."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import AutoresetMode
 
+from ..engine.batch_env import BatchEnv, Infos
 from ..numerics.torch_backend import DTYPES, torch
 from ..task import REPORT, RUNNING, StepReport
-from ..validation import (
-    Mask,
-    check_int,
-    format_rows,
-    parse_actions,
-    parse_autoreset_mode,
-    parse_reset_mask,
-    short_repr,
-)
-from ..vector import StabilityVectorEnv
+from ..validation import Mask, parse_actions, short_repr
+from ..vector import make_rows
 
 Tensor = torch.Tensor
-Infos = dict[str, Any]
 
 
 class StepEnds(NamedTuple):
@@ -35,7 +25,7 @@ class StepEnds(NamedTuple):
     final_report: Tensor | None = None  # (len(StepReport), N)
 
 
-class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
+class TensorVectorEnv(BatchEnv[Tensor]):
     """`num_envs` environments on a device, `StabilityVectorEnv` in tensors, seed by seed.
 
     Observations are (N, k), rewards (N,), `terminated` and `truncated` (N,) of bool, infos (N,) of
@@ -44,72 +34,43 @@ class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
     (N, width) on the device, a bad one as in the vector env. Seeds, options and errors of a reset
     are those of `StabilityVectorEnv`, but all rows have a plant of one kind: tyres, roll, lags,
     small angles and whether a driver reacts to the car are those of the env's own scenario.
+
+    Args:
+        num_envs: Number of environments N.
+        device: Device of the tensors.
+        dtype: Type of floats.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled".
+        arguments: Arguments of `StabilityEnv`.
+        is_uniform: Whether scenario and vehicle may not be lists (N,).
     """
 
-    _has_over = True  # whether a row may be over
     _snapshot_type: type = Mapping
 
-    def _init_env(
+    def __init__(
         self, num_envs: int, device: str | torch.device, dtype: str | torch.dtype,
-        autoreset_mode: str | AutoresetMode, host_rows: int,
-        arguments: Mapping[str, Any],
+        autoreset_mode: str | AutoresetMode, arguments: Mapping[str, Any], is_uniform: bool,
     ) -> None:  # fmt: skip
-        """Take the arguments that all engines have; the env on the host has `host_rows` rows."""
         for name in ("max_episode_steps", "info", "render_mode"):
             if arguments.get(name) is not None:
                 got = short_repr(arguments[name])
                 raise TypeError(f"an env on a device has no {name}, got {got}")
-        self.num_envs = check_int("num_envs", num_envs, "environments")
-        self._mode = parse_autoreset_mode(autoreset_mode)
         self.device, known = _parse_device(device), DTYPES | {x: x for x in DTYPES.values()}
         if dtype not in known:
             raise ValueError(f"dtype is 'float64' or 'float32', got {dtype!r}")
         self.dtype = known[dtype]
-        self._host = host = StabilityVectorEnv(host_rows, **arguments)
-        self.layout, self.control_period = host.layout, host.control_period
-        self.reference = host.reference
-        self.metadata = {**host.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = host.single_observation_space
-        self.single_action_space = host.single_action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._started = False
+        env, rows = make_rows(num_envs, arguments, is_uniform)
+        self.metadata = env.metadata
+        super().__init__(autoreset_mode, rows)
 
-    def reset(
-        self, *, seed: Any = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Tensor, Infos]:
-        """Start episodes; where it raises, everything stays as it was.
-
-        Args:
-            seed: An int s (row i gets s + i), or a list (N,) of int or None.
-            options: Options of `StabilityVectorEnv`.
-
-        Returns:
-            Observations (N, k), and the infos of all rows.
-        """
-        remaining = dict(options or {})
-        mask = remaining.pop("reset_mask", None)
-        mask = mask.cpu().numpy() if isinstance(mask, torch.Tensor) else mask
-        self._start_episodes(seed, remaining, parse_reset_mask(mask, self.num_envs))
-        self._started = True
+    def _read_reset(self, mask: Mask) -> tuple[Tensor, Infos]:
         obs, report, _ = self._get_outputs()
         return obs.clone(), _read_infos(report.clone())
 
-    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
-        """Hold each row's action for one control period.
+    def _list_over_rows(self) -> list[int]:
+        rows: list[int] = self._get_outputs()[2].nonzero()[:, 0].tolist()
+        return rows
 
-        Args:
-            actions: Fractions of full scale, shape (N, 1), or (N, 2) with `steering`.
-
-        Returns:
-            Observations, rewards, terminated, truncated and infos.
-        """
-        if not self._started:
-            raise ResetNeeded("no episode was started: call reset() first")
-        waits = self._mode == AutoresetMode.DISABLED and self._has_over
-        if waits and (rows := self._get_outputs()[2].nonzero()[:, 0].tolist()):
-            over = format_rows(rows)
-            raise ResetNeeded(f"the episode is over in {over}: call reset() with a reset_mask")
+    def _step_rows(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         ends = self._advance(actions)
         obs, report, _ = self._get_outputs()
         infos: Infos = {}
@@ -149,10 +110,6 @@ class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
         self._restore(snapshot)
 
     @abstractmethod
-    def _start_episodes(self, seed: object, options: dict[str, Any], mask: Mask) -> None:
-        """Reset the rows of a mask (N,)."""
-
-    @abstractmethod
     def _advance(self, actions: Any) -> StepEnds:
         """Step all rows, and reset those that it has to."""
 
@@ -162,7 +119,7 @@ class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
 
     def _parse_actions(self, actions: Any, dtype: torch.dtype, grad: bool = False) -> Tensor:
         """Parse actions as (N, width), rounded to float32 unless a tensor's graph is kept."""
-        config, N = self._host.config, self.num_envs
+        config, N = self.config, self.num_envs
         width, fail = config.action_width, config.on_bad_action == "fail"
         if not isinstance(actions, torch.Tensor):
             rounded: Tensor = torch.as_tensor(parse_actions(actions, N, width, fail))
@@ -180,12 +137,6 @@ class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
         commands: Tensor = actions.to(dtype)
         return commands
 
-    def _refuse_actions(self, commands: Tensor, bad: Tensor) -> None:
-        """Raise ValueError if commands (N, width) are not finite where `bad` (N,) holds."""
-        if rows := bad.nonzero()[:, 0].tolist():
-            got = f"is not finite, {commands[rows[0]].tolist()}"
-            raise ValueError(f"the action of {format_rows(rows)} {got}; nothing was stepped")
-
     @abstractmethod
     def _get_motion(self) -> Tensor:
         """Get the true motion, (len(Motion), N)."""
@@ -195,28 +146,28 @@ class TensorVectorEnv(VectorEnv[Tensor, Any, Any], ABC):
         """Restore a snapshot of this engine."""
 
     @abstractmethod
-    def _get_record(self, part: str) -> Tensor:
-        """Get "rows", "packets", "done" or "delivered" of the newest record, rows last."""
+    def _get_record(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Get the newest `RecordArrays`; of rows and packets the last axis is the env's rows."""
 
     @property
     def rows(self) -> Tensor:
         """Fast rows of the newest record, (N, n, FAST_WIDTH)."""
-        return self._get_record("rows").permute(2, 0, 1)
+        return self._get_record()[0].permute(2, 0, 1)
 
     @property
     def packets(self) -> Tensor:
         """Packets of the newest record, (N, max, PACKET_WIDTH)."""
-        return self._get_record("packets").permute(2, 0, 1)
+        return self._get_record()[1].permute(2, 0, 1)
 
     @property
     def ticks_done(self) -> Tensor:
         """Number of `rows` of the newest record, (N,)."""
-        return self._get_record("done")
+        return self._get_record()[2]
 
     @property
     def delivered(self) -> Tensor:
         """Number of `packets` of the newest record, (N,)."""
-        return self._get_record("delivered")
+        return self._get_record()[3]
 
 
 def _read_infos(report: Tensor) -> Infos:

@@ -1,20 +1,16 @@
 """`CudaVectorEnv`: many cars in one CUDA kernel a step, with state and resets on the device."""
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 
-from ..engine.config import EpisodeConfig
-from ..engine.episodes import IntArray
+from ..engine.batch import IntArray
 from ..engine.layout import Z
 from ..engine.step import get_start_variant
 from ..numerics.torch_backend import torch
-from ..validation import Mask, parse_seeds, split_options
 from .base import StepEnds, Tensor, TensorVectorEnv
 from .cuda_kernel import (
     ASKED,
@@ -70,6 +66,7 @@ class CudaVectorEnv(TensorVectorEnv):
     """
 
     _snapshot_type = Snapshot
+    _has_over = True  # for all that the host knows
 
     def __init__(
         self,
@@ -81,59 +78,30 @@ class CudaVectorEnv(TensorVectorEnv):
         record: bool = False,
         **arguments: Any,
     ) -> None:
-        self._init_env(num_envs, device, dtype, autoreset_mode, 1, arguments)
+        super().__init__(num_envs, device, dtype, autoreset_mode, arguments, is_uniform=True)
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"
             raise ValueError(f"engine='cuda' runs {runs}, got {str(device)!r}")
-        self._config = self._host.config
-        self._constants = make_constants(self._config, self._mode.value, record)
+        self._constants = make_constants(self.config, self._mode.value, record)
         self._real = np.float64 if self.dtype == torch.float64 else np.float32
         sizes = make_specification(self._constants, self._real, num_envs, 1)
         if not SIMULATED:
-            check_memory(sizes, num_envs, self.device)
+            _check_memory(sizes, num_envs, self.device)
         self._kernel = load_kernel(self._constants, self._real, self.device)
         self._memory = DeviceArrays(*(self._allocate(*spec) for spec in sizes))
         words = np.random.default_rng().integers(0, 2**32, (WORDS, num_envs))
         words[WORDS // 2] |= 1  # PCG64's increment is odd
         self._memory.generators.copy_(torch.as_tensor(words))
-        self._memory.bounds.copy_(torch.as_tensor(self._config.bounds))
+        self._memory.bounds.copy_(torch.as_tensor(self.config.bounds))
 
     def _allocate(self, kind: Any, shape: tuple[int, ...]) -> Tensor:
         """Allocate zeros of a NumPy type on the device."""
         return torch.zeros(shape, dtype=_TORCH.get(kind, self.dtype), device=self.device)
 
-    def _start_episodes(self, seed: object, options: dict[str, Any], mask: Mask) -> None:
+    def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         """Reset rows on the device, where their generators are."""
-        seeds = parse_seeds(seed, self.num_envs)
-        if not (self._started or mask.all()):
-            raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
-        configs, start_index = self._make_configs(options, mask)
-        seeded_rows = [i for i in np.flatnonzero(mask).tolist() if seeds[i] is not None]
-        words = read_words([seeding.np_random(seeds[i])[0] for i in seeded_rows])
-        self._memory.generators[:, seeded_rows] = torch.as_tensor(words, device=self.device)
-        packed, switches = pack_starts([config.start for config in configs])
-        self._memory = self._memory._replace(
-            which=torch.as_tensor(start_index, device=self.device),
-            starts=torch.as_tensor(packed).to(self.device, self.dtype),
-            switches=torch.as_tensor(switches, device=self.device),
-        )
-        self._memory.over[torch.as_tensor(mask, device=self.device)] = ASKED
-        self._kernel(self.num_envs, True, self._memory)
-
-    def _make_configs(
-        self, options: Mapping[str, Any], mask: Mask
-    ) -> tuple[Sequence[EpisodeConfig], IntArray]:
-        """Make the starts' configs, that without options first, and each row's index among them."""
-        configs, start_index = [self._config.base], np.zeros(self.num_envs, np.int64)
-        known: dict[tuple[object, ...], int] = {}
-        for i, row_options in enumerate(split_options(options, self.num_envs) if options else ()):
-            key = (*row_options, *map(id, row_options.values()))
-            if row_options and mask[i]:
-                if key not in known:
-                    known[key] = len(configs)
-                    configs.append(self._config.apply_options(row_options))
-                start_index[i] = known[key]
-        for config in configs[1:]:
+        configs, index = self._make_configs(options, chosen)
+        for config in configs:
             kind, width = get_start_variant(config.start), len(config.start.params)
             if kind != self._constants.kind or width != self._constants.width:
                 raise ValueError(
@@ -141,14 +109,27 @@ class CudaVectorEnv(TensorVectorEnv):
                     f"{self._constants.width} parameters; scenario {config.scenario.name!r} "
                     f"has {kind} with {width}"
                 )
-        return configs, start_index
+        words = read_words([seeding.np_random(seed)[0] for seed in seeds.values()])
+        self._memory.generators[:, list(seeds)] = torch.as_tensor(words, device=self.device)
+        start_index = np.zeros(self.num_envs, np.int64)  # 0: without options
+        start_index[chosen] = 1 + index
+        starts = [config.start for config in (self.config.base, *configs)]
+        packed, switches = pack_starts(starts)
+        self._memory = self._memory._replace(
+            which=torch.as_tensor(start_index, device=self.device),
+            starts=torch.as_tensor(packed).to(self.device, self.dtype),
+            switches=torch.as_tensor(switches, device=self.device),
+        )
+        self._memory.over[torch.as_tensor(chosen, device=self.device)] = ASKED
+        self._kernel(self.num_envs, True, self._memory)
 
     def _advance(self, actions: Any) -> StepEnds:
         """Start a kernel that steps rows or resets them."""
         commands = self._parse_actions(actions, torch.float32).contiguous()
-        if self._config.on_bad_action != "fail":  # here the host waits
+        if self.config.on_bad_action != "fail":  # here the host waits
             bad = ~torch.isfinite(commands).all(1) & (self._memory.over == RUNS)
-            self._refuse_actions(commands, bad)
+            if rows := bad.nonzero()[:, 0].tolist():
+                self._refuse_actions(rows, commands)
         sizes = make_specification(self._constants, self._real, self.num_envs, 1)
         new_arrays = {name: self._allocate(*getattr(sizes, name)) for name in _NEW_ARRAYS[1:]}
         self._memory = memory = self._memory._replace(actions=commands, **new_arrays)
@@ -161,14 +142,11 @@ class CudaVectorEnv(TensorVectorEnv):
     def _get_outputs(self) -> tuple[Tensor, Tensor, Tensor]:
         return self._memory.obs, self._memory.reports, self._memory.over
 
-    def _get_record(self, part: str) -> Tensor:
+    def _get_record(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         if not self._constants.record:
             raise ValueError("there is no record: build the env with record=True")
         m = self._memory
-        done, delivered = m.counts
-        parts: dict[str, Tensor] = {"rows": m.rows, "packets": m.packets}
-        parts |= {"done": done, "delivered": delivered}
-        return parts[part]
+        return m.rows, m.packets, m.counts[0], m.counts[1]
 
     def _get_motion(self) -> Tensor:
         states: Tensor = self._memory.states
@@ -194,17 +172,8 @@ class CudaVectorEnv(TensorVectorEnv):
         self._started = snapshot.started
 
 
-def check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None:
-    """Check that arrays, and the results of three steps, fit on the device.
-
-    Args:
-        sizes: Types and shapes of `make_specification`.
-        count: Number of rows.
-        device: GPU.
-
-    Raises:
-        MemoryError: Where they do not fit.
-    """
+def _check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None:
+    """Check that arrays of `sizes`, and the results of three steps, fit on the device."""
     needed, free = 0, torch.cuda.mem_get_info(device)[0]
     for name, (kind, shape) in sizes._asdict().items():
         copies = 3 if name in (*_NEW_ARRAYS, "obs") else 1

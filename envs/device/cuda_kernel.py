@@ -18,12 +18,11 @@ from numba.cuda.np.numpy_support import carray
 
 from ..engine.batch import read_ends
 from ..engine.config import EnvConfig
-from ..engine.layout import FLAGS, STATE_WIDTH, Switches
+from ..engine.layout import FLAGS, STATE_WIDTH, EpisodeArrays, EpisodeStart, StepVariant, Switches
+from ..engine.outputs import finish_step
 from ..engine.reset import reset_vehicle
-from ..engine.step import clip_action, finish_step, get_start_variant, integrate_step, reject_action
-from ..engine.tick import StepVariant
+from ..engine.step import clip_action, get_start_variant, integrate_step, reject_action
 from ..engine.window import make_window, precompute_window
-from ..engine.workspace import EpisodeArrays, EpisodeStart
 from ..numerics.jit import copy_into
 from ..numerics.primitives import Matrix, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
@@ -207,7 +206,7 @@ def _step_row(
     """Step row i by one env-step; or reset it, if `resets` and it is ASKED."""
     row = EpisodeArrays(
         m.params[:, i], m.states[:, i], thread_arrays.switches, m.obs[i], thread_arrays.rows,
-        thread_arrays.packets, m.reports[:, i],
+        thread_arrays.packets, m.reports[:, i], m.bounds, thread_arrays.window,
     )  # fmt: skip
     start_index, over = 0, int(m.over[i])
     if resets:
@@ -220,7 +219,7 @@ def _step_row(
             return
     else:
         copy_into(constants.switches, thread_arrays.switches)
-        done = _run_row(row, m.actions[i], constants, m.bounds, thread_arrays.window)
+        done = _run_row(row, m.actions[i], constants)
         reward, terminated, truncated = read_ends(row.report)
         m.rewards[i], m.terminated[i], m.truncated[i] = reward, int(terminated), int(truncated)
         _count(i, constants, m, done, row.report)
@@ -236,22 +235,17 @@ def _step_row(
     _count(i, constants, m, 1, row.report)
 
 
-def _run_row(
-    row: EpisodeArrays, action: Vector, constants: KernelConstants, bounds: Matrix, window: Matrix
-) -> int:
+def _run_row(row: EpisodeArrays, action: Vector, constants: KernelConstants) -> int:
     """Step a row that runs by one env-step; return the ticks done."""
-    yaw_share, steer_share = clip_action(action)
-    if yaw_share != yaw_share:
+    shares = clip_action(action)
+    if shares[0] != shares[0]:
         reject_action(row)
         for k in range(constants.entries):
             row.obs[k] = 0.0
         return 0
-    precompute_window(row.p, row.z, constants.n, constants.kind.has_driver, window)
-    done = integrate_step(
-        row.p, row.z, constants.kind, yaw_share, steer_share, constants.n, row.rows, row.report,
-        window, True,
-    )  # fmt: skip
-    finish_step(row, constants.n, done, bounds, window)
+    precompute_window(row, constants.n, constants.kind)
+    done = integrate_step(row, constants.kind, shares, constants.n, True)
+    finish_step(row, constants.n, done)
     return int(done)
 
 
@@ -271,7 +265,7 @@ def _reset_row(
         packed[motion:],
     )  # fmt: skip
     key_low, key_high = _draw_key(generator)
-    reset_vehicle(start, key_low, key_high, m.bounds, row)
+    reset_vehicle(start, key_low, key_high, row)
 
 
 def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Vector) -> None:

@@ -3,12 +3,12 @@
 import os
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from ..engine.batch import IntArray, NumbaEngine
 from ..engine.config import EpisodeConfig
 from ..engine.layout import P
 from ..engine.step import get_start_variant
@@ -16,11 +16,9 @@ from ..numerics.packed import read
 from ..numerics.torch_backend import torch
 from ..sensors.link import Link
 from ..sensors.slow import SLOW_NAMES
-from ..validation import Mask
 from .base import StepEnds, Tensor, TensorVectorEnv
-from .gradients import NO_TENSORS, split_inputs
-from .torch_rows import DeviceRows
-from .torch_sensors import PacketCapacity, compute_capacity
+from .torch_rows import NO_TENSORS, DeviceRows, split_inputs
+from .torch_sensors import PacketCapacity
 from .torch_step import StepOutcome, TorchReset, TorchState, TorchStep
 
 _Links = dict[int, set[Link]]  # by the sensor's place
@@ -71,7 +69,8 @@ class DeviceVectorEnv(TensorVectorEnv):
         grad: bool = False,
         **arguments: Any,
     ) -> None:
-        self._init_env(num_envs, device, dtype, autoreset_mode, num_envs, arguments)
+        super().__init__(num_envs, device, dtype, autoreset_mode, arguments, is_uniform=False)
+        self.engine = NumbaEngine(self.config, num_envs)  # on the host, which resets
         compiler = os.environ.get("CXX", "g++")  # where torch looks for it
         if compile and self.device.type == "cpu" and shutil.which(compiler) is None:
             warnings.warn(
@@ -81,11 +80,10 @@ class DeviceVectorEnv(TensorVectorEnv):
                 stacklevel=2,
             )
             compile = False
-        self._compile, self._grad, config = compile, grad, self._host.config
-        self._has_over = False
+        self._compile, self._grad, config = compile, grad, self.config
         self._kind = get_start_variant(config.base.start)
         self._links: _Links = {i: set() for i, name in enumerate(SLOW_NAMES) if name in config.slow}
-        self._links, capacities = self._collect_links(self._host.configs)
+        self._links, capacities = self._collect_links(self.configs)
         self._build(capacities)
 
     def _collect_links(
@@ -106,36 +104,35 @@ class DeviceVectorEnv(TensorVectorEnv):
             for sensor, previous in self._links.items()
         }
         n = self.control_period
-        return links, {i: compute_capacity(list(known), n) for i, known in links.items()}
+        return links, {i: _compute_capacity(list(known), n) for i, known in links.items()}
 
     def _build(self, capacities: dict[int, PacketCapacity]) -> None:
         """Build the step with these capacities, and copy all rows to the device."""
-        host, dtype = self._host, self.dtype
-        obs_dtype = dtype if self._grad else torch.float32
+        dtype, obs_dtype = self.dtype, self.dtype if self._grad else torch.float32
         tensor_args = dtype, obs_dtype, self.device, self._compile
-        self._step = TorchStep(host.config, capacities, *tensor_args)
+        self._step = TorchStep(self.config, capacities, *tensor_args)
         start = TorchReset(self._step) if self._grad else None
-        self._rows = DeviceRows(host, capacities, self.device, dtype, start)
+        self._rows = DeviceRows(self.engine.arrays, capacities, self.device, dtype, start)
 
-    def _start_episodes(self, seed: object, options: dict[str, Any], mask: Mask) -> None:
+    def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         """Reset rows on the host, and copy them to the device."""
-        host, inputs, chosen = self._host, NO_TENSORS, np.flatnonzero(mask)
+        inputs, host = NO_TENSORS, self.engine
         if self._grad:
-            place = host.config.base, self.num_envs, self._rows.params
+            place = self.config.base, self.num_envs, self._rows.params
             options, inputs = split_inputs(options, *place)
-        configs, _ = host.apply_options(options, chosen.tolist())
+        configs, index = self._make_configs(options, chosen)
         links, capacities = self._collect_links(configs)
         needs_rebuild = capacities != self._rows.capacities
         if needs_rebuild and self._grad and len(chosen) < self.num_envs:
             reason = "these sensors take more room than any before"
             raise ValueError(f"{reason}: reset all rows, or the others would lose their gradients")
         if needs_rebuild:
-            self._rows.download(host)
-        host.reset(seed=seed, options=options | {"reset_mask": mask})
+            self._rows.download(host.arrays)
+        self._restart_rows(chosen, configs, index, seeds)
         self._links = links
         if needs_rebuild:
             self._build(capacities)
-        self._rows.upload(host, chosen, inputs)
+        self._rows.upload(host.arrays, chosen, self.configs, inputs)
         self._has_over = bool(self._rows.state.over.any())
 
     def _advance(self, actions: Any) -> StepEnds:
@@ -146,36 +143,28 @@ class DeviceVectorEnv(TensorVectorEnv):
             state, outcome = self._step(rows.params, rows.keys, rows.state, commands)
         flags = torch.stack((outcome.refused.any(), state.over.any()))
         refused, ended = flags.tolist()  # the one time the device is waited for
-        if refused and self._host.config.on_bad_action != "fail":
-            self._refuse_actions(commands, outcome.refused)
+        if refused and self.config.on_bad_action != "fail":
+            self._refuse_actions(outcome.refused.nonzero()[:, 0].tolist(), commands)
         over_rows = rows.state.over if self._has_over else None
         rows.state, rows.outcome, self._has_over = state, outcome, ended
         ends = StepEnds(outcome.rewards, outcome.terminated, outcome.truncated)
         if over_rows is not None:
-            self._reset_rows(over_rows)
+            self._start_rows(over_rows.nonzero()[:, 0].cpu().numpy(), {}, {})
         if ended and self._mode == AutoresetMode.SAME_STEP:
             ends = ends._replace(final_obs=outcome.obs, final_report=state.report.clone())
-            self._reset_rows(state.over)
-            self._has_over = False
+            self._start_rows(state.over.nonzero()[:, 0].cpu().numpy(), {}, {})
         return ends
 
     def detach(self) -> None:
         """Cut the graph at the state, from earlier actions and states; parameters stay attached."""
         self._rows.detach()
 
-    def _reset_rows(self, over: Tensor) -> None:
-        """Reset these rows (N,) without options."""
-        chosen = over.nonzero()[:, 0].cpu().numpy()
-        self._host.reset_rows(chosen)
-        self._host.over[chosen] = False
-        self._rows.upload(self._host, chosen)
-
     def _get_outputs(self) -> tuple[Tensor, Tensor, Tensor]:
         return self._rows.outcome.obs, self._rows.state.report, self._rows.state.over
 
-    def _get_record(self, part: str) -> Tensor:
-        record: Tensor = getattr(self._rows.outcome, part)
-        return record
+    def _get_record(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        outcome = self._rows.outcome
+        return outcome.rows, outcome.packets, outcome.done, outcome.delivered
 
     def _get_motion(self) -> Tensor:
         return self._rows.state.motion
@@ -184,19 +173,22 @@ class DeviceVectorEnv(TensorVectorEnv):
         """Get the state of the rows and the newest step's outcome, the env's own tensors."""
         return self._rows.state, self._rows.outcome
 
-    @property  # type: ignore[misc]  # without a setter, as in the vector env
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """Each row's generator, on the host, which draws one 64-bit key a reset."""
-        return self._host.np_random
-
     def get_state(self) -> dict[str, Any]:
         """Copy the state of all rows, which `StabilityVectorEnv.set_state` takes too."""
-        self._rows.download(self._host)
-        return self._host.get_state()
+        self._rows.download(self.engine.arrays)
+        return self._copy_state()
 
     def _restore(self, snapshot: Mapping[str, Any]) -> None:
         links, capacities = self._collect_links(snapshot["configs"])
-        self._host.set_state(snapshot)
+        self._restore_state(snapshot)
         self._links = links
         self._build(capacities)
-        self._started, self._has_over = snapshot["started"], bool(self._rows.state.over.any())
+
+
+def _compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
+    """Compute the capacity for sensors with any of some links, in env-steps of n ticks."""
+    return PacketCapacity(
+        max(-int(-n // link.period) for link in links),
+        max(link.max_in_flight for link in links),
+        2 if any(link.duplicate > 0.0 for link in links) else 1,
+    )

@@ -13,7 +13,7 @@ from ..numerics.packed import read
 from ..numerics.primitives import select
 from ..numerics.torch_backend import to_torch, torch
 from ..record import PACKET, PACKET_WIDTH
-from ..sensors.link import Link, compute_arrivals, count_max_in_flight
+from ..sensors.link import compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, sample_sensor
 from ..ticks import NEVER
 from ..vehicle.dynamics import Motion
@@ -51,23 +51,6 @@ class PacketCapacity(NamedTuple):
     frames: int  # captured in an env-step
     under_way: int  # packets at once
     copies: int  # of a packet
-
-
-def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
-    """Compute the capacity for sensors with any of some links.
-
-    Args:
-        links: Links of the sensors.
-        n: Ticks of an env-step.
-
-    Returns:
-        The capacity.
-    """
-    return PacketCapacity(
-        max(-int(-n // link.period) for link in links),
-        max(count_max_in_flight(link) for link in links),
-        2 if any(link.duplicate > 0.0 for link in links) else 1,
-    )
 
 
 class SlowSensors:
@@ -131,9 +114,11 @@ class SlowSensors:
         packets = []
         block = BLOCKS[sensor].link
         arrival_ticks = self._compute_arrivals(link, frame, tick, keys[0], keys[1], block)
+        stamp = tick + link.stamp  # nothing arrives before it
         for arrived in arrival_ticks[: self.capacities[sensor].copies]:
+            arrived = pick(arrived == NEVER, NEVER, torch.maximum(arrived, stamp))
             arrival_tick = pick(active, arrived, NEVER)  # outside the window it never arrives
-            head = torch.full_like(tick, sensor), tick, arrival_tick
+            head = torch.full_like(tick, sensor), stamp, arrival_tick
             packets.append(torch.stack((*head, *fields)))
         next_state = list(slow)
         next_state[SLOW_STATE.frames] = pick(active, frame + 1.0, frame)

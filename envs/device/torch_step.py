@@ -1,4 +1,7 @@
-"""Env-steps of all cars on tensors, pure functions that never wait for the device; and tick 0."""
+"""Env-steps of all cars on tensors, pure functions that never wait for the device; and tick 0.
+
+Each car is frozen at its end, and nothing branches on values.
+"""
 
 from typing import Any, NamedTuple
 
@@ -6,12 +9,17 @@ from ..engine.config import EnvConfig
 from ..engine.layout import FLAGS, SLOW_STATE, ActuatorState, P
 from ..engine.reset import compute_first_row
 from ..engine.step import get_start_variant, make_step_params
+from ..engine.tick import StepState, TickInputs, apply_tyre_change, integrate_tick
+from ..engine.window import compute_tick_cost
 from ..numerics.functions import CHANNELS, clip, draw_normals
 from ..numerics.packed import read
-from ..numerics.primitives import select
-from ..numerics.torch_backend import compile_method, to_torch, torch
+from ..numerics.primitives import Scalar, select
+from ..numerics.torch_backend import GradientGate, compile_method, to_torch, torch
 from ..record import FAST, FAST_WIDTH, PACKET
 from ..scenarios.driver import compute_target_angle
+from ..scenarios.road import NominalMotion
+from ..scenarios.steering import compute_steering
+from ..sensors.errors import ErrorState
 from ..sensors.inertial import NormalDraws
 from ..sensors.slow import WIDTHS, draw_first_drift
 from ..task import (
@@ -24,14 +32,14 @@ from ..task import (
     StepReport,
     compute_failure_cost,
     compute_reference,
+    select_failure,
 )
 from ..ticks import NEVER, TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
-from .gradients import GradientGate
 from .torch_sensors import Delivered, PacketCapacity, SlowSensors, SlowState, TickWindow
-from .torch_ticks import InfoValues, Ticks, TickState
 
 Tensor = torch.Tensor
+Numbers = tuple[Tensor, ...]
 
 
 class TorchState(NamedTuple):
@@ -42,6 +50,8 @@ class TorchState(NamedTuple):
     driver: Tensor  # rad, the driver's steering command, (N,)
     refs: Tensor  # rad, rad/s, references of beta and gamma, (2, N)
     nominal_motion: Tensor  # (len(NominalMotion), N)
+    errors: Tensor  # (len(ErrorState), N)
+    past_efforts: Tensor  # (RATE_TICKS, N)
     tick: Tensor  # ticks since the start, as floats, (N,)
     failure: Tensor  # places in `FAILURES`, as floats, (N,)
     slow: Tensor  # `SlowState.slow`, (sensors, SLOW_WIDTH, N)
@@ -69,6 +79,45 @@ class StepOutcome(NamedTuple):
     delivered: Tensor  # packets that count, int64, (N,)
 
 
+class _InfoValues(NamedTuple):
+    """Numbers of `info` from the last tick of a car; (N,) each."""
+
+    beta: Scalar  # rad
+    beta_ref: Scalar  # rad
+    gamma_ref: Scalar  # rad/s
+    steer: Scalar  # rad, front wheels
+    moment: Scalar  # N m, yaw moment of both motors
+
+
+class _TickState(NamedTuple):
+    """State of the cars within an env-step; (N,) each, or tuples of such."""
+
+    alive: Tensor  # not frozen yet
+    motion: Numbers
+    drive: Numbers
+    driver: Tensor
+    refs: Numbers
+    nominal_motion: Numbers
+    errors: Numbers
+    past_efforts: Numbers
+    tick: Tensor
+    failure: Tensor  # places in `FAILURES`, as floats
+    cost: Tensor  # of the ticks of this step
+    shown: Numbers  # `_InfoValues`
+    row: Numbers  # the newest fast row
+    track: Numbers  # the newest motion, fit for `info` or not
+
+
+class _Ticked(NamedTuple):
+    """Integrated ticks of an env-step."""
+
+    state: _TickState
+    rows: Tensor  # fast rows, (n, FAST_WIDTH, N)
+    track: Tensor  # motions, (n, len(Motion), N)
+    running: Tensor  # whether the car was stepped, (N,)
+    refused: Tensor  # whether its action was not finite, (N,)
+
+
 class TorchStep:
     """Env-steps of cars of one variant.
 
@@ -88,14 +137,21 @@ class TorchStep:
         start = config.base.start
         self.kind, self.n, self.dtype = get_start_variant(start), int(config.control_period), dtype
         self.sensors, self._obs_dtype = tuple(capacities), obs_dtype
-        self._ticks = Ticks(self.kind, dtype, compile)
         self._slow = SlowSensors(capacities, self.kind.small_angle, dtype)
         self._switches = read(start.switches, FLAGS)
         self._bounds = torch.as_tensor(config.bounds, dtype=dtype, device=device)[:, :, None]
-        self._clip, self._select, self._compute_failure_cost = to_torch(
-            dtype, clip, select, compute_failure_cost
-        )
-        self.finish_step: Any = compile_method(self._finish_step) if compile else self._finish_step
+        (
+            self._clip, self._select, self._compute_failure_cost, self._draw_normals,
+            self._compute_steering, self._make_step_params, self._integrate_tick,
+            self._apply_tyre_change, self._select_failure, self._compute_tick_cost,
+        ) = to_torch(
+            dtype, clip, select, compute_failure_cost, draw_normals, compute_steering,
+            make_step_params, integrate_tick, apply_tyre_change, select_failure, compute_tick_cost,
+        )  # fmt: skip
+        parts: list[Any] = [self._finish_step, self._step_tick, self._precompute_window]
+        if compile:
+            parts = list(map(compile_method, parts))
+        self.finish_step, self._tick, self._window = parts
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor
@@ -111,23 +167,103 @@ class TorchStep:
         yaw_share, *steer_shares = map(gate, shares.unbind(1))
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
-        start = _make_tick_state(state, running)
-        tick_state, rows, track = self._ticks.integrate_step(
-            p, keys, start, yaw_share, steer_share, self.n
-        )
+        tick_state = _make_tick_state(state, running)
+        all_draws, steering = self._window(p, keys, tick_state.tick + 1, self.n)
+        rows, track = [], []
+        for j in range(self.n):  # of cars that fail or end the last values are repeated
+            draws = tuple(normals[j] for normals in all_draws)
+            angle = None if steering is None else steering[j]
+            tick_state = self._tick(p, yaw_share, steer_share, tick_state, draws, angle)
+            rows.append(torch.stack(tick_state.row))
+            track.append(torch.stack(tick_state.track))
         is_refused = ~is_finite & ~state.over
+        ticked = _Ticked(tick_state, torch.stack(rows), torch.stack(track), running, is_refused)
         next_state: TorchState
-        next_state, outcome = self.finish_step(
-            p, keys, state, tick_state, rows, track, running, is_refused
-        )
+        next_state, outcome = self.finish_step(p, keys, state, ticked)
         gate.open = next_state.failure != NOT_FINITE
         return next_state, outcome
 
+    def _precompute_window(
+        self, p: Tensor, keys: Tensor, first: Tensor, n: int
+    ) -> tuple[Numbers, Any]:
+        """Compute (nine normal numbers, profile's steering) of n ticks from `first` on, (n, N)."""
+        ticks = first + torch.arange(n, device=first.device)[:, None]
+        tick_numbers = ticks.to(torch.int64)
+        inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
+        wheels = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.wheels)
+        vibration = torch.zeros_like(inertial[0])
+        if self.kind.has_errors:
+            vibration = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.errors)[0]
+        draws = (*inertial, *wheels, vibration)
+        if self.kind.has_driver:
+            return draws, None
+        profile = p[P.steering_profile[0] :]
+        return draws, self._compute_steering(ticks.to(self.dtype), profile)
+
+    def _step_tick(
+        self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: _TickState,
+        draws: Numbers, next_steer: Any,
+    ) -> _TickState:  # fmt: skip
+        """Step the cars that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
+        pick = self._select
+        params = self._make_step_params(p)
+        task = params.task
+        car = self._apply_tyre_change(
+            params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
+        )
+        motion, drive = Motion(*tick_state.motion), ActuatorState(*tick_state.drive)
+        nominal_motion = NominalMotion(*tick_state.nominal_motion)
+        # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
+        state = StepState(
+            motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion,
+            ErrorState(*tick_state.errors),
+        )  # fmt: skip
+        normals = NormalDraws(draws[:4], draws[4:8], draws[8])
+        acts = tick_state.tick >= task.lead_in
+        N_z = pick(acts, yaw_share * task.yaw_scale, 0.0)
+        added = pick(acts, steer_share * task.authority, 0.0)
+        inputs = TickInputs(N_z, added, normals, next_steer, tick_state.past_efforts[0])
+        next_state, measured = self._integrate_tick(
+            params, inputs, state, tick_state.tick, self.kind
+        )
+        alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
+        tick = tick_state.tick + alive
+        tick_cost = self._compute_tick_cost(
+            next_state.motion, measured.cost_inputs, task, params.path, self.kind
+        )
+        failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
+        refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
+        beta = pick(measured.lost, 0.0, tick_cost.beta)
+        info_values = (beta, *refs, measured.steer, measured.moment)
+        efforts = tick_state.past_efforts
+        if self.kind.has_errors:
+            efforts = (*efforts[1:], measured.cost_inputs.effort)
+
+        def select_cars(where: Tensor, new: Any, old: Any) -> Numbers:
+            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
+
+        return _TickState(
+            alive & (failure == RUNNING) & (tick < task.duration),
+            select_cars(is_fit, next_state.motion, tick_state.motion),
+            select_cars(alive, next_state.drive, tick_state.drive),
+            pick(alive, next_state.driver, tick_state.driver),
+            select_cars(alive, refs, tick_state.refs),
+            select_cars(alive, next_state.nominal_motion, tick_state.nominal_motion),
+            select_cars(alive, next_state.errors, tick_state.errors),
+            select_cars(alive, efforts, tick_state.past_efforts),
+            tick,
+            pick(alive, failure, tick_state.failure),
+            tick_state.cost + pick(alive & acts, tick_cost.cost * TICK, 0.0),
+            select_cars(alive, info_values, tick_state.shown),
+            select_cars(alive, measured.row, tick_state.row),
+            select_cars(alive, next_state.motion, tick_state.track),
+        )
+
     def _finish_step(
-        self, p: Tensor, keys: Tensor, state: TorchState, tick_state: TickState, rows: Tensor,
-        track: Tensor, running: Tensor, refused: Tensor,
-    ) -> tuple[TorchState, StepOutcome]:  # fmt: skip
+        self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked
+    ) -> tuple[TorchState, StepOutcome]:
         """Do slow sensors, observation and report of a step whose ticks are integrated."""
+        tick_state, rows, track, running, refused = ticked
         done, duration = tick_state.tick - state.tick, p[P.task.duration]
         window = TickWindow(state.tick, tick_state.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
@@ -144,7 +280,8 @@ class TorchStep:
         truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
         next_state = TorchState(
             torch.stack(tick_state.motion), torch.stack(tick_state.drive), tick_state.driver,
-            torch.stack(tick_state.refs), torch.stack(tick_state.nominal_motion), tick_state.tick,
+            torch.stack(tick_state.refs), torch.stack(tick_state.nominal_motion),
+            torch.stack(tick_state.errors), torch.stack(tick_state.past_efforts), tick_state.tick,
             failure, *slow_state, terminated | truncated, report,
         )  # fmt: skip
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
@@ -154,7 +291,7 @@ class TorchStep:
         )  # fmt: skip
 
     def _observe(
-        self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
+        self, rows: Tensor, done: Tensor, tick_state: _TickState, slow: Tensor, delivered: Delivered
     ) -> Tensor:
         """Compute the observation (N, k) from the first `done` (N,) of rows (n, FAST_WIDTH, N)."""
         entries: list[Tensor] = []
@@ -171,7 +308,7 @@ class TorchStep:
             entries.append(rows[-1, FAST.curvature])
         for sensor in self.sensors:
             entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
-        info_values = InfoValues(*tick_state.shown)
+        info_values = _InfoValues(*tick_state.shown)
         entries += [info_values.beta_ref, info_values.gamma_ref]
         low, high = self._bounds.unbind(0)
         clipped: Tensor = self._clip(torch.stack(entries), low, high)
@@ -191,11 +328,11 @@ class TorchStep:
         values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
         return [*values, age, is_fresh.any(0).to(tick.dtype)]
 
-    def _report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
+    def _report(self, tick_state: _TickState, duration: Tensor, count: Tensor) -> Tensor:
         """Compute the reports (len(StepReport), N) of cars that were stepped."""
         failure_cost = self._compute_failure_cost(duration, tick_state.tick)
         cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
-        info_values = InfoValues(*tick_state.shown)
+        info_values = _InfoValues(*tick_state.shown)
         values = {
             "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
             "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
@@ -206,7 +343,7 @@ class TorchStep:
         }  # fmt: skip
         return torch.stack([values[name] for name in StepReport._fields])
 
-    def _report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
+    def _report_refusal(self, tick_state: _TickState, duration: Tensor, before: Tensor) -> Tensor:
         """Compute the reports of cars that fail by a non-finite action, from those before."""
         cost = self._compute_failure_cost(duration, tick_state.tick)
         values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
@@ -250,19 +387,18 @@ class TorchReset:
                 motion, params.path, road, target, params.driver, stop
             )
         drive = torch.stack(ActuatorState(*state.drive.unbind(0))._replace(delta_f=steer))
-        n = [
-            self._draw_normals(keys[0], keys[1], 0, c) for c in (CHANNELS.inertial, CHANNELS.wheels)
-        ]
-        row = self._compute_first_row(
-            motion, steer, params.road, params.car.d_f, params.noise, NormalDraws(*n),
-            kind.small_angle,
-        )  # fmt: skip
+        channels = CHANNELS.inertial, CHANNELS.wheels, CHANNELS.errors
+        n = [self._draw_normals(keys[0], keys[1], 0, channel) for channel in channels]
+        draws = NormalDraws(n[0], n[1], n[2][0])
+        errors = ErrorState(*state.errors.unbind(0))
+        row = self._compute_first_row(motion, steer, params, draws, errors, kind)
         row = [zero + number for number in row]
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-        refs = torch.stack(self._compute_reference(steer, v, params.target, kind.reference))
+        command = row[FAST.steer_command]
+        refs = torch.stack(self._compute_reference(command, v, params.target, kind.reference))
         all_cars = torch.ones_like(state.over)
         beta = self._compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
-        info_values = InfoValues(beta, refs[0], refs[1], steer, zero)
+        info_values = _InfoValues(beta, refs[0], refs[1], steer, zero)
         started = state._replace(drive=drive, driver=steer, refs=refs)
         tick_state = _make_tick_state(started, all_cars)
         empty_queue = torch.full_like(state.queue, NEVER)
@@ -273,7 +409,7 @@ class TorchReset:
         rows = torch.stack(row).expand(self._step.n, -1, -1)  # tick 0 stands for every sample
         tick_state = tick_state._replace(shown=info_values)
         result: tuple[TorchState, StepOutcome] = self._step.finish_step(
-            p, keys, previous, tick_state, rows, state.motion[None], all_cars, ~all_cars
+            p, keys, previous, _Ticked(tick_state, rows, state.motion[None], all_cars, ~all_cars)
         )
         return result
 
@@ -294,14 +430,15 @@ class TorchReset:
         return torch.stack(sensors)
 
 
-def _make_tick_state(state: TorchState, alive: Tensor) -> TickState:
+def _make_tick_state(state: TorchState, alive: Tensor) -> _TickState:
     """Make the state of cars at the start of an env-step."""
-    tick, n_shown = state.tick, len(InfoValues._fields)
+    tick, n_shown = state.tick, len(_InfoValues._fields)
     zeros = tick.new_zeros((2 + n_shown + FAST_WIDTH, len(tick)))
     failure, cost, *numbers = zeros.unbind(0)
     motion, drive, refs = state.motion.unbind(0), state.drive.unbind(0), state.refs.unbind(0)
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
-    return TickState(
-        alive, motion, drive, state.driver, refs, state.nominal_motion.unbind(0), tick, failure,
-        cost, tuple(numbers[:n_shown]), tuple(numbers[n_shown:]), state.motion.unbind(0),
+    return _TickState(
+        alive, motion, drive, state.driver, refs, state.nominal_motion.unbind(0),
+        state.errors.unbind(0), state.past_efforts.unbind(0), tick, failure, cost,
+        tuple(numbers[:n_shown]), tuple(numbers[n_shown:]), state.motion.unbind(0),
     )  # fmt: skip

@@ -1,32 +1,38 @@
-"""Env-steps and resets of a batch, its vehicles of one variant in SIMD lanes; compiled."""
+"""Env-steps and resets of a batch, its vehicles of one variant in SIMD lanes: `NumbaEngine`."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..numerics.jit import copy_into, jit, noinline
-from ..numerics.packed import count_lanes, load_element, read
+from ..numerics.packed import count_lanes, read, write
 from ..numerics.primitives import Matrix, Vector
 from ..numerics.simd import LANES
-from ..record import FAST_WIDTH, Array
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REFUSED, REPORT, RUNNING
-from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
-from .outputs import observe_fast
+from ..validation import Mask
+from .config import EnvConfig
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, Z
+from .outputs import finish_slow_sensors, observe_fast
 from .reset import reset_vehicle
 from .step import (
+    SHARES,
     check_action_range,
     clip_action,
-    finish_slow_sensors,
     integrate_step,
     make_step_variant,
     step_vehicle,
 )
 from .window import make_window, overwrite_steering, precompute_lane_window
-from .workspace import EpisodeArrays, EpisodeStart
 
+IntArray = npt.NDArray[np.int64]
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
-_DYNAMIC_WIDTH = Z.slow[0].frames  # a tick changes the first numbers, and the driver's angle
+# How many parameters ticks read, and how many numbers of the state they change besides the driver's
+# angle: in an ideal world, and in one with errors.
+_TICK_PARAMS = (P.errors[0], P.slow[0].period)
+_TICK_STATE = (Z.errors[0], Z.slow[0].frames)
 
 
 class BatchArrays(NamedTuple):
@@ -43,6 +49,11 @@ class BatchArrays(NamedTuple):
     delivered: Vector  # (N,), how many of `packets` are there
     over: Vector  # (N,) of bool: the episode has ended and was not reset yet
 
+    @property
+    def record(self) -> "RecordArrays":
+        """The newest records."""
+        return RecordArrays(self.rows, self.packets, self.ticks_done, self.delivered)
+
 
 class RecordArrays(NamedTuple):
     """The records of N episodes."""
@@ -58,41 +69,31 @@ class _LaneBuffers(NamedTuple):
 
     order: npt.NDArray[np.int64]  # (N,), all rows, those of one variant next to each other
     members: npt.NDArray[np.int64]  # (lanes,), the rows in the lanes now
-    params: Array
-    states: Array
+    block: EpisodeArrays  # without packets, and without the observation's entries of slow sensors
     shares: Array
-    rows: Array
-    reports: Array
-    obs: Array  # but for the entries of slow sensors
-    window: Array  # of the block
-    single_window: Array  # of a row that is stepped by itself
+    window: Array  # of a row that is stepped by itself
 
 
-def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
-    """Make the working arrays of a batch step.
-
-    Args:
-        count: Number of rows.
-        n: Ticks of a step.
-        entries: Entries of an observation.
-
-    Returns:
-        Buffers, whose `order` is 0 .. count - 1.
-    """
-    return _LaneBuffers(
-        np.arange(count), np.zeros(LANES, np.int64), np.zeros((PARAMS_WIDTH, LANES)),
-        np.zeros((STATE_WIDTH, LANES)), np.zeros((2, LANES)), np.zeros((n, FAST_WIDTH, LANES)),
-        np.zeros((_REPORT, LANES)), np.zeros((entries, LANES)), make_window(n, LANES),
-        make_window(n),
+def _make_lane_buffers(count: int, n: int, bounds: Array) -> _LaneBuffers:
+    """Make the working arrays of a batch step of n ticks; `order` is 0 .. count - 1."""
+    block = EpisodeArrays(
+        np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
+        np.zeros(len(FLAGS), np.int64), np.zeros((bounds.shape[1], LANES)),
+        np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
+        np.zeros((_REPORT, LANES)), bounds, make_window(n, LANES),
     )  # fmt: skip
+    members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
+    return _LaneBuffers(np.arange(count), members, block, shares, make_window(n))
 
 
 @jit
-def _get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
+def _get_episode_arrays(
+    batch: BatchArrays, i: int, bounds: Matrix, window: Matrix
+) -> EpisodeArrays:
     """Get the arrays of episode i of a batch."""
     return EpisodeArrays(
         batch.params[i], batch.states[i], batch.switches[i], batch.obs[i], batch.rows[i],
-        batch.packets[i], batch.reports[i],
+        batch.packets[i], batch.reports[i], bounds, window,
     )  # fmt: skip
 
 
@@ -105,50 +106,46 @@ def _get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
 
 
 @noinline
-def _step_lanes(
-    count: int, batch: BatchArrays, actions: Matrix, bounds: Matrix, buffers: _LaneBuffers
-) -> bool:
+def _step_lanes(count: int, batch: BatchArrays, actions: Matrix, buffers: _LaneBuffers) -> bool:
     """Step the block's first `count` members; False, and nothing changes, where one ends early."""
-    params, states, n = batch.params, batch.states, batch.rows.shape[1]
+    params, states, n, block = batch.params, batch.states, batch.rows.shape[1], buffers.block
+    first, bounds = buffers.members[0], block.bounds
+    copy_into(batch.switches[first], block.switches)
+    variant = make_step_variant(params[first], block.switches)
+    n_params, n_state = _TICK_PARAMS[variant.has_errors], _TICK_STATE[variant.has_errors]
     for lane in range(count_lanes()):
         i = buffers.members[lane if lane < count else 0]  # spare lanes repeat the first
-        for k in range(PARAMS_WIDTH):
-            buffers.params[k, lane] = params[i, k]
-        for k in range(_DYNAMIC_WIDTH):
-            buffers.states[k, lane] = states[i, k]
-        buffers.states[Z.driver, lane] = states[i, Z.driver]
-        buffers.shares[0, lane], buffers.shares[1, lane] = clip_action(actions[i])
-    first = buffers.members[0]
-    variant = make_step_variant(params[first], batch.switches[first])
-    precompute_lane_window(buffers.params, buffers.states, n, variant.has_driver, buffers.window)
+        for k in range(n_params):
+            block.p[k, lane] = params[i, k]
+        for k in range(n_state):
+            block.z[k, lane] = states[i, k]
+        block.z[Z.driver, lane] = states[i, Z.driver]
+        write(buffers.shares, clip_action(actions[i]), SHARES, lane)
+    precompute_lane_window(block, n, variant)
     for lane in range(count_lanes()):
         i = buffers.members[lane if lane < count else 0]
-        overwrite_steering(params[i], states[i], n, buffers.window[:, :, lane])
-    done = integrate_step(
-        buffers.params, buffers.states, variant, load_element(buffers.shares, 0),
-        load_element(buffers.shares, 1), n, buffers.rows, buffers.reports, buffers.window, False,
-    )  # fmt: skip
-    if done == 0:
+        window = block.window[:, :, lane]
+        overwrite_steering(_get_episode_arrays(batch, i, bounds, window), n)
+    if integrate_step(block, variant, read(buffers.shares, SHARES), n, False) == 0:
         return False
-    refs, last = read(buffers.reports, _REFS), len(bounds[0]) - 2
-    slow_start = observe_fast(buffers.rows, n, refs, bounds, batch.switches[first], buffers.obs)
+    refs, last = read(block.report, _REFS), len(bounds[0]) - 2
+    slow_start = observe_fast(block, n, refs)
     for lane in range(count):
         i = buffers.members[lane]
-        for k in range(_DYNAMIC_WIDTH):
-            states[i, k] = buffers.states[k, lane]
-        states[i, Z.driver] = buffers.states[Z.driver, lane]
+        row = _get_episode_arrays(batch, i, bounds, block.window[:, :, lane])
+        for k in range(n_state):
+            states[i, k] = block.z[k, lane]
+        states[i, Z.driver] = block.z[Z.driver, lane]
         for k in range(_REPORT):
-            batch.reports[i, k] = buffers.reports[k, lane]
+            batch.reports[i, k] = block.report[k, lane]
         for j in range(n):
             for k in range(FAST_WIDTH):
-                batch.rows[i, j, k] = buffers.rows[j, k, lane]
+                batch.rows[i, j, k] = block.rows[j, k, lane]
         for k in range(slow_start):
-            batch.obs[i, k] = buffers.obs[k, lane]
+            batch.obs[i, k] = block.obs[k, lane]
         for k in range(last, last + 2):
-            batch.obs[i, k] = buffers.obs[k, lane]
-        finish_slow_sensors(
-            _get_episode_arrays(batch, i), n, slow_start, bounds, buffers.window[:, :, lane]
-        )
+            batch.obs[i, k] = block.obs[k, lane]
+        finish_slow_sensors(row, n, slow_start)
     return True
 
 
@@ -156,26 +153,11 @@ _MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 
 
 @jit
-def step_rows(
-    batch: BatchArrays, actions: Matrix, bounds: Matrix, results: tuple[Vector, Vector, Vector],
+def _step_rows(
+    batch: BatchArrays, actions: Matrix, results: tuple[Vector, Vector, Vector],
     buffers: _LaneBuffers,
 ) -> int:  # fmt: skip
-    """Step every row by one env-step, and count the episodes that ended.
-
-    Rows whose episode is `over` stand still with reward 0. Afterwards `over` is true only for rows
-    that ended in this step: for those that stood still it is cleared before any reset.
-
-    Args:
-        batch: Arrays of the rows.
-        actions: Fractions of full scale, float32 of shape (N, 1) or (N, 2).
-        bounds: Bounds of the observation, shape (2, k).
-        results: Rewards, terminated and truncated, shape (N,) each, which are written.
-        buffers: Working arrays of the blocks.
-
-    Returns:
-        The count, with WILD added for an action beyond its limit. REFUSED, with nothing stepped, if
-        an action is not finite in a row whose switch `fail_bad` is off.
-    """
+    """Step every row as `NumbaEngine.step` says; `results` are written."""
     n_ended, over = 0, batch.over
     rewards, terminated, truncated = results
     for i in range(len(over)):
@@ -189,9 +171,9 @@ def step_rows(
     for m in range(len(over)):
         i = buffers.order[m]
         if not over[i]:
-            share, _ = clip_action(actions[i])
+            share = clip_action(actions[i])[0]
             if share != share:
-                batch.ticks_done[i] = _step_single(i, batch, actions, bounds, buffers)
+                batch.ticks_done[i] = _step_single(i, batch, actions, buffers)
                 batch.obs[i, :] = 0.0
             else:
                 buffers.members[n_pending] = i
@@ -201,13 +183,13 @@ def step_rows(
         ):
             is_vectorised = False
             if n_pending > _MAX_SCALAR:
-                is_vectorised = _step_lanes(n_pending, batch, actions, bounds, buffers)
+                is_vectorised = _step_lanes(n_pending, batch, actions, buffers)
             for lane in range(n_pending):
                 i = buffers.members[lane]
                 if is_vectorised:
                     batch.ticks_done[i] = batch.rows.shape[1]
                 else:
-                    batch.ticks_done[i] = _step_single(i, batch, actions, bounds, buffers)
+                    batch.ticks_done[i] = _step_single(i, batch, actions, buffers)
             n_pending = 0
     for i in range(len(over)):
         if over[i]:
@@ -247,30 +229,18 @@ def _has_variant_change(m: int, batch: BatchArrays, buffers: _LaneBuffers) -> bo
 
 
 @jit
-def _step_single(
-    i: int, batch: BatchArrays, actions: Matrix, bounds: Matrix, buffers: _LaneBuffers
-) -> int:
+def _step_single(i: int, batch: BatchArrays, actions: Matrix, buffers: _LaneBuffers) -> int:
     """Step row i by itself; return the ticks done."""
-    row, n = _get_episode_arrays(batch, i), batch.rows.shape[1]
-    return int(step_vehicle(row, actions[i], n, bounds, buffers.single_window))
+    row = _get_episode_arrays(batch, i, buffers.block.bounds, buffers.window)
+    return int(step_vehicle(row, actions[i], batch.rows.shape[1]))
 
 
 @jit
-def reset_rows(
-    chosen: Vector, start_index: Vector, starts: EpisodeStart, keys: Matrix, bounds: Matrix,
-    batch: BatchArrays, final: RecordArrays,
+def _reset_rows(
+    chosen: Vector, start_index: Vector, starts: EpisodeStart, keys: Matrix, batch: BatchArrays,
+    final: RecordArrays, buffers: _LaneBuffers,
 ) -> None:  # fmt: skip
-    """Reset rows, whose records are first copied.
-
-    Args:
-        chosen: Indices of the rows, shape (M,).
-        start_index: Index in `starts` of each row's start, shape (M,).
-        starts: Packed starts of episodes, the first axis of each array.
-        keys: Key of each row's episode, two words of 32 bits, shape (M, 2).
-        bounds: Bounds of the observation, shape (2, k).
-        batch: Arrays of all rows.
-        final: Records of all rows, into which those of the chosen are copied.
-    """
+    """Reset rows `chosen` (M,) with keys (M, 2) of 32 bits; their records are copied to `final`."""
     for m in range(len(chosen)):
         i, t = chosen[m], start_index[m]
         for j in range(batch.ticks_done[i]):
@@ -279,8 +249,101 @@ def reset_rows(
             copy_into(batch.packets[i, j], final.packets[i, j])
         final.ticks_done[i], final.delivered[i] = batch.ticks_done[i], batch.delivered[i]
         key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
-        reset_vehicle(
-            _get_episode_start(starts, t), key_low, key_high, bounds, _get_episode_arrays(batch, i)
-        )
+        row = _get_episode_arrays(batch, i, buffers.block.bounds, buffers.window)
+        reset_vehicle(_get_episode_start(starts, t), key_low, key_high, row)
         batch.ticks_done[i] = 1
         batch.delivered[i] = int(batch.reports[i, REPORT.packets])
+
+
+def _pad_params(params: Array, width: int) -> Array:
+    """Pad packed parameters to (width,): a trace repeats its last angle, others append zeros."""
+    has_trace = len(params) > PARAMS_WIDTH
+    return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
+
+
+class NumbaEngine:
+    """N episodes in compiled code, those of one variant in SIMD lanes.
+
+    Args:
+        config: Config of the rows, which differ in scenario and vehicles alone.
+        count: Number of rows N.
+
+    Attributes:
+        arrays: The rows' arrays.
+        final: The rows' records before their newest reset.
+        lane_buffers: Working arrays of a step.
+    """
+
+    def __init__(self, config: EnvConfig, count: int) -> None:
+        N, n, k = count, int(config.control_period), len(config.layout)
+        self.arrays = BatchArrays(
+            params=np.zeros((N, PARAMS_WIDTH)), states=np.zeros((N, STATE_WIDTH)),
+            switches=np.zeros((N, len(FLAGS)), np.int64), obs=np.zeros((N, k), np.float32),
+            rows=np.zeros((N, n, FAST_WIDTH)),
+            packets=np.zeros((N, config.max_packets, PACKET_WIDTH)),
+            reports=np.zeros((N, len(REPORT))), ticks_done=np.zeros(N, np.int64),
+            delivered=np.zeros(N, np.int64), over=np.zeros(N, np.bool_),
+        )  # fmt: skip
+        self.final = RecordArrays(*(array.copy() for array in self.arrays.record))
+        self.lane_buffers = _make_lane_buffers(N, n, config.bounds)
+
+    def reset(
+        self,
+        chosen: IntArray,
+        starts: Sequence[EpisodeStart],
+        index: IntArray,
+        keys: npt.NDArray[np.uint64],
+    ) -> None:
+        """Reset rows.
+
+        Args:
+            chosen: The rows, shape (M,).
+            starts: Starts of their episodes.
+            index: Index of each one's start, shape (M,).
+            keys: Key of each one's episode, shape (M,).
+        """
+        words = np.stack([keys & 0xFFFFFFFF, keys >> 32], 1).astype(np.int64)
+        params = self.arrays.params
+        width = max(params.shape[1], *(len(start.params) for start in starts))
+        if width > params.shape[1]:  # for a trace
+            params = np.array([_pad_params(row, width) for row in params])
+            self.arrays = self.arrays._replace(params=params)
+        packed = [start._replace(params=_pad_params(start.params, width)) for start in starts]
+        stacked = EpisodeStart(*map(np.stack, zip(*packed, strict=True)))
+        _reset_rows(chosen, index, stacked, words, self.arrays, self.final, self.lane_buffers)
+        self.arrays.over[chosen] = False
+        self._group_by_variant()
+
+    def step(self, commands: npt.NDArray[np.float32], results: tuple[Array, Mask, Mask]) -> int:
+        """Step all rows by one env-step.
+
+        Rows whose episode is `over` stand still with reward 0. Afterwards `over` is true only for
+        rows that ended in this step: where they stood still it is cleared before any reset.
+
+        Args:
+            commands: Fractions of full scale, shape (N, width).
+            results: Rewards, terminated and truncated, shape (N,) each, which are written.
+
+        Returns:
+            Number of episodes that ended, with WILD added for an action beyond its limit. REFUSED,
+            with nothing stepped, if an action is not finite in a row that does not fail by it.
+        """
+        return _step_rows(self.arrays, commands, results, self.lane_buffers)
+
+    def restore(self, arrays: Mapping[str, Array]) -> None:
+        """Restore arrays.
+
+        Args:
+            arrays: Copies of `BatchArrays`, by name.
+        """
+        self.arrays = self.arrays._replace(params=arrays["params"].copy())
+        for name, array in self.arrays._asdict().items():
+            array[:] = arrays[name]
+        self._group_by_variant()
+
+    def _group_by_variant(self) -> None:
+        """Sort rows of the same variant next to each other in the lanes' order."""
+        lags = self.arrays.params[:, [P.motor.start, P.steering.start]] > 0.0
+        variants, order = np.hstack([self.arrays.switches, lags]), self.lane_buffers.order
+        is_mixed = (variants != variants[0]).any()
+        order[:] = np.lexsort(variants.T) if is_mixed else np.arange(len(order))

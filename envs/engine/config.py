@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from ..record import Array
@@ -16,13 +17,20 @@ from ..scenarios.manoeuvres import make_scenario
 from ..scenarios.road import ROADS, make_path
 from ..scenarios.scenario import MIN_GPS_PERIOD, Scenario
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
+from ..scenarios.world import IDEAL, World
 from ..sensors.camera import FieldOfView
-from ..sensors.camera.detector import DELAYS, MAX_DELAY, VISIONS, count_delay_ticks, load_detector
-from ..sensors.gps import HDOP_LAWS, SatelliteGeometry
+from ..sensors.camera.analytic import DELAYS, MAX_DELAY, VISIONS, count_delay_ticks, load_detector
+from ..sensors.errors import IDEAL_SENSORS
 from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link, SlowSensor, make_link
-from ..sensors.slow import SENSOR_SETS, SLOW_NAMES, apply_changes
-from ..task import REFERENCES, ObservationEntry, make_observation_layout, make_reference_params
+from ..sensors.slow import HDOP_LAWS, SENSOR_SETS, SLOW_NAMES, SatelliteGeometry, apply_changes
+from ..task import (
+    REFERENCES,
+    ObservationEntry,
+    make_observation_layout,
+    make_reference_params,
+    make_space,
+)
 from ..ticks import FOREVER, TICK, count_ticks
 from ..validation import (
     check_choice,
@@ -40,8 +48,16 @@ from ..vehicle.dynamics import CarParams, Motion, RoadParams
 from ..vehicle.linear import Bicycle
 from ..vehicle.parameters import GRAVITY, Vehicle, make_vehicle
 from ..vehicle.tyres import TYRE_LAWS
-from .layout import PARAMS_WIDTH, Disturbance, EpisodeParams, Switches, TaskParams, TyreChange
-from .workspace import EpisodeStart
+from .layout import (
+    PARAMS_WIDTH,
+    Disturbance,
+    EpisodeParams,
+    EpisodeStart,
+    FrictionWave,
+    Switches,
+    TaskParams,
+    TyreChange,
+)
 
 _SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
@@ -74,31 +90,37 @@ def make_car(vehicle: Vehicle) -> CarParams:
         mu=vehicle.friction, l_pre=vehicle.preview, S=vehicle.roll_moment_arm,
         I_x=vehicle.roll_inertia, K_x=vehicle.roll_stiffness, C_x=vehicle.roll_damping,
         h=vehicle.gravity_height, forward=vehicle.antenna_ahead, left=vehicle.antenna_left,
-        mu_r=vehicle.friction, P=vehicle.motor_power, h_x=vehicle.transfer_height,
+        mu_r=vehicle.friction, P=vehicle.motor_power, h_x=vehicle.transfer_height, k_l=1.0, k_r=1.0,
+        relaxation=vehicle.relaxation,
     )  # fmt: skip
 
 
-def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> TaskParams:
+def make_task_params(
+    vehicle: Vehicle, scenario: Scenario, yaw_first: bool, lead_in: float = 0.0,
+    world: World = IDEAL,
+) -> TaskParams:  # fmt: skip
     """Make the episode's length and limits.
 
     Args:
         vehicle: The true vehicle.
         scenario: Scenario with the duration and the limits.
         yaw_first: Whether the yaw moment comes before acceleration.
+        lead_in: Ticks before the manoeuvre.
+        world: World with the cost of the yaw moment's rate.
 
     Returns:
         Length and limits.
     """
     return TaskParams(
-        duration=count_ticks(scenario.duration), half_width=scenario.half_width,
+        duration=lead_in + count_ticks(scenario.duration), half_width=scenario.half_width,
         yaw_scale=vehicle.yaw_moment_limit, yaw_first=float(yaw_first), spin=_SPIN_ANGLE,
         authority=vehicle.steering_authority, slew=vehicle.steering_rate * TICK,
-        stop=vehicle.steering_stop,
+        stop=vehicle.steering_stop, torque_slew=0.0, lead_in=lead_in, moment_rate=world.moment_rate,
     )  # fmt: skip
 
 
-def _make_speed_profile(scenario: Scenario) -> SpeedProfile:
-    """Make the driver's speed profile; the speed itself is drawn."""
+def _make_speed_profile(scenario: Scenario, lead_in: float) -> SpeedProfile:
+    """Make the driver's speed profile behind a lead-in (ticks); the speed itself is drawn."""
     profile = SpeedProfile(
         speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5
     )
@@ -106,15 +128,18 @@ def _make_speed_profile(scenario: Scenario) -> SpeedProfile:
         return profile._replace(hold=0.0, acceleration=scenario.acceleration)
     if scenario.speed_change:
         start, length = scenario.change_start, scenario.change_length
-        rate, tick = scenario.speed_change / length, count_ticks(start)
+        rate, tick = scenario.speed_change / length, lead_in + count_ticks(start)
         profile = profile._replace(acceleration=rate, start=tick, end=tick + count_ticks(length))
     return profile._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
 
 
-def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
-    """Make a slow sensor's link with the scenario's outage."""
+def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None, lead_in: float) -> Link:
+    """Make a slow sensor's link with the scenario's outage behind a lead-in (ticks)."""
     try:
-        return make_link(sensor, getattr(scenario, f"{name}_outage", None))
+        outage = getattr(scenario, f"{name}_outage", None)
+        if outage is not None:
+            outage = tuple(time + lead_in * TICK for time in outage)
+        return make_link(sensor, outage)
     except ValueError as error:
         raise ValueError(f"scenario {short_repr(scenario.name)}: {name}: {error}") from None
 
@@ -155,6 +180,25 @@ def _apply_scenario_clocks(
     return changed
 
 
+def _apply_stamp_range(sensor: SlowSensor, low: float, high: float) -> SlowSensor:
+    """Describe the delays that packets seem to have whose stamps are off by low to high (s)."""
+    delays = tuple(max(delay - high, 0.0) for delay in sensor.delays)
+    return dataclasses.replace(sensor, delays=delays, jitter=sensor.jitter + (high - low))
+
+
+def _check_later_start(scenario: Scenario) -> None:
+    """Raise ValueError for a scenario whose manoeuvre cannot begin later."""
+    starts = scenario.range("initial_beta") + scenario.range("initial_gamma")
+    for holds, text in (
+        (scenario.steering in ("trace", "wander"), f"steers by {scenario.steering} from 0 s on"),
+        (scenario.acceleration is not None, "accelerates from 0 s on"),
+        (bool(scenario.surge), "surges from 0 s on"),
+        (any(starts), "begins with a slip or a yaw rate"),
+    ):
+        if holds:
+            raise ValueError(f"lead_in: scenario {short_repr(scenario.name)} {text}")
+
+
 def _apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
     """Describe the delay of a camera with a detector by its range; it is a tick at least."""
     if delay == "link":
@@ -188,11 +232,14 @@ class EnvConfig:
     delay: str | None
     strict: bool
     slow_changes: Mapping[str, Mapping[str, Any] | None]
+    world: World = IDEAL
+    lead_in: float = 0.0  # s
 
     def __post_init__(self) -> None:
         check_choice("sensors", self.sensors, SENSOR_SETS)
         if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
-            known = [entry.name for entry in dataclasses.fields(self)][:-1]
+            names = [entry.name for entry in dataclasses.fields(self)]
+            known = [name for name in names if name != "slow_changes"]
             raise TypeError(describe_unknown("argument", unknown, [*known, *SLOW_NAMES]))
         check_int("control_period", self.control_period, "ticks", 1, 1000)
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
@@ -206,6 +253,8 @@ class EnvConfig:
         check_choice("vision", self.vision, VISIONS)
         if self.vision == "image" and "camera" not in SENSOR_SETS[self.sensors]:
             raise ValueError(f"vision='image' needs a camera, and {self.sensors!r} has none")
+        if not 0.0 <= check_number("lead_in", self.lead_in) <= 3600.0:
+            raise ValueError(f"lead_in is 0 to 3600 s, got {self.lead_in!r}")
         if self.delay is not None:
             check_choice("delay", self.delay, DELAYS)
             if self.vision != "image":
@@ -239,6 +288,11 @@ class EnvConfig:
         """Width of an action."""
         return 2 if self.steering else 1
 
+    def make_spaces(self) -> "tuple[gym.spaces.Box[np.float32], gym.spaces.Box[np.float32]]":
+        """Make the spaces of observations and actions."""
+        actions = gym.spaces.Box(-1.0, 1.0, (self.action_width,), np.float32)
+        return make_space(self.layout), actions
+
     @cached_property
     def base(self) -> EpisodeConfig:
         """An episode without options."""
@@ -250,17 +304,25 @@ class EnvConfig:
         """Pack all that a reset does not draw; motion (len(Motion),) is NaN where it is default."""
         vehicle = vehicle.replace(**scenario.vehicle)
         nominal = self.nominal.replace(**scenario.nominal)
+        world, n = self.world, int(self.control_period)
         if self.strict:
-            for part in (scenario, vehicle, nominal):
+            for part in (scenario, vehicle, nominal, world):
                 check_plausible(part)
+        if self.lead_in:
+            _check_later_start(scenario)
+        lead_in = n * math.ceil(count_ticks(self.lead_in) / n)  # in whole steps
         slow = _apply_scenario_clocks(self.slow, scenario)
+        if "gps" in slow and get_range(world.gps_stamp) != (0.0, 0.0):  # its clock is its own
+            slow["gps"] = dataclasses.replace(slow["gps"], phase=None)
         if self.vision == "image":
             slow["camera"] = _apply_detector_clock(slow["camera"], self.delay)
             scenario = scenario.replace(noise={**scenario.noise, **load_detector().noise})
         check_choice("reference", self.reference, REFERENCES)
         if scenario.roll:
             vehicle.check_roll()
-        links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
+        links = {name: _make_link(scenario, name, slow.get(name), lead_in) for name in SLOW_NAMES}
+        if "gps" in slow:
+            slow["gps"] = _apply_stamp_range(slow["gps"], *get_range(world.gps_stamp))
         hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
         gains = _compute_gains(-TICK / scenario.disturbance_time)
         params = EpisodeParams(
@@ -275,14 +337,14 @@ class EnvConfig:
             motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
             steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
             wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
-            speed_profile=_make_speed_profile(scenario),
+            speed_profile=_make_speed_profile(scenario, lead_in),
             noise=Noise()._replace(**scenario.noise),
             slow=tuple(links.values()),
             target=make_reference_params(nominal),
             disturbance=Disturbance(
                 scenario.disturbance_force, scenario.disturbance_moment, *gains
             ),
-            task=make_task_params(vehicle, scenario, self.yaw_first),
+            task=make_task_params(vehicle, scenario, self.yaw_first, lead_in, world),
             steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
             sky=SatelliteGeometry(
                 math.log(scenario.hdop),
@@ -300,15 +362,19 @@ class EnvConfig:
             tyre_change=TyreChange(FOREVER, 1.0, 1.0),  # drawn
             field_of_view=FieldOfView(scenario.camera_heading, scenario.camera_offset),
             nominal_car=Bicycle(*nominal.lateral),
+            errors=IDEAL_SENSORS,
+            friction_wave=FrictionWave(0.0, 0.0, 0.0),  # drawn
         )
         switches = Switches(
-            small_angle=int(scenario.small_angle), law=TYRE_LAWS.index(scenario.tyres),
+            small_angle=int(scenario.small_angle),
+            law=TYRE_LAWS.index(world.tyres or scenario.tyres),
             reference=REFERENCES.index(self.reference),
             steering=STEERING_KINDS.index(scenario.steering), all_samples=int(self.fast == "all"),
             with_map=int(self.with_map), fail_bad=int(self.on_bad_action == "fail"),
             roll=int(scenario.roll), road=ROADS.index(scenario.road),
+            has_errors=int(not world.is_ideal),
         )  # fmt: skip
-        low, high = scenario.get_draw_ranges()
+        low, high = scenario.get_draw_ranges(world)
         angles = scenario.trace  # as `steering.interpolate_trace` reads them
         trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
         packed = np.array(_list_numbers(params) + trace, np.float64)
@@ -342,23 +408,30 @@ class EnvConfig:
             if name in options:
                 number = check_number(f"reset option {name}", options[name])
                 scenario = scenario.replace(**{name: number})
-        motion = _parse_initial_motion(options.get("state", {}), scenario)
+        motion = _parse_initial_motion(options.get("state", {}), scenario, vehicle, self.world)
         return self._make_episode(scenario, vehicle, motion)
 
 
-def _parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:
+def _parse_initial_motion(
+    state: Mapping[str, Any], scenario: Scenario, vehicle: Vehicle, world: World
+) -> Array:
     """Parse a start `Motion` (len(Motion),) from a mapping, NaN where it has no value."""
     remaining = dict(check_mapping("reset option state", state))
     start = np.full(len(Motion._fields), np.nan)
+    relaxation = scenario.vehicle.get("relaxation", vehicle.relaxation)
+    is_relaxing = (world.tyres or scenario.tyres) == "magic-formula" and relaxation > 0.0
     for i, name in enumerate(Motion._fields):
         value = remaining.pop(name, None)
         if value is not None and not (is_finite(value) and abs(value) <= 1e6):
             got = short_repr(value)
             raise ValueError(f"reset option state: {name} is {got}, not a number up to 1e6")
         start[i] = np.nan if value is None else value
-        if name.startswith("phi") and value and not scenario.roll:
-            reason = f"but scenario {scenario.name!r} has no roll"
-            raise ValueError(f"reset option state: {name} is {value!r}, {reason}")
+        for prefix, holds, lack in (
+            ("phi", scenario.roll, "no roll"), ("slip", is_relaxing, "no tyres that relax"),
+        ):  # fmt: skip
+            if name.startswith(prefix) and value and not holds:
+                reason = f"but scenario {scenario.name!r} has {lack}"
+                raise ValueError(f"reset option state: {name} is {value!r}, {reason}")
     if remaining:
         known = ", ".join(Motion._fields)
         raise ValueError(f"unknown state {join_names(map(str, remaining))}; known: {known}")

@@ -7,17 +7,17 @@
 from typing import Annotated, Any, NamedTuple
 
 from ..numerics.packed import make_offsets
-from ..numerics.primitives import Scalar, Vector
+from ..numerics.primitives import Matrix, Scalar, Vector
 from ..record import PACKET_WIDTH
 from ..scenarios.driver import DriverParams, SpeedProfile, Wind
 from ..scenarios.road import NominalMotion, TrackPath
 from ..scenarios.steering import STEERING_WIDTH
 from ..sensors.camera import FieldOfView
-from ..sensors.gps import SatelliteGeometry
+from ..sensors.errors import ErrorState, SensorErrors
 from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link
-from ..sensors.slow import SLOW, VALUES
-from ..task import ReferenceParams
+from ..sensors.slow import SLOW, VALUES, SatelliteGeometry
+from ..task import RATE_TICKS, ReferenceParams
 from ..vehicle.actuators import Lag
 from ..vehicle.dynamics import CarParams, Motion, RoadParams
 from ..vehicle.linear import Bicycle
@@ -43,6 +43,9 @@ class TaskParams(NamedTuple):
     authority: Scalar  # rad, added steering of an action of 1
     slew: Scalar  # rad per tick, rate limit of the added steering
     stop: Scalar  # rad, limit of the whole front steering angle
+    torque_slew: Scalar  # N m a tick, rate limit of a motor's command; 0: none; drawn
+    lead_in: Scalar  # ticks before the manoeuvre, in which nothing acts and nothing is judged
+    moment_rate: Scalar  # s2, weight of the yaw moment's rate in the cost
 
 
 class TyreChange(NamedTuple):
@@ -51,6 +54,14 @@ class TyreChange(NamedTuple):
     tick: Scalar  # at whose start they change
     front: Scalar  # factor on the front cornering stiffness
     rear: Scalar  # factor on the rear cornering stiffness
+
+
+class FrictionWave(NamedTuple):
+    """Friction that varies along the road about the drawn one."""
+
+    share: Scalar  # amplitude over friction; drawn, as are the others
+    rate: Scalar  # rad/m
+    phase: Scalar  # rad
 
 
 class ActuatorState(NamedTuple):
@@ -64,6 +75,8 @@ class ActuatorState(NamedTuple):
     N_d: Scalar  # N m, yaw moment
     slewing: Scalar  # rad, the command of added steering within its rate limit
     added: Scalar  # rad, the added steering that acts
+    command_l: Scalar  # N m, command of the left motor within its rate limit
+    command_r: Scalar  # N m, of the right motor
 
 
 class Clock(NamedTuple):
@@ -92,7 +105,7 @@ SLOW_STATE, SLOW_WIDTH = make_offsets(_SlowSensorState)
 
 
 class EpisodeParams(NamedTuple):
-    """Parameters, constant within an episode. New parts go at the end."""
+    """Parameters, constant within an episode: those of ticks, of errors, of slow sensors."""
 
     car: CarParams
     road: RoadParams
@@ -101,17 +114,19 @@ class EpisodeParams(NamedTuple):
     wind: Wind
     speed_profile: SpeedProfile
     noise: Noise
-    slow: Annotated[tuple[Link, ...], len(SLOW)]
     target: ReferenceParams
     disturbance: Disturbance
     task: TaskParams
     steering_profile: Annotated[tuple[Scalar, ...], STEERING_WIDTH]
-    sky: SatelliteGeometry  # of the GPS
     driver: DriverParams
     path: TrackPath
     tyre_change: TyreChange
-    field_of_view: FieldOfView  # of the camera
     nominal_car: Bicycle  # nominal, which lays the road
+    errors: SensorErrors  # drawn; ideal worlds have no use for it
+    friction_wave: FrictionWave  # likewise
+    slow: Annotated[tuple[Link, ...], len(SLOW)]
+    sky: SatelliteGeometry  # of the GPS
+    field_of_view: FieldOfView  # of the camera
 
 
 class _EpisodeState(NamedTuple):
@@ -122,6 +137,9 @@ class _EpisodeState(NamedTuple):
     clock: Clock
     refs: Annotated[tuple[Scalar, ...], 2]  # rad, rad/s, the references of beta and gamma
     nominal_motion: NominalMotion  # the nominal car where it lays the road
+    errors: ErrorState  # of the fast sensors; with what follows, of a world that is not ideal
+    # yaw moment as a fraction of full scale, of the last ticks, the oldest first
+    past_efforts: Annotated[tuple[Scalar, ...], RATE_TICKS]
     slow: Annotated[tuple[_SlowSensorState, ...], len(SLOW)]
     # packets, columns as in `Packet`
     queue: Annotated[Vector, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH]
@@ -145,6 +163,46 @@ class Switches(NamedTuple):
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
     road: int  # place in `scenarios.road.ROADS`
+    has_errors: int  # 1: a `World` that is not ideal
 
 
 FLAGS, _ = make_offsets(Switches)
+
+
+class StepVariant(NamedTuple):
+    """Integers that choose a tick's code, the same for all cars computed together."""
+
+    small_angle: int  # 1: the small-angle plant
+    law: int  # place in `TYRE_LAWS`
+    reference: int  # place in `REFERENCES`
+    roll: int  # 1: the body rolls
+    has_driver: int  # the driver reacts to the car
+    lag: int  # how many of motors and steering lag
+    has_load_shift: int  # 1 where the lateral acceleration shifts load between the wheels
+    road: int  # place in `scenarios.road.ROADS`
+    has_errors: int  # 1: a `World` that is not ideal
+
+
+class EpisodeArrays(NamedTuple):
+    """One episode's arrays."""
+
+    # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
+    p: Vector
+    z: Vector  # (STATE_WIDTH,), packed as in `_EpisodeState`
+    switches: Vector  # (len(Switches),) int64
+    obs: Vector  # (k,) float32
+    rows: Matrix  # (n, FAST_WIDTH), the fast rows of the newest record
+    packets: Matrix  # (max, PACKET_WIDTH), its packets
+    report: Vector  # (len(Report),)
+    bounds: Matrix  # (2, k), of the observation
+    window: Matrix  # (WINDOW_HEIGHT, columns), the step's ticks
+
+
+class EpisodeStart(NamedTuple):
+    """The packed start of an episode; of several, arrays have an axis more, the first."""
+
+    params: Vector  # as in `EpisodeArrays`, but for the draws
+    low: Vector  # (len(Draws),), the ranges that it draws from
+    high: Vector
+    switches: Vector
+    motion: Vector  # (len(Motion),), NaN: standing on the road at the drawn speed

@@ -5,17 +5,17 @@ those under way lie in the state.
 """
 
 from ..numerics.functions import clip
-from ..numerics.jit import jit
-from ..numerics.packed import load_element, read, store_element
-from ..numerics.primitives import Matrix, Scalar, Vector, minimum, select, to_word
+from ..numerics.jit import copy_into, jit, noinline
+from ..numerics.packed import load_element, read, store_element, write
+from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select, to_word
 from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
-from ..task import AGE_CAP, N_SAMPLED, REPORT
+from ..task import AGE_CAP, N_SAMPLED, REPORT, ReferenceParams, compute_reference
 from ..ticks import NEVER, TICK
 from ..vehicle.dynamics import Motion
-from .layout import FLAGS, P, Z
-from .workspace import EpisodeArrays
+from .layout import FLAGS, EpisodeArrays, P, Z
+from .window import WINDOW
 
 NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
@@ -52,10 +52,11 @@ def _send_frame(
     column = Z.slow[sensor]
     frame = z[column.frames]
     first, second = compute_arrivals(link, frame, tick, key[0], key[1], BLOCKS[sensor].link)
+    stamp = tick + link.stamp  # nothing arrives before it
     if first != NEVER:
-        _push_packet(z, sensor, tick, first, quality, frame, values)
+        _push_packet(z, sensor, stamp, maximum(first, stamp), quality, frame, values)
     if second != NEVER:
-        _push_packet(z, sensor, tick, second, quality, frame, values)
+        _push_packet(z, sensor, stamp, maximum(second, stamp), quality, frame, values)
     z[column.frames] = frame + 1.0
     z[column.next_capture] = tick + link.period
 
@@ -124,25 +125,15 @@ def make_measurement_context(
         The inputs.
     """
     road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
-    sky, field_of_view = read(p, P.sky), read(p, P.field_of_view)
+    sky, field_of_view, errors = read(p, P.sky), read(p, P.field_of_view), read(p, P.errors)
     return MeasurementContext(
-        motion, road, car, noise, sky, field_of_view, small_angle, key[0], key[1], tick
+        motion, road, car, noise, sky, field_of_view, errors, small_angle, key[0], key[1], tick
     )
 
 
 @jit
-def sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count: int) -> int:
-    """Sample the slow sensors at a tick and deliver due packets.
-
-    Args:
-        row: Arrays of the episode.
-        motion: Motion of the car.
-        tick: Tick of the samples.
-        count: Number of packets of the step that were delivered before.
-
-    Returns:
-        The number that is delivered now.
-    """
+def _sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count: int) -> int:
+    """Sample the slow sensors at a tick and deliver due packets; return the step's new count."""
     p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
     key = (to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high]))
     for sensor in range(len(Z.slow)):
@@ -158,7 +149,7 @@ def sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count:
 
 
 @jit
-def observe(row: EpisodeArrays, n: int, count: int, refs: Vector, bounds: Matrix) -> None:
+def observe(row: EpisodeArrays, n: int, count: int, refs: Vector) -> None:
     """Write the float32 observation, clipped at its bounds.
 
     Args:
@@ -166,30 +157,23 @@ def observe(row: EpisodeArrays, n: int, count: int, refs: Vector, bounds: Matrix
         n: Number of fast rows.
         count: Number of packets.
         refs: (beta_ref, gamma_ref) (rad, rad/s).
-        bounds: Bounds of the observation, shape (2, k).
     """
-    k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
-    observe_slow(row, k, count, bounds)
+    _observe_slow(row, observe_fast(row, n, refs), count)
 
 
 @jit
-def observe_fast(
-    rows: Matrix, n: int, refs: Vector, bounds: Matrix, switches: Vector, obs: Vector
-) -> int:
+def observe_fast(row: EpisodeArrays, n: int, refs: Vector) -> int:
     """Write the observation's first entries, of fast rows, and its last two, the references.
 
     Args:
-        rows: Fast rows; of a block rows and obs have an axis more.
+        row: Arrays of the episode, or of a block.
         n: Number of fast rows.
         refs: (beta_ref, gamma_ref) (rad, rad/s).
-        bounds: Bounds of the observation, shape (2, k).
-        switches: `Switches` of the episode.
-        obs: Output for the observation, shape (k,).
 
     Returns:
         Number of first entries.
     """
-    k = 0
+    rows, bounds, switches, obs, k = row.rows, row.bounds, row.switches, row.obs, 0
     for column in range(N_SAMPLED):
         if switches[FLAGS.all_samples]:
             for j in range(n):
@@ -221,16 +205,9 @@ def _store_clipped(obs: Vector, value: Scalar, bounds: Matrix, k: int) -> None:
 
 
 @jit
-def observe_slow(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> None:
-    """Write the observation's entries of the slow sensors.
-
-    Args:
-        row: Arrays of the episode.
-        k: The first of the entries.
-        count: Number of packets.
-        bounds: Bounds of the observation, shape (2, k).
-    """
-    p, z, obs, packets = row.p, row.z, row.obs, row.packets
+def _observe_slow(row: EpisodeArrays, k: int, count: int) -> None:
+    """Write the observation's entries of the slow sensors, from entry k on."""
+    p, z, obs, packets, bounds = row.p, row.z, row.obs, row.packets, row.bounds
     tick = z[Z.clock.tick]
     for sensor in range(len(Z.slow)):
         newest = Z.slow[sensor]
@@ -251,14 +228,139 @@ def observe_slow(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> None
 
 
 @jit
-def write_report(report: Vector, z: Vector) -> None:
-    """Write time, yaw rate, heading and failure of the state into the report.
-
-    Args:
-        report: The report, shape (len(StepReport),).
-        z: Packed state, shape (STATE_WIDTH,).
-    """
+def _write_report(report: Vector, z: Vector) -> None:
+    """Write time, yaw rate, heading and failure of the state into the report."""
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]
     report[REPORT.psi] = z[Z.motion.psi]
     report[REPORT.failure] = z[Z.clock.failure]
+
+
+@jit
+def finish_step(row: EpisodeArrays, n: int, done: int) -> None:
+    """Do slow sensors, observation and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        n: Ticks of a control period.
+        done: Ticks integrated in the step.
+    """
+    finish_slow_sensors(row, done, _observe_step(row, n, done))
+
+
+@noinline
+def finish_slow_sensors(row: EpisodeArrays, done: int, k: int) -> None:
+    """Do slow sensors and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        done: Ticks integrated in the step.
+        k: Index of the slow sensors' first entry in the observation.
+    """
+    _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done))
+
+
+@jit
+def _find_next_due(z: Vector, tick: Scalar) -> Scalar:
+    """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
+    due = maximum(z[Z.clock.next_due], tick + 1.0)
+    for sensor in range(len(Z.slow)):
+        capture = z[Z.slow[sensor].next_capture]
+        due = select(capture > tick, minimum(due, capture), due)
+    return due
+
+
+@jit
+def sample_slow_ticks(row: EpisodeArrays, first: int, last: int, count: int, done: int) -> int:
+    """Sample the slow sensors at the ticks of a step's rows first to last - 1.
+
+    Args:
+        row: Arrays of the episode.
+        first: First of the rows; row 0 is the step's first tick.
+        last: The row behind the last one.
+        count: Number of packets of the step that were delivered before.
+        done: Ticks integrated in the step.
+
+    Returns:
+        Number of packets of the step that are delivered by then.
+    """
+    z = row.z
+    start_tick = z[Z.clock.tick] - done
+    tick = _find_next_due(z, start_tick + first)
+    while tick <= start_tick + last:
+        j = int(tick - start_tick) - 1
+        count = _sample_slow_sensors(row, read(row.window, WINDOW.track, j), tick, count)
+        tick = _find_next_due(z, tick)
+    return count
+
+
+@jit
+def _observe_step(row: EpisodeArrays, n: int, done: int) -> int:
+    """Write the observation but for the slow sensors, whose first entry's index is returned."""
+    report, rows = row.report, row.rows
+    refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
+    n_rows = done
+    if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
+        for j in range(done, n):
+            copy_into(rows[done - 1], rows[j])
+        n_rows = n
+    return int(observe_fast(row, n_rows, refs))
+
+
+@jit
+def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int) -> None:
+    """Write observation and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        n: Ticks of a control period.
+        done: Ticks integrated in the step.
+        count: Number of packets.
+    """
+    _finish_report(row, _observe_step(row, n, done), count)
+
+
+@jit
+def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
+    """Write the report, and the observation of the slow sensors from entry k on."""
+    report = row.report
+    _observe_slow(row, k, count)
+    _write_report(report, row.z)
+    report[REPORT.reward] = -report[REPORT.cost]
+    report[REPORT.packets] = count
+
+
+@jit
+def finish_reset(
+    row: EpisodeArrays, motion: Motion, beta: Scalar, steer: Scalar, target: ReferenceParams
+) -> None:
+    """Do slow sensors, references, observation and report of tick 0.
+
+    Args:
+        row: Arrays of the episode, whose first fast row is written.
+        motion: Motion of the car.
+        beta: Sideslip angle (rad).
+        steer: Steering angle (rad).
+        target: Coefficients of the references.
+    """
+    z, rows, switches, report = row.z, row.rows, row.switches, row.report
+    count = _sample_slow_sensors(row, motion, 0.0, 0)
+    v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
+    command = rows[0, FAST.steer_command]
+    refs = compute_reference(command, v, target, switches[FLAGS.reference])
+    write(z, refs, Z.refs)
+    n_rows = 1
+    if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
+        for j in range(1, len(rows)):
+            copy_into(rows[0], rows[j])
+        n_rows = len(rows)
+    observe(row, n_rows, count, refs)
+    _write_report(report, z)
+    report[REPORT.beta] = beta
+    report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
+    report[REPORT.steer] = steer
+    report[REPORT.yaw_moment] = 0.0
+    report[REPORT.cost] = 0.0
+    report[REPORT.reward] = 0.0
+    report[REPORT.packets] = count
+    report[REPORT.ended] = 0.0

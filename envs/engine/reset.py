@@ -1,38 +1,41 @@
 """Reset of an episode: its draws from a key, and tick 0; compiled."""
 
-from ..numerics.functions import CHANNELS, draw_normals, sincos
+from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import Matrix, Scalar, Vector, from_word, select
+from ..numerics.primitives import Scalar, Vector, from_word, maximum, select
 from ..record import FAST
-from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_stable
+from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
 from ..scenarios.driver import compute_target_angle
-from ..scenarios.road import transform_path
-from ..scenarios.steering import DRIVER, WANDER, write_steering
-from ..sensors.inertial import Noise, NormalDraws, compute_fast_row
+from ..scenarios.road import add_weave, transform_path
+from ..scenarios.steering import DRIVER, WANDER, write_gentle_steering, write_steering
+from ..sensors.errors import ErrorState, SensorErrors, apply_sensor_errors
+from ..sensors.inertial import NormalDraws, compute_fast_row
 from ..sensors.link import draw_clock_phase
 from ..sensors.slow import GPS, draw_first_drift
-from ..task import REPORT, compute_reference
-from ..ticks import FOREVER, NEVER, round_to_ticks
+from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
 from ..vehicle.dynamics import (
     Motion,
-    RoadParams,
     compute_car_curvature,
     compute_gravity,
     compute_sideslip_angle,
 )
 from ..vehicle.parameters import GRAVITY
-from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .outputs import NEVER_DUE, observe, sample_slow_sensors, write_report
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z
+from .outputs import NEVER_DUE, finish_reset
+from .step import make_step_params, make_step_variant
+from .tick import StepParams
 from .window import compute_profile_angle
-from .workspace import EpisodeArrays, EpisodeStart
+
+_GUST_ARM = 0.2  # m ahead of the centre of gravity, as of tie-vision's wind
+_LEAD_ACCELERATION = 0.5  # m/s2
 
 
 @jit
 def _write_surroundings(p: Vector, d: Draws, s: Scalar, v_x: Scalar) -> None:
     """Write drawn friction, wind, road and path, for a start at s (m) with v_x (m/s)."""
-    mirrored = d.side < 0.5
-    right = select(d.friction_right > 0.0, d.friction_right, d.friction)
+    mirrored, lead_in = d.side < 0.5, p[P.task.lead_in] * TICK
+    right = select(d.friction_right > 0.0, d.friction_right, d.friction) * d.friction_across
     p[P.car.mu] = select(mirrored, right, d.friction)
     p[P.car.mu_r] = select(mirrored, d.friction, right)
     p[P.wind.force] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
@@ -42,9 +45,12 @@ def _write_surroundings(p: Vector, d: Draws, s: Scalar, v_x: Scalar) -> None:
     p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
     bank_gravity = GRAVITY * sincos(d.bank)[0]
     p[P.road.lateral] = select(mirrored, 0.0 - bank_gravity, bank_gravity)
+    p[P.road.start] = p[P.road.start] + lead_in * v_x
     scaled = d.path_speed > 0.0  # the path begins where the car is at the onset
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
     path = transform_path(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
+    if lead_in > 0.0:
+        path = add_weave(path, s, v_x, lead_in)
     write(p, path, P.path)
 
 
@@ -58,6 +64,43 @@ def _write_sensors(p: Vector, d: Draws, low: Vector, high: Vector) -> None:
     for i in (link.delay_0, link.delay_1, link.delay_2, link.delay_3):
         p[i] = p[i] + extra_latency
     p[link.jitter] = p[link.jitter] - (round_to_ticks(high[DRAWS.gps_latency]) - min_latency)
+
+
+@jit
+def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
+    """Write what a `World` draws besides the car, and the state of the sensors' errors."""
+    turn = 2.0 * PI * d.phase  # of all waves: small multiples of it hardly depend on each other
+    lag = select(d.map_lag > 0.0, d.map_lag, 1.0)
+    map_rest = select(d.map_lag > 0.0, exp(maximum(0.0 - TICK / lag, -7.5)), 0.0)
+    errors = SensorErrors(
+        d.camera_yaw, d.camera_pitch, d.camera_height, d.steer_offset, d.steer_scale,
+        d.wheel_scale * d.wheel_left, d.wheel_scale, d.gyro_scale,
+        d.gyro_drift * TICK, d.accel_scale, d.accel_ahead, d.vibration,
+        d.course_error, 2.0 * PI * TICK / d.course_period, turn, d.map_error,
+        2.0 * PI / d.map_length, 2.0 * turn, map_rest,
+    )  # fmt: skip
+    write(p, errors, P.errors)
+    write(p, (d.friction_wave, 2.0 * PI / d.friction_length, 3.0 * turn), P.friction_wave)
+    p[P.road.wave], p[P.road.wave_rate] = GRAVITY * sincos(d.bank_wave)[0], 2.0 * PI / d.bank_length
+    p[P.road.wave_phase] = 5.0 * turn
+    p[P.task.torque_slew] = d.torque_rate * p[P.car.T_max] * TICK
+    p[P.car.relaxation] = p[P.car.relaxation] * d.relaxation
+    p[P.car.k_l], p[P.car.k_r] = d.torque_scale * d.torque_left, d.torque_scale
+    gust = d.gust * p[P.car.m]
+    p[P.disturbance.force] = p[P.disturbance.force] + gust
+    p[P.disturbance.moment] = p[P.disturbance.moment] + _GUST_ARM * gust
+    p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + GRAVITY * sincos(d.accel_roll)[0]
+    p[P.slow[GPS].stamp] = round_to_ticks(d.gps_stamp)
+    z[Z.errors.curvature] = compute_car_curvature(read(z, Z.motion), read(p, P.road))
+
+
+@jit
+def _write_gentle_steering(p: Vector, speed: Scalar) -> None:
+    """Write the gentle steering before the manoeuvre, of about `_LEAD_ACCELERATION` a sine."""
+    target, v = read(p, P.target), maximum(speed, 1.0)
+    gain = maximum(1.0 + target.G * v * v, 0.2) / (target.per_l * v * v)  # dakf-stability (23)
+    profile = p[P.steering_profile[0] :]
+    write_gentle_steering(p[P.task.lead_in], _LEAD_ACCELERATION * gain, profile)
 
 
 @jit
@@ -76,52 +119,61 @@ def _write_motion(z: Vector, d: Draws, start: Vector, small_angle: int) -> None:
 
 @jit
 def compute_first_row(
-    motion: Motion, steer: Scalar, road: RoadParams, d_f: Scalar, noise: Noise, draws: NormalDraws,
-    small_angle: int,
+    motion: Motion, steer: Scalar, params: StepParams, draws: NormalDraws, errors: ErrorState,
+    variant: StepVariant,
 ) -> Vector:  # fmt: skip
     """Compute the fast sensors at tick 0, when only the steering has acted.
 
     Args:
         motion: Motion of the car.
         steer: Steering angle (rad).
-        road: Curvature, bank and grade of the road.
-        d_f: Front track (m).
-        noise: Noise of the sensors.
+        params: Parameters of a step.
         draws: Random numbers of the tick.
-        small_angle: 1 for the small-angle plant.
+        errors: State of the sensors' errors.
+        variant: Variant of the ticks.
 
     Returns:
         The fast row, FAST_WIDTH numbers.
     """
+    road = params.road
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))
-    g_x, g_y = compute_gravity(motion, road, small_angle)
-    return compute_fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), applied, d_f, noise, draws)
+    g_x, g_y = compute_gravity(motion, road, variant.small_angle)
+    accel = (g_x, g_y + GRAVITY * motion.phi)
+    row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
+    if variant.has_errors:
+        row = apply_sensor_errors(row, motion, accel, errors, params.errors)
+    return row
 
 
 @noinline
-def reset_vehicle(
-    start: EpisodeStart, key_low: int, key_high: int, bounds: Matrix, row: EpisodeArrays
-) -> None:
+def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: EpisodeArrays) -> None:
     """Draw the episode from a key and deliver tick 0.
 
     Args:
         start: Packed start of the episode.
         key_low: Lower 32 bits of the key.
         key_high: Upper 32 bits.
-        bounds: Bounds of the observation, shape (2, k).
         row: Arrays of the episode, which are written.
     """
-    p, z, rows, report = row.p, row.z, row.rows, row.report
+    p, z = row.p, row.z
     copy_into(start.params, p)
     copy_into(start.switches, row.switches)
     switches = row.switches
     scratch = z[:DRAWS_WIDTH]  # until the state is written
     d, redraws = draw_stable(start.low, start.high, key_low, key_high, read(p, P.car), scratch)
-    p[P.car.C_f] = p[P.car.C_f] * d.front_stiffness
-    p[P.car.C_r] = p[P.car.C_r] * d.rear_stiffness
+    lead_in = p[P.task.lead_in] * TICK
+    if lead_in > 0.0:  # what has a time comes later
+        scratch[DRAWS.onset] = d.onset + lead_in
+        scratch[DRAWS.wind_start] = d.wind_start + lead_in
+        changes = d.tyre_change_time > 0.0
+        scratch[DRAWS.tyre_change_time] = d.tyre_change_time + select(changes, lead_in, 0.0)
+        d = read(scratch, DRAWS)
+    write(p, draw_car(d, read(p, P.car)), P.car)
     change_tick = select(d.tyre_change_time > 0.0, round_to_ticks(d.tyre_change_time), FOREVER)
     write(p, (change_tick, d.front_change, d.rear_change), P.tyre_change)
     write_steering(switches[FLAGS.steering], d, p[P.steering_profile[0] :])
+    if lead_in > 0.0:
+        _write_gentle_steering(p, d.speed)
     if d.side < 0.5:
         for i in range(PARAMS_WIDTH + 1, len(p)):  # a trace
             p[i] = 0.0 - p[i]
@@ -133,6 +185,7 @@ def reset_vehicle(
     _write_sensors(p, d, start.low, start.high)
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
+    _write_errors(p, z, d)
     n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
     road, target = read(p, P.road), read(p, P.target)
     steer = compute_profile_angle(p, 0.0)
@@ -156,25 +209,9 @@ def reset_vehicle(
     beta = compute_sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = draw_normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = draw_normals(key_low, key_high, 0, CHANNELS.wheels)
-    draws, noise = NormalDraws(fast, wheels), read(p, P.noise)
-    row_0 = compute_first_row(motion, steer, road, p[P.car.d_f], noise, draws, small_angle)
-    write(rows[0], row_0, FAST)
-    count = sample_slow_sensors(row, motion, 0.0, 0)
-    v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    refs = compute_reference(steer, v, target, switches[FLAGS.reference])
-    write(z, refs, Z.refs)
-    n_rows = 1
-    if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
-        for j in range(1, len(rows)):
-            copy_into(rows[0], rows[j])
-        n_rows = len(rows)
-    observe(row, n_rows, count, refs, bounds)
-    write_report(report, z)
-    report[REPORT.beta] = beta
-    report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
-    report[REPORT.steer] = steer
-    report[REPORT.yaw_moment] = 0.0
-    report[REPORT.cost] = 0.0
-    report[REPORT.reward] = 0.0
-    report[REPORT.packets] = count
-    report[REPORT.ended] = 0.0
+    vibration = draw_normals(key_low, key_high, 0, CHANNELS.errors)[0]
+    z[Z.errors.vibration] = p[P.errors.vibration] * vibration
+    draws, variant = NormalDraws(fast, wheels, vibration), make_step_variant(p, switches)
+    row_0 = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
+    write(row.rows[0], row_0, FAST)
+    finish_reset(row, motion, beta, steer, target)

@@ -6,14 +6,17 @@ k+1 to k+n; a reset returns tick 0 alone. `precompute_window` writes what does n
 car, `integrate_step` moves the car, `finish_step` does slow sensors, observation and report.
 """
 
+from typing import NamedTuple
+
 from ..numerics.functions import clip
-from ..numerics.jit import copy_into, inline, jit, noinline
+from ..numerics.jit import inline, jit, noinline
 from ..numerics.packed import load_element, read, store_element, write
-from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
+from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task import (
     BAD_ACTION,
+    RATE_TICKS,
     REFUSED,
     REPORT,
     RUNNING,
@@ -23,19 +26,32 @@ from ..task import (
     select_failure,
 )
 from ..vehicle.tyres import has_load_shift
-from .layout import FLAGS, P, Z
-from .outputs import observe_fast, observe_slow, sample_slow_sensors, write_report
+from .layout import FLAGS, EpisodeArrays, EpisodeStart, P, StepVariant, Z
+from .outputs import finish_step
 from .tick import (
     Measurements,
     StepParams,
     StepState,
-    StepVariant,
+    TickInputs,
     apply_tyre_change,
     compute_static_load,
     integrate_tick,
 )
 from .window import TICK_COST, WINDOW, evaluate_cost, precompute_window, read_draws
-from .workspace import EpisodeArrays, EpisodeStart, split_workspace
+from .workspace import split_workspace
+
+SHARES = (0, 1)
+"""Places of an action's numbers: yaw moment, added steering."""
+
+
+class StepEnd(NamedTuple):
+    """The end of an env-step."""
+
+    failure: Scalar  # code
+    beta: Scalar  # rad
+    refs: Vector  # rad, rad/s, the references of beta and gamma
+    tick: Scalar
+    cost: Scalar  # of the step
 
 
 @jit
@@ -54,6 +70,7 @@ def make_step_params(p: Vector) -> StepParams:
         target=read(p, P.target), disturbance=read(p, P.disturbance), task=read(p, P.task),
         noise=read(p, P.noise), driver=read(p, P.driver), path=read(p, P.path),
         tyre_change=read(p, P.tyre_change), nominal_car=read(p, P.nominal_car),
+        errors=read(p, P.errors), friction_wave=read(p, P.friction_wave),
     )  # fmt: skip
 
 
@@ -74,7 +91,7 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
     load_shift = has_load_shift(flags.small_angle, flags.law, flags.roll)
     return StepVariant(
         flags.small_angle, flags.law, flags.reference, flags.roll, has_driver, n_lagging,
-        load_shift, flags.road,
+        load_shift, flags.road, flags.has_errors,
     )  # fmt: skip
 
 
@@ -91,45 +108,59 @@ def get_start_variant(start: EpisodeStart) -> StepVariant:
 
 
 @jit
+def _read_effort(z: Vector, window: Vector, j: int) -> Scalar:
+    """Read the yaw moment's share `RATE_TICKS` before tick j of the step."""
+    if j < RATE_TICKS:
+        return load_element(z, Z.past_efforts[0] + j)
+    return load_element(window, WINDOW.cost_inputs.effort, j - RATE_TICKS)
+
+
+@jit
+def _store_efforts(z: Vector, window: Vector, done: int) -> None:
+    """Store the yaw moment's share of the last `RATE_TICKS` ticks, `done` of them of this step."""
+    for i in range(RATE_TICKS):
+        effort = _read_effort(z, window, done + i)
+        store_element(z, effort, Z.past_efforts[0] + i)
+
+
+@jit
 def integrate_step(
-    p: Vector, z: Vector, variant: StepVariant, yaw_share: Scalar, steer_share: Scalar, n: int,
-    rows: Matrix, report: Vector, window: Vector, is_single: bool,
-) -> int:  # fmt: skip
+    row: EpisodeArrays, variant: StepVariant, shares: Vector, n: int, is_single: bool
+) -> int:
     """Integrate plant and fast sensors over n ticks, fewer where the episode ends.
 
     Args:
-        p: Packed parameters; of a block of vehicles p, z and report have a column for each.
-        z: Packed state, shape (STATE_WIDTH,).
+        row: Arrays of the episode, or of a block of vehicles, where they have one axis more.
         variant: Variant of the ticks.
-        yaw_share: Yaw moment as a fraction of full scale, within +-1.
-        steer_share: Added steering as a fraction of full scale, within +-1.
+        shares: (yaw moment, added steering) as fractions of full scale, within +-1.
         n: Number of ticks.
-        rows: Fast rows to write, shape (n, FAST_WIDTH); a block's have an axis more, as its window.
-        report: Report to write, shape (len(REPORT),).
-        window: Noise and steering of the ticks, shape (WINDOW_HEIGHT, columns).
         is_single: Whether it is one vehicle.
 
     Returns:
         Number of ticks integrated; 0 where one of a block ends early, z and report then unchanged.
     """
-    params = make_step_params(p)
+    z, rows, window = row.z, row.rows, row.window
+    params = make_step_params(row.p)
     task = params.task
-    N_z, added = yaw_share * task.yaw_scale, steer_share * task.authority
+    first_tick = load_element(z, Z.clock.tick)
+    acts = first_tick >= task.lead_in
+    N_z = select(acts, shares[0] * task.yaw_scale, 0.0)
+    added = select(acts, shares[1] * task.authority, 0.0)
     n_run = n
     while True:
-        motion, drive, tick = read(z, Z.motion), read(z, Z.drive), load_element(z, Z.clock.tick)
+        motion, drive, tick = read(z, Z.motion), read(z, Z.drive), first_tick
         car = apply_tyre_change(params.car, params.tyre_change, tick > params.tyre_change.tick)
         tyre_load = compute_static_load(drive, car, variant)
         refs, nominal_motion = read(z, Z.refs), read(z, Z.nominal_motion)
         state = StepState(
-            motion, drive, tyre_load, load_element(z, Z.driver), car, refs, nominal_motion
-        )
+            motion, drive, tyre_load, load_element(z, Z.driver), car, refs, nominal_motion,
+            read(z, Z.errors),
+        )  # fmt: skip
         for j in range(n_run):
             motion_before = state.motion
             draws, next_steer = read_draws(window, j), load_element(window, WINDOW.steer, j)
-            state, measured = integrate_tick(
-                params, N_z, added, state, tick, draws, next_steer, variant
-            )
+            inputs = TickInputs(N_z, added, draws, next_steer, _read_effort(z, window, j))
+            state, measured = integrate_tick(params, inputs, state, tick, variant)
             tick = tick + 1.0
             write(rows[j], measured.row, FAST)
             write(window, state.motion, WINDOW.track, j)
@@ -148,149 +179,44 @@ def integrate_step(
                     motion, beta, refs = motion_before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
                 write(z, motion, Z.motion)
                 failure = select_failure(measured.lost, tick_cost.spun != 0.0, tick_cost.off != 0.0)
-                write_final_state(
-                    z, report, state, measured, failure, beta, refs, tick, cost, task.duration
-                )
+                cost = select(acts, cost, 0.0)
+                end = StepEnd(failure, beta, refs, tick, cost)
+                if variant.has_errors:
+                    _store_efforts(z, window, j + 1)
+                write_final_state(row, state, measured, end, task.duration)
                 return j + 1
 
 
 @inline
 def write_final_state(
-    z: Vector, report: Vector, state: StepState, measured: Measurements, failure: Scalar,
-    beta: Scalar, refs: Vector, tick: Scalar, cost: Scalar, duration: Scalar,
-) -> None:  # fmt: skip
+    row: EpisodeArrays, state: StepState, measured: Measurements, end: StepEnd, duration: Scalar
+) -> None:
     """Write the end of an env-step, but for the motion.
 
     Args:
-        z: Packed state to write.
-        report: Report to write.
+        row: Arrays of the episode, or of a block.
         state: State at the end.
         measured: Measurements at the end.
-        failure: Code of the failure.
-        beta: Sideslip angle (rad).
-        refs: (beta_ref, gamma_ref) (rad, rad/s).
-        tick: Tick of the end.
-        cost: Cost of the step.
+        end: What else is known of the end.
         duration: Length of the episode (ticks).
     """
+    z, report, tick = row.z, row.report, end.tick
     write(z, state.drive, Z.drive)
     store_element(z, state.driver, Z.driver)
-    write(z, refs, Z.refs)
+    write(z, end.refs, Z.refs)
     write(z, state.nominal_motion, Z.nominal_motion)
+    write(z, state.errors, Z.errors)
     store_element(z, tick, Z.clock.tick)
-    store_element(z, failure, Z.clock.failure)
+    store_element(z, end.failure, Z.clock.failure)
     remaining_cost = compute_failure_cost(duration, tick)
-    store_element(report, cost + select(failure != RUNNING, remaining_cost, 0.0), REPORT.cost)
-    store_element(report, beta, REPORT.beta)
-    store_element(report, refs[0], REPORT.beta_ref)
-    store_element(report, refs[1], REPORT.gamma_ref)
+    failure_cost = select(end.failure != RUNNING, remaining_cost, 0.0)
+    store_element(report, end.cost + failure_cost, REPORT.cost)
+    store_element(report, end.beta, REPORT.beta)
+    store_element(report, end.refs[0], REPORT.beta_ref)
+    store_element(report, end.refs[1], REPORT.gamma_ref)
     store_element(report, measured.steer, REPORT.steer)
     store_element(report, measured.moment, REPORT.yaw_moment)
     store_element(report, select(tick >= duration, 1.0, 0.0), REPORT.ended)
-
-
-@jit
-def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix, window: Vector) -> None:
-    """Do slow sensors, observation and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        n: Ticks of a control period.
-        done: Ticks integrated in the step.
-        bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step, shape (WINDOW_HEIGHT, columns).
-    """
-    finish_slow_sensors(row, done, _observe_step(row, n, done, bounds), bounds, window)
-
-
-@noinline
-def finish_slow_sensors(
-    row: EpisodeArrays, done: int, k: int, bounds: Matrix, window: Vector
-) -> None:
-    """Do slow sensors and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        done: Ticks integrated in the step.
-        k: Index of the slow sensors' first entry in the observation.
-        bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step, shape (WINDOW_HEIGHT, columns).
-    """
-    _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
-
-
-@jit
-def _find_next_due(z: Vector, tick: Scalar) -> Scalar:
-    """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
-    due = maximum(z[Z.clock.next_due], tick + 1.0)
-    for sensor in range(len(Z.slow)):
-        capture = z[Z.slow[sensor].next_capture]
-        due = select(capture > tick, minimum(due, capture), due)
-    return due
-
-
-@jit
-def sample_slow_ticks(
-    row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Vector
-) -> int:
-    """Sample the slow sensors at the ticks of a step's rows first to last - 1.
-
-    Args:
-        row: Arrays of the episode.
-        first: First of the rows; row 0 is the step's first tick.
-        last: The row behind the last one.
-        count: Number of packets of the step that were delivered before.
-        done: Ticks integrated in the step.
-        window: Window of the step, shape (WINDOW_HEIGHT, columns).
-
-    Returns:
-        Number of packets of the step that are delivered by then.
-    """
-    z = row.z
-    start_tick = z[Z.clock.tick] - done
-    tick = _find_next_due(z, start_tick + first)
-    while tick <= start_tick + last:
-        j = int(tick - start_tick) - 1
-        count = sample_slow_sensors(row, read(window, WINDOW.track, j), tick, count)
-        tick = _find_next_due(z, tick)
-    return count
-
-
-@jit
-def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix) -> int:
-    """Write the observation but for the slow sensors, whose first entry's index is returned."""
-    report, rows = row.report, row.rows
-    refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
-    n_rows = done
-    if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
-        for j in range(done, n):
-            copy_into(rows[done - 1], rows[j])
-        n_rows = n
-    return int(observe_fast(rows, n_rows, refs, bounds, row.switches, row.obs))
-
-
-@jit
-def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Matrix) -> None:
-    """Write observation and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        n: Ticks of a control period.
-        done: Ticks integrated in the step.
-        count: Number of packets.
-        bounds: Bounds of the observation, shape (2, k).
-    """
-    _finish_report(row, _observe_step(row, n, done, bounds), count, bounds)
-
-
-@jit
-def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> None:
-    """Write the report, and the observation of the slow sensors from entry k on."""
-    report = row.report
-    observe_slow(row, k, count, bounds)
-    write_report(report, row.z)
-    report[REPORT.reward] = -report[REPORT.cost]
-    report[REPORT.packets] = count
 
 
 @jit
@@ -350,29 +276,24 @@ def reject_action(row: EpisodeArrays) -> int:
 
 
 @noinline
-def step_vehicle(row: EpisodeArrays, action: Vector, n: int, bounds: Matrix, window: Matrix) -> int:
+def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
     """Step one vehicle by n ticks, fewer where the episode ends.
 
     Args:
         row: Arrays of the episode.
         action: Fractions of full scale of the yaw moment and, if there are two, the added steering.
         n: Ticks of a control period.
-        bounds: Bounds of the observation, shape (2, k).
-        window: Window of the step, shape (WINDOW_HEIGHT, columns).
 
     Returns:
         Ticks integrated; for an action that is not finite REFUSED, or 0 with `fail_bad`.
     """
-    p, z = row.p, row.z
-    yaw_share, steer_share = clip_action(action)
-    if yaw_share != yaw_share:
+    shares = clip_action(action)
+    if shares[0] != shares[0]:
         return int(reject_action(row))
-    variant = make_step_variant(p, row.switches)
-    precompute_window(p, z, n, variant.has_driver, window)
-    done = integrate_step(
-        p, z, variant, yaw_share, steer_share, n, row.rows, row.report, window, True
-    )
-    finish_step(row, n, done, bounds, window)
+    variant = make_step_variant(row.p, row.switches)
+    precompute_window(row, n, variant)
+    done = integrate_step(row, variant, shares, n, True)
+    finish_step(row, n, done)
     return int(done)
 
 
@@ -387,6 +308,6 @@ def step_workspace(workspace: Vector, action: Vector) -> int:
     Returns:
         As `step_vehicle`, with WILD added for an action beyond its limit.
     """
-    row, bounds, window = split_workspace(workspace)
-    done = int(step_vehicle(row, action, len(row.rows), bounds, window))
+    row = split_workspace(workspace)
+    done = int(step_vehicle(row, action, len(row.rows)))
     return done + check_action_range(action) if done > 0 else done

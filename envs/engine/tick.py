@@ -6,6 +6,7 @@ it serve outside plants too.
 
 from typing import Any, NamedTuple
 
+from ..numerics.functions import sincos
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
@@ -19,6 +20,13 @@ from ..scenarios.driver import (
     compute_wind,
 )
 from ..scenarios.road import NOMINAL_PATH, NominalMotion, TrackPath, step_nominal_car
+from ..sensors.errors import (
+    ErrorState,
+    SensorErrors,
+    advance_errors,
+    apply_sensor_errors,
+    compute_shifted_force,
+)
 from ..sensors.inertial import Noise, NormalDraws, compute_fast_row, compute_specific_force
 from ..task import ReferenceParams, compute_reference, filter_reference
 from ..ticks import TICK
@@ -41,23 +49,10 @@ from ..vehicle.dynamics import (
 )
 from ..vehicle.linear import Bicycle
 from ..vehicle.tyres import TyreInputs, TyreLoad, compute_tyre_load
-from .layout import ActuatorState, Disturbance, TaskParams, TyreChange
+from .layout import ActuatorState, Disturbance, FrictionWave, StepVariant, TaskParams, TyreChange
 from .window import CostInputs
 
 _NO_LAG, _ONE_LAG = range(2)  # 2: both lag
-
-
-class StepVariant(NamedTuple):
-    """Integers that choose a tick's code, the same for all cars computed together."""
-
-    small_angle: int  # 1: the small-angle plant
-    law: int  # place in `TYRE_LAWS`
-    reference: int  # place in `REFERENCES`
-    roll: int  # 1: the body rolls
-    has_driver: int  # the driver reacts to the car
-    lag: int  # how many of motors and steering lag
-    has_load_shift: int  # 1 where the lateral acceleration shifts load between the wheels
-    road: int  # place in `scenarios.road.ROADS`
 
 
 class StepParams(NamedTuple):
@@ -77,6 +72,8 @@ class StepParams(NamedTuple):
     path: TrackPath
     tyre_change: TyreChange
     nominal_car: Bicycle
+    errors: SensorErrors
+    friction_wave: FrictionWave
 
 
 class StepState(NamedTuple):
@@ -89,6 +86,17 @@ class StepState(NamedTuple):
     car: CarParams  # with the present tyres
     refs: Vector  # rad, rad/s, the references of beta and gamma
     nominal_motion: NominalMotion  # the nominal car that lays the road
+    errors: ErrorState
+
+
+class TickInputs(NamedTuple):
+    """Inputs of a tick: commands, and numbers of the window."""
+
+    N_z: Scalar  # N m, commanded yaw moment
+    added: Scalar  # rad, commanded added steering
+    draws: NormalDraws  # of the sensors at its end, and of the disturbance from then on
+    next_steer: Scalar  # rad, the profile's steering at the end, where no driver reacts to the car
+    effort_before: Scalar  # yaw moment `RATE_TICKS` ago as a fraction of full scale
 
 
 class AppliedInputs(NamedTuple):
@@ -103,6 +111,7 @@ class AppliedInputs(NamedTuple):
     added: Scalar  # rad, the part of steer that was added to the driver's
     moment: Scalar  # N m, yaw moment of both motors
     effort: Scalar  # the yaw moment as a fraction of full scale
+    errors: ErrorState  # at the tick's end
 
 
 class _PlantInputs(NamedTuple):
@@ -147,7 +156,7 @@ def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) ->
 
 @inline
 def compute_static_load(drive: ActuatorState, car: CarParams, variant: StepVariant) -> TyreLoad:
-    """Compute the tyres' load at the actuators' present state.
+    """Compute the `TyreLoad` of the actuators' present state; no wheel load at rest is meant.
 
     Args:
         drive: State of the actuators.
@@ -220,8 +229,22 @@ def _apply_due_change(
         car = apply_tyre_change(car, params.tyre_change, is_due)
         start = compute_static_load(state.drive, car, variant)
     return StepState(
-        state.motion, state.drive, start, state.driver, car, state.refs, state.nominal_motion
-    )
+        state.motion, state.drive, start, state.driver, car, state.refs, state.nominal_motion,
+        state.errors,
+    )  # fmt: skip
+
+
+@inline
+def _apply_friction_wave(params: StepParams, state: StepState, variant: StepVariant) -> StepState:
+    """Change the friction under the car to that of its place, held over the tick."""
+    wave, car = params.friction_wave, state.car
+    factor = 1.0 + wave.share * sincos(wave.rate * state.motion.s + wave.phase)[0]
+    left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
+    car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
+    return StepState(
+        state.motion, state.drive, compute_static_load(state.drive, car, variant), state.driver,
+        car, state.refs, state.nominal_motion, state.errors,
+    )  # fmt: skip
 
 
 @inline
@@ -234,51 +257,58 @@ def _follow_nominal_path(
         state.nominal_motion, state.driver, speed, params.nominal_car
     )
     road, turn_part = params.road, (turn_rate,)  # `turn` is the road's field 5, `road` field 1
-    road_part = (RoadParams(*(road[:5] + turn_part)),)
+    road_part = (RoadParams(*(road[:5] + turn_part + road[6:])),)
     return StepParams(*(params[:1] + road_part + params[2:])), nominal_motion
 
 
 @inline
 def compute_inputs(
-    params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
-    draws: NormalDraws,
-) -> _PlantInputs:  # fmt: skip
+    params: StepParams, inputs: TickInputs, state: StepState, tick: Scalar, variant: StepVariant
+) -> _PlantInputs:
     """Compute the plant's inputs during a tick.
 
     Args:
         params: Parameters of the step.
-        N_z: Commanded yaw moment (N m).
-        steer_command: Commanded added steering (rad).
+        inputs: Inputs of the tick.
         state: State at the start.
         tick: Tick at which it starts.
-        draws: Random numbers of the tick's end.
+        variant: Variant of the tick.
 
     Returns:
         The inputs.
     """
     motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
-    drive, driver, car = state.drive, state.driver, state.car
-    slewing = limit_rate(drive.slewing, steer_command, task.slew)
+    drive, driver, car, draws = state.drive, state.driver, state.car, inputs.draws
+    slewing = limit_rate(drive.slewing, inputs.added, task.slew)
     limited_steer = limit_angle(slewing, driver, task.stop)
     steer = driver + limited_steer
+    profile = params.speed_profile
     T_l, T_r, a_x, integral = compute_motor_torques(
-        N_z, tick, state.motion.v_x, drive.integral, params.speed_profile, car, task.yaw_first
+        inputs.N_z, tick, state.motion.v_x, drive.integral, profile, car, task.yaw_first
     )
+    curvature, errors = compute_car_curvature(state.motion, params.road), state.errors
+    if variant.has_errors:
+        limited_l, limited_r = (
+            limit_rate(drive.command_l, T_l, task.torque_slew),
+            limit_rate(drive.command_r, T_r, task.torque_slew),
+        )
+        T_l = select(task.torque_slew > 0.0, limited_l, T_l)
+        T_r = select(task.torque_slew > 0.0, limited_r, T_r)
+        errors = advance_errors(errors, params.errors, curvature, state.motion.s, draws.vibration)
     F_w, N_w, N_x = compute_wind(tick, params.wind)
     left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
     moment = compute_yaw_moment(left, right, car)
     applied = AppliedInputs(
         apply_lag(steer, drive.delta_f, steering.mean), left, right, driver, a_x,
-        compute_car_curvature(state.motion, params.road),
-        apply_lag(limited_steer, drive.added, steering.mean), moment,
-        moment * (1.0 / task.yaw_scale),
+        curvature, apply_lag(limited_steer, drive.added, steering.mean), moment,
+        moment * (1.0 / task.yaw_scale), errors,
     )  # fmt: skip
     next_drive = ActuatorState(
         apply_lag(T_l, drive.T_l, motor.end), apply_lag(T_r, drive.T_r, motor.end),
         apply_lag(steer, drive.delta_f, steering.end), integral,
         ou.decay * drive.F_d + ou.noise_gain * ou.force * draws.wheels[2],
         ou.decay * drive.N_d + ou.noise_gain * ou.moment * draws.wheels[3], slewing,
-        apply_lag(limited_steer, drive.added, steering.end),
+        apply_lag(limited_steer, drive.added, steering.end), T_l, T_r,
     )  # fmt: skip
     return _PlantInputs(
         steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x), applied,
@@ -300,7 +330,7 @@ def _compute_loads(
         )
         middle, end = start, start
     else:  # actuators that lag move continuously: a tick starts where the last one ended
-        if variant.lag == _ONE_LAG:  # the other one jumps
+        if variant.lag == _ONE_LAG:  # the one without lag jumps: its `Lag` is all 0
             angle = apply_lag(steer, drive.delta_f, steering.start)
             start = compute_lagged_load(angle, T_l, T_r, drive, motor.start, car, variant)
         angle = apply_lag(steer, drive.delta_f, steering.middle)
@@ -313,7 +343,7 @@ def _compute_loads(
 @inline
 def measure_tick(
     params: StepParams, motion: Motion, accel: Vector, applied: AppliedInputs, refs_before: Vector,
-    next_steer: Scalar, draws: NormalDraws, variant: StepVariant,
+    inputs: TickInputs, variant: StepVariant,
 ) -> tuple[Scalar, Measurements]:  # fmt: skip
     """Compute the driver's command and the measurements at the end of a tick.
 
@@ -323,66 +353,72 @@ def measure_tick(
         accel: (a_x, a_y), specific forces (m/s2).
         applied: Mean inputs over the tick.
         refs_before: References of beta and gamma at the start (rad, rad/s).
-        next_steer: Profile's steering (rad) at the end, used where no driver reacts to the car.
-        draws: Random numbers of the tick's end.
+        inputs: Inputs of the tick.
         variant: Variant of the tick.
 
     Returns:
         The driver's steering command (rad), and the measurements.
     """
     task = params.task
-    row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
+    row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, inputs.draws)
+    if variant.has_errors:
+        row = apply_sensor_errors(row, motion, accel, applied.errors, params.errors)
     v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-    driver = next_steer
+    driver = inputs.next_steer
     if variant.has_driver:
         driver = compute_driver_angle(
             applied.driver, motion, params.path, params.road, params.target, params.driver,
             task.stop,
         )  # fmt: skip
-    steady = compute_reference(driver, v, params.target, variant.reference)
+    command = driver  # as it is measured: the car's own controller makes the reference
+    if variant.has_errors:
+        command = params.errors.steer_scale * driver + params.errors.steer_offset
+    steady = compute_reference(command, v, params.target, variant.reference)
     refs = filter_reference(refs_before, steady, params.target, variant.reference)
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     # squares: the references take them too, so what overflows there is lost as well
     finite = size + motion.psi + motion.Y + motion.phi
     measured = Measurements(
         row, refs, applied.steer, applied.moment, finite - finite != 0.0,
-        CostInputs(refs[0], refs[1], applied.effort, applied.added),
+        CostInputs(
+            refs[0], refs[1], applied.effort - inputs.effort_before, applied.added, applied.effort
+        ),
     )  # fmt: skip
     return driver, measured
 
 
 @inline
 def integrate_tick(
-    params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
-    draws: NormalDraws, next_steer: Scalar, variant: StepVariant,
-) -> tuple[StepState, Measurements]:  # fmt: skip
+    params: StepParams, inputs: TickInputs, state: StepState, tick: Scalar, variant: StepVariant
+) -> tuple[StepState, Measurements]:
     """Integrate one tick of the plant.
 
     Args:
         params: Parameters of the step.
-        N_z: Commanded yaw moment (N m).
-        steer_command: Commanded added steering (rad).
+        inputs: Inputs of the tick.
         state: State at the start.
         tick: Tick at which it starts.
-        draws: Random numbers of the tick's end.
-        next_steer: Profile's steering (rad) at the end, used where no driver reacts to the car.
         variant: Variant of the tick.
 
     Returns:
         State and measurements at the end.
     """
-    small_angle, law, roll = variant.small_angle, variant.law, variant.roll
     state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion
+    if variant.has_errors:
+        state = _apply_friction_wave(params, state, variant)
     if variant.road == NOMINAL_PATH:
         params, nominal_motion = _follow_nominal_path(params, state, tick)
-    inputs = compute_inputs(params, N_z, steer_command, state, tick, draws)
-    loads = _compute_loads(params, inputs, state, variant)
+    plant = compute_inputs(params, inputs, state, tick, variant)
+    loads = _compute_loads(params, plant, state, variant)
     before, car, road = state.motion, state.car, params.road
-    motion = kutta3(before, loads, inputs.disturbance, car, road, TICK, small_angle, law, roll)
-    accel = compute_specific_force(before, motion, road, small_angle, roll)
+    motion = kutta3(before, loads, plant.disturbance, car, road, TICK, variant)
+    accel = compute_specific_force(before, motion, road, variant.small_angle, variant.roll)
+    if variant.has_errors:
+        accel = compute_shifted_force(accel, before, motion, params.errors)
     driver, measured = measure_tick(
-        params, motion, accel, inputs.applied, state.refs, next_steer, draws, variant
+        params, motion, accel, plant.applied, state.refs, inputs, variant
     )
     return StepState(
-        motion, inputs.drive, loads[2], driver, car, measured.refs, nominal_motion
-    ), measured
+        motion, plant.drive, loads[2], driver, car, measured.refs, nominal_motion,
+        plant.applied.errors,
+    ), measured  # fmt: skip

@@ -1,4 +1,4 @@
-"""Views of an episode's packed numbers: vehicle, slow sensors, motion, true state and record."""
+"""Views of an episode's packed numbers: vehicle, slow sensors, true state and record."""
 
 import dataclasses
 from typing import NamedTuple
@@ -20,46 +20,53 @@ from .config import EpisodeConfig
 from .layout import FLAGS, P, Z
 
 
-def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
-    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides.
+class Episode(NamedTuple):
+    """An episode now: its config, and views of its packed numbers."""
 
-    Args:
-        config: The episode's config.
-        params: Packed parameters.
-        state: Packed state.
+    params: Array
+    state: Array
+    switches: npt.NDArray[np.int64]
+    report: Array
+    config: EpisodeConfig
+    rows: Array  # of the newest record, shape (ticks, FAST_WIDTH)
+    packets: Array  # shape (delivered, PACKET_WIDTH)
 
-    Returns:
-        The vehicle.
-    """
-    car, change = read(params, P.car), read(params, P.tyre_change)
-    if not car.m > 0.0:  # not reset yet
-        return config.vehicle
-    is_changed = state[Z.clock.tick] >= change.tick
-    return config.vehicle.replace(
-        front_stiffness=car.C_f * (change.front if is_changed else 1.0),
-        rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
-        friction=0.5 * (car.mu + car.mu_r),
-    )
+    @property
+    def record(self) -> Record:
+        """The newest record, a copy."""
+        first = int(self.state[Z.clock.tick]) - len(self.rows) + 1
+        return Record(self.rows.copy(), self.packets.copy(), first)
 
+    @property
+    def vehicle(self) -> Vehicle:
+        """The true vehicle now, with the seed's draws; friction is the mean of both sides'."""
+        car, change = read(self.params, P.car), read(self.params, P.tyre_change)
+        if not car.m > 0.0:  # not reset yet
+            return self.config.vehicle
+        is_changed = self.state[Z.clock.tick] >= change.tick
+        return self.config.vehicle.replace(
+            mass=car.m,
+            yaw_inertia=car.I,
+            front_arm=car.l_f,
+            rear_arm=car.l_r,
+            relaxation=car.relaxation,
+            front_stiffness=car.C_f * (change.front if is_changed else 1.0),
+            rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
+            friction=0.5 * (car.mu + car.mu_r),
+        )
 
-def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
-    """Get the slow sensors with the clock phases that the episode drew.
-
-    Args:
-        config: The episode's config.
-        state: Packed state.
-
-    Returns:
-        The sensors by name.
-    """
-    sensors = {}
-    for name, sensor in config.slow.items():
-        if sensor.phase is None:
-            column = Z.slow[SLOW_NAMES.index(name)]
-            first = state[column.next_capture] - state[column.frames] * count_ticks(sensor.period)
-            sensor = dataclasses.replace(sensor, phase=first * TICK)
-        sensors[name] = sensor
-    return sensors
+    @property
+    def slow_sensors(self) -> dict[str, SlowSensor]:
+        """The slow sensors by name, with the clock phases that the episode drew."""
+        sensors = {}
+        for name, sensor in self.config.slow.items():
+            if sensor.phase is None:
+                column, period = Z.slow[SLOW_NAMES.index(name)], count_ticks(sensor.period)
+                first = self.state[column.next_capture] - self.state[column.frames] * period
+                first += self.params[P.slow[SLOW_NAMES.index(name)].stamp]
+                sensor = dataclasses.replace(sensor, phase=float(first) * TICK)
+            sensors[name] = sensor
+        return sensors
 
 
 class TrueState(NamedTuple):
@@ -105,17 +112,3 @@ def _write_true_states(params: Vector, states: Vector, switches: Matrix, out: Ma
         out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * lateral_gravity
         out[i, TRUE_STATE.N_d] = z[Z.drive.N_d] + N_w
         out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_rate] = motion.phi, motion.phi_dot
-
-
-def make_record(state: Array, rows: Array, packets: Array) -> Record:
-    """Make a record from copies.
-
-    Args:
-        state: Packed state.
-        rows: Fast rows that end now, shape (n, FAST_WIDTH).
-        packets: Packets, shape (count, PACKET_WIDTH).
-
-    Returns:
-        The record.
-    """
-    return Record(rows.copy(), packets.copy(), int(state[Z.clock.tick]) - len(rows) + 1)

@@ -13,6 +13,7 @@ from ..numerics.packed import (
     count_lanes,
     iota,
     lane_width,
+    load_element,
     load_lanes,
     make_offsets,
     read,
@@ -35,10 +36,10 @@ from ..record import Array
 from ..scenarios.road import TrackPath, compute_path_offset
 from ..scenarios.steering import WANDER_START, compute_steering, interpolate_trace
 from ..sensors.inertial import NormalDraws
-from ..task import compute_cost_rate
+from ..task import RATE_TICKS, compute_cost_rate
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
-from .layout import PARAMS_WIDTH, P, TaskParams, Z
+from .layout import PARAMS_WIDTH, EpisodeArrays, P, StepVariant, TaskParams, Z
 
 
 class CostInputs(NamedTuple):
@@ -46,8 +47,9 @@ class CostInputs(NamedTuple):
 
     beta_ref: Scalar  # rad
     gamma_ref: Scalar  # rad/s
-    effort: Scalar  # yaw moment as a fraction of full scale
+    effort_change: Scalar  # of `effort` over `RATE_TICKS`
     added: Scalar  # rad, added steering
+    effort: Scalar  # yaw moment as a fraction of full scale; no `_TickCost` overwrites it
 
 
 class _TickCost(NamedTuple):
@@ -64,13 +66,14 @@ class _StepWindow(NamedTuple):
 
     inertial: Annotated[tuple[Scalar, ...], 4]
     wheels: Annotated[tuple[Scalar, ...], 4]
+    vibration: Scalar
     steer: Scalar  # rad, the profile's
     track: Motion
     cost_inputs: CostInputs
 
 
 WINDOW, WINDOW_HEIGHT = make_offsets(_StepWindow)
-TICK_COST = _TickCost(*WINDOW.cost_inputs)
+TICK_COST = _TickCost(*WINDOW.cost_inputs[:4])
 """The rows that hold a tick's cost once it is evaluated, flags as 0 and 1."""
 _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
@@ -118,15 +121,14 @@ def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
 
 
 @jit
-def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
+def overwrite_steering(row: EpisodeArrays, n: int) -> None:
     """Write the angles of a trace, or of a wandering driver, over those of the profile.
 
     Args:
-        p: Packed parameters, shape (PARAMS_WIDTH,).
-        z: Packed state, shape (STATE_WIDTH,).
+        row: `EpisodeArrays` of one vehicle, whose window is written.
         n: Number of ticks.
-        window: Window of the step, whose row `steer` is written.
     """
+    p, z, window = row.p, row.z, row.window
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
             window[WINDOW.steer, j] = interpolate_trace(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
@@ -143,51 +145,53 @@ def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
 
 
 @jit
-def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
+def precompute_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
     """Write noise and steering of one vehicle's next ticks.
 
     Args:
-        p: Packed parameters, shape (PARAMS_WIDTH,).
-        z: Packed state, shape (STATE_WIDTH,).
+        row: `EpisodeArrays` of the vehicle, whose window is written.
         n: Number of ticks.
-        has_driver: Whether a driver reacts to the car, so that no profile steers.
-        window: Window of the step, which is written.
+        variant: Variant of the ticks.
     """
-    clock = read(z, Z.clock)
+    clock, window = read(row.z, Z.clock), row.window
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
-    profile = p[P.steering_profile[0] :]
+    profile = row.p[P.steering_profile[0] :]
     for j in range(0, n, count_lanes()):
         ticks = iota(first + j)
         inertial = draw_normals(key_low, key_high, ticks, CHANNELS.inertial)
         wheels = draw_normals(key_low, key_high, ticks, CHANNELS.wheels)
         write(window, inertial, WINDOW.inertial, j)
         write(window, wheels, WINDOW.wheels, j)
-        if not has_driver:
+        if variant.has_errors:
+            vibration = draw_normals(key_low, key_high, ticks, CHANNELS.errors)[0]
+            store_element(window, vibration, WINDOW.vibration, j)
+        if not variant.has_driver:
             store_element(window, compute_steering(to_float(ticks), profile), WINDOW.steer, j)
-    overwrite_steering(p, z, n, window)
+    overwrite_steering(row, n)
 
 
 @jit
-def precompute_lane_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
+def precompute_lane_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
     """Write noise and steering of a block's next ticks, but for `overwrite_steering`.
 
     Args:
-        p: Packed parameters with a column for each vehicle.
-        z: Packed state likewise.
+        row: `EpisodeArrays` of the block, whose window is written.
         n: Number of ticks.
-        has_driver: Whether a driver reacts to the car, so that no profile steers.
-        window: The window of the block.
+        variant: Variant of the ticks.
     """
-    clock = read(z, Z.clock)
+    clock, window = read(row.z, Z.clock), row.window
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
-    profile = p[P.steering_profile[0] :]
+    profile = row.p[P.steering_profile[0] :]
     for j in range(n):
         tick = clock.tick + (j + 1)
         inertial = draw_normals(key_low, key_high, to_int(tick), CHANNELS.inertial)
         wheels = draw_normals(key_low, key_high, to_int(tick), CHANNELS.wheels)
         write(window, inertial, WINDOW.inertial, j)
         write(window, wheels, WINDOW.wheels, j)
-        if not has_driver:
+        if variant.has_errors:
+            vibration = draw_normals(key_low, key_high, to_int(tick), CHANNELS.errors)[0]
+            store_element(window, vibration, WINDOW.vibration, j)
+        if not variant.has_driver:
             store_element(window, compute_steering(tick, profile), WINDOW.steer, j)
 
 
@@ -202,13 +206,17 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
     Returns:
         The random numbers.
     """
-    return NormalDraws(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))
+    return NormalDraws(
+        read(window, WINDOW.inertial, j),
+        read(window, WINDOW.wheels, j),
+        load_element(window, WINDOW.vibration, j),
+    )
 
 
 @inline
 def compute_tick_cost(
     motion: Motion, cost_inputs: CostInputs, task: TaskParams, path: TrackPath,
-    variant: Any,
+    variant: StepVariant,
 ) -> _TickCost:  # fmt: skip
     """Compute cost and failures of a tick from the motion at its end.
 
@@ -228,10 +236,10 @@ def compute_tick_cost(
     e_beta, e_gamma = beta - cost_inputs.beta_ref, motion.gamma - cost_inputs.gamma_ref
     path_offset = compute_path_offset(path, motion.s) if variant.has_driver else 0.0
     lateral_deviation = motion.y - path_offset
+    effort_rate = cost_inputs.effort_change * (1.0 / (RATE_TICKS * TICK))
+    rate_cost, steer = task.moment_rate * (effort_rate * effort_rate), cost_inputs.added
     return _TickCost(
-        compute_cost_rate(
-            e_beta, e_gamma, cost_inputs.effort, cost_inputs.added, variant.reference
-        ),
+        compute_cost_rate(e_beta, e_gamma, cost_inputs.effort, steer, variant.reference, rate_cost),
         beta,
         (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
         absolute(lateral_deviation) > task.half_width,
@@ -240,7 +248,7 @@ def compute_tick_cost(
 
 @jit
 def evaluate_cost(
-    window: Matrix, n: int, cost: Scalar, params: Any, variant: Any
+    window: Matrix, n: int, cost: Scalar, params: Any, variant: StepVariant
 ) -> tuple[Scalar, int, bool]:
     """Evaluate a step's ticks up to a failure.
 
@@ -259,7 +267,7 @@ def evaluate_cost(
         cost_inputs = load_lanes(window, WINDOW.cost_inputs, j)
         tick_cost = compute_tick_cost(motion, cost_inputs, params.task, params.path, variant)
         spun, off = select(tick_cost.spun, 1.0, 0.0), select(tick_cost.off, 1.0, 0.0)
-        write(window, (tick_cost.cost, tick_cost.beta, spun, off), WINDOW.cost_inputs, j)
+        write(window, (tick_cost.cost, tick_cost.beta, spun, off), TICK_COST, j)
     for j in range(n):
         tick_cost = read(window, TICK_COST, j)
         cost = cost + tick_cost.cost * TICK

@@ -1,29 +1,17 @@
-"""Arrays of an episode; its workspace, one vector that holds them."""
+"""The workspace of one car: one vector that holds the arrays of its episode."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..numerics.jit import as_python, jit
 from ..numerics.packed import as_float32, as_int64, as_matrix, make_offsets, read
-from ..numerics.primitives import Matrix, Scalar, Vector
+from ..numerics.primitives import Scalar, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REPORT
-from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
+from .config import EnvConfig
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays
 from .window import WINDOW_HEIGHT, count_columns
-
-
-class EpisodeArrays(NamedTuple):
-    """One episode's arrays."""
-
-    # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
-    p: Vector
-    z: Vector  # (STATE_WIDTH,), packed as in `_EpisodeState`
-    switches: Vector  # (len(Switches),) int64
-    obs: Vector  # (k,) float32
-    rows: Matrix  # (n, FAST_WIDTH), the fast rows of the newest record
-    packets: Matrix  # (max, PACKET_WIDTH), its packets
-    report: Vector  # (len(Report),)
 
 
 class _WorkspaceSizes(NamedTuple):
@@ -37,29 +25,29 @@ class _WorkspaceSizes(NamedTuple):
 SIZES, _HEADER = make_offsets(_WorkspaceSizes)
 
 
-def _make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
-    """Make a workspace of n ticks: one vector, since numba takes 0.04 us for every array passed.
+def _make_workspace(config: EnvConfig, trace_width: int = 0) -> Array:
+    """Make a workspace: one vector, since numba takes 0.04 us for every array passed.
 
-    `bounds` are (2, k); `trace_width` values of a trace follow the parameters.
+    `trace_width` values of a trace follow the parameters.
     """
-    k = bounds.shape[1]
+    n, k, max_packets = int(config.control_period), len(config.layout), config.max_packets
     width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
     width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * count_columns(n)
     workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
     workspace[:_HEADER] = n, k, max_packets
-    _split_workspace(workspace)[1][:] = bounds
+    _split_workspace(workspace).bounds[:] = config.bounds
     return workspace
 
 
 @jit
-def split_workspace(workspace: Vector) -> tuple[EpisodeArrays, Matrix, Matrix]:
+def split_workspace(workspace: Vector) -> EpisodeArrays:
     """Split a workspace into its parts.
 
     Args:
         workspace: Vector of `_make_workspace`.
 
     Returns:
-        The episode's arrays, bounds of the observation, window.
+        The episode's arrays.
     """
     sizes = read(workspace, SIZES)
     n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
@@ -70,69 +58,53 @@ def split_workspace(workspace: Vector) -> tuple[EpisodeArrays, Matrix, Matrix]:
     rows = window + WINDOW_HEIGHT * count_columns(n)
     packets = rows + n * FAST_WIDTH
     obs = packets + max_packets * PACKET_WIDTH
-    row = EpisodeArrays(
+    return EpisodeArrays(
         workspace[obs - (-k // 2) :], workspace[_HEADER:report],
         as_int64(workspace, flags, len(FLAGS)), as_float32(workspace, obs, k),
         as_matrix(workspace, rows, n, FAST_WIDTH),
         as_matrix(workspace, packets, max_packets, PACKET_WIDTH), workspace[report:flags],
-    )  # fmt: skip
-    return (
-        row,
         as_matrix(workspace, bounds, 2, k),
         as_matrix(workspace, window, WINDOW_HEIGHT, count_columns(n)),
-    )
+    )  # fmt: skip
 
 
 _split_workspace = as_python(split_workspace)
-_VIEW_NAMES = (
-    "_row", "_params", "_state", "_switches", "_obs", "rows", "packets", "_report", "_bounds",
-    "_window", "_read_report", "_copy_observation",
-)  # fmt: skip
 
 
-class WorkspaceMixin:
-    """An environment of one car, whose arrays are parts of `_workspace`.
+class Workspace:
+    """The arrays of one car's episode, which are parts of one `vector`.
 
-    `rows` and `packets` are the newest record's; `delivered` of the latter are there.
+    Args:
+        config: Config of the environment.
+
+    Attributes:
+        vector: The vector; a copy of it is a copy of the episode.
+        row: Its parts.
+        read_report: Function that lists the report's numbers.
+        copy_observation: Function that copies the observation.
     """
 
-    config: Any  # `EnvConfig`
-    control_period: int
-    _workspace: Array | None = None
+    def __init__(self, config: EnvConfig) -> None:
+        self._config = config
+        self._bind(_make_workspace(config))
 
-    def _allocate(self, width: int) -> None:
-        """Allocate a workspace for `width` parameters with a trace, if that is another number."""
-        if self._workspace is None or len(self._params) != width:
-            config, n = self.config, self.control_period
-            sizes = config.max_packets, width - PARAMS_WIDTH
-            self._workspace = _make_workspace(n, config.bounds, *sizes)
-            self._bind_views()
+    def allocate(self, width: int) -> None:
+        """Make room for parameters with a trace, and lose all numbers, if the room is another.
 
-    def _bind_views(self) -> None:
-        """Bind the workspace's parts, and the calls that read them in every step."""
-        self._row, self._bounds, self._window = _split_workspace(self._workspace)
-        self._params, self._state, self._switches, self._obs, *record = self._row
-        self.rows, self.packets, self._report = record
-        self._read_report, self._copy_observation = self._report.tolist, self._obs.copy
+        Args:
+            width: Number of the parameters.
+        """
+        if len(self.row.p) != width:
+            self._bind(_make_workspace(self._config, width - PARAMS_WIDTH))
 
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in vars(self).items() if name not in _VIEW_NAMES}
+    def _bind(self, vector: Array) -> None:
+        """Bind the vector's parts, and the calls that read them in every step."""
+        self.vector, self.row = vector, _split_workspace(vector)
+        self.read_report, self.copy_observation = self.row.report.tolist, self.row.obs.copy
 
-    def __setstate__(self, state: dict[str, object]) -> None:
-        vars(self).update(state)
-        self._bind_views()
+    def __getstate__(self) -> tuple[EnvConfig, Array]:
+        return self._config, self.vector
 
-    @property
-    def delivered(self) -> int:
-        """Number of packets of the newest record."""
-        return int(self._report[REPORT.packets])
-
-
-class EpisodeStart(NamedTuple):
-    """The packed start of an episode; of several, arrays have an axis more, the first."""
-
-    params: Vector  # as in `EpisodeArrays`, but for the draws
-    low: Vector  # (len(Draws),), the ranges that it draws from
-    high: Vector
-    switches: Vector
-    motion: Vector  # (len(Motion),), NaN: standing on the road at the drawn speed
+    def __setstate__(self, state: tuple[EnvConfig, Array]) -> None:
+        self._config, vector = state
+        self._bind(vector)

@@ -16,10 +16,10 @@ from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
 from ..task import COLLISION, DEPARTURE, REPORT, RUNNING, compute_failure_cost
-from ..validation import check_choice, check_int
+from ..validation import check_choice, check_int, check_mapping, describe_unknown
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import VehicleSource
-from .traffic import PERIOD, ROADS, Traffic, TrafficStart, parse_hazard
+from .traffic import PERIOD, ROADS, Hazard, Traffic, TrafficStart
 
 if TYPE_CHECKING:
     from highway_env.road.graphics import WorldSurface
@@ -27,6 +27,13 @@ if TYPE_CHECKING:
 MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
 _OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")
 _FIXED_STATE = ("s", "theta", "X", "Y")
+
+
+def _make_hazard(source: Mapping[str, Range]) -> Hazard:
+    known = Hazard.__dataclass_fields__
+    if unknown := [name for name in check_mapping("hazard", source) if name not in known]:
+        raise TypeError(describe_unknown("field of hazard", unknown, known))
+    return Hazard(**source)
 
 
 class HighwayEnv(StabilityEnv):
@@ -73,7 +80,7 @@ class HighwayEnv(StabilityEnv):
         **options: Any,
     ) -> None:
         check_choice("road", road, ROADS)
-        self.road, self.hazard = road, parse_hazard(hazard)
+        self.road, self.hazard = road, None if hazard is None else _make_hazard(hazard)
         self.traffic = check_int("traffic", traffic, "vehicles", 0, MAX_VEHICLES)
         adapted = self._adapt_scenario(make_scenario(scenario))
         super().__init__(sensors, adapted, vehicle, reference=reference, **options)
@@ -125,7 +132,7 @@ class HighwayEnv(StabilityEnv):
 
     def _start_episode(self) -> None:
         """Make the road, its vehicles, and the driver's path around the one that brakes."""
-        p, z = self._params, self._state
+        p, z = self._row.p, self._row.z
         friction = 0.5 * float(p[P.car.mu] + p[P.car.mu_r])
         speed = float(p[P.speed_profile.speed])
         start = TrafficStart(self._episode.vehicle, self.motion, speed, friction)
@@ -137,19 +144,20 @@ class HighwayEnv(StabilityEnv):
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive a control period on the lane as it is here, then take the road's steps in it."""
-        traffic, p, z = self._traffic, self._params, self._state
+        traffic, row = self._traffic, self._row
+        p, z, report = row.p, row.z, row.report
         assert traffic is not None
         position = traffic.locate(self.motion)
         z[Z.motion.y], z[Z.motion.theta] = position.y, position.theta
         p[P.road.curvature] = position.curvature
         first = int(z[Z.clock.tick])
         done = super()._advance(command)
-        is_running = done > 0 and self._report[REPORT.failure] == RUNNING
+        is_running = done > 0 and report[REPORT.failure] == RUNNING
         for tick in range(first + 1, first + done + 1) if is_running else ():
             if tick % PERIOD == 0:
-                traffic.step_road(read(self._window, WINDOW.track, tick - first - 1))
+                traffic.step_road(read(row.window, WINDOW.track, tick - first - 1))
         if is_running and (traffic.crashed or traffic.departed):
-            failure, report = COLLISION if traffic.crashed else DEPARTURE, self._report
+            failure = COLLISION if traffic.crashed else DEPARTURE
             z[Z.clock.failure] = report[REPORT.failure] = failure
             report[REPORT.cost] += compute_failure_cost(p[P.task.duration], z[Z.clock.tick])
             report[REPORT.reward] = -report[REPORT.cost]

@@ -172,13 +172,13 @@ class KeepingEnv(PlantEnv):
         return super().reset(seed=seed, options={"state": self.plant.motion._asdict()})
 
     def _start_episode(self) -> None:
-        self.plant.start(int(self._state[Z.clock.key_low]))
+        self.plant.start(int(self._row.z[Z.clock.key_low]))
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive a control period on the lane as it is here, which camera and record then have."""
-        plant, z = self.plant, self._state
+        plant, z = self.plant, self._row.z
         plant.project()
-        self._params[P.road.curvature] = plant.curvature
+        self._row.p[P.road.curvature] = plant.curvature
         z[Z.motion.y], z[Z.motion.theta] = plant.y, plant.theta
         return super()._advance(command)
 

@@ -6,7 +6,7 @@ its left (side 1) or to its right (-1). Every road begins straight.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..rendering import canvas
 from ..rendering.road import compute_body
 from ..scenarios.draws import Range, get_range
 from ..scenarios.road import TrackPath
-from ..validation import check_mapping, describe_unknown, is_finite
+from ..validation import is_finite
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import GRAVITY, Vehicle
 
@@ -205,26 +205,6 @@ class Hazard:
                 rule = "is a number or (low, high) from 0 on"
                 raise ValueError(f"hazard: {name} {rule}, got {value}")
             object.__setattr__(self, name, tuple(map(float, ends)))
-
-
-def parse_hazard(source: Mapping[str, Range] | None) -> Hazard | None:
-    """Parse a hazard from a mapping of its fields.
-
-    Args:
-        source: Values by the names of `Hazard`'s fields, {} for the usual ones; None for no hazard.
-
-    Returns:
-        Hazard with these values, or None.
-
-    Raises:
-        TypeError: For an unknown field.
-    """
-    if source is None:
-        return None
-    known = Hazard.__dataclass_fields__
-    if unknown := [name for name in check_mapping("hazard", source) if name not in known]:
-        raise TypeError(describe_unknown("field of hazard", unknown, known))
-    return Hazard(**source)
 
 
 class TrafficStart(NamedTuple):

@@ -105,6 +105,47 @@ def atan(x: Scalar) -> Scalar:
 
 
 @jit
+def compute_arctan(x: Scalar) -> Scalar:
+    """Compute arctan x for x >= 0, error below 3e-16: one quotient, no root; a third of `atan`.
+
+    Args:
+        x: Tangent of the angle, zero or more.
+
+    Returns:
+        The angle (rad).
+    """
+    steep, middle = x > 2.414213562373095, x > 0.41421356237309503  # tan of 3 pi/8 and pi/8
+    far = select(steep, x, select(middle, x + 1.0, 1.0))
+    t = select(steep, -1.0, select(middle, x - 1.0, x)) / far
+    z = t * t
+    p = 1.62858201153657823623e-02  # fdlibm, s_atan.c
+    p = p * z - 3.65315727442169155270e-02
+    p = p * z + 4.97687799461593236017e-02
+    p = p * z - 5.83357013379057348645e-02
+    p = p * z + 6.66107313738753120669e-02
+    p = p * z - 7.69187620504482999495e-02
+    p = p * z + 9.09088713343650656196e-02
+    p = p * z - 1.11111104054623557880e-01
+    p = p * z + 1.42857142725034663711e-01
+    p = p * z - 1.99999999998764832476e-01
+    p = p * z + 3.33333333333329318027e-01
+    return select(steep, 0.5 * PI, select(middle, 0.25 * PI, 0.0)) + (t - t * (z * p))
+
+
+@jit
+def compute_sine(x: Scalar) -> Scalar:
+    """Compute sin x for |x| < 1.9 rad, error below 2e-14, as 2 sin(x / 2) cos(x / 2).
+
+    Args:
+        x: Angle (rad).
+
+    Returns:
+        Its sine.
+    """
+    return 2.0 * _sin_kernel(0.5 * x) * _cos_kernel(0.5 * x)
+
+
+@jit
 def atan2(y: Scalar, x: Scalar) -> Scalar:
     """Compute the angle of (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
 
@@ -217,6 +258,7 @@ class Channels(NamedTuple):
     scenario: int = 7  # uniforms of the scenario's draws; the counter's tick is the attempt
     sky: int = 8  # log HDOP's innovation, its start at reset, two unused
     steering: int = 9  # of a driver who wanders; three unused
+    errors: int = 10  # a_y's vibration; three unused
 
 
 CHANNELS = Channels()

@@ -8,7 +8,7 @@ import functools
 import os
 from collections.abc import Callable, Mapping
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numba
 from numba.extending import is_jitted
@@ -25,78 +25,7 @@ config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def jit(function: F) -> F:
-    """Compile with numba: IEEE arithmetic in the order written; stock numba has no disk cache.
-
-    Args:
-        function: Python function in numba's subset.
-
-    Returns:
-        The compiled function.
-    """
-    return _compile(function)
-
-
-def jit_nrt(function: F) -> F:
-    """Compile with reference counting: what allocates or reshapes arrays, and its callers.
-
-    All others in `envs` and `estimators` do without it, which halves the time of a filter's tick.
-
-    Args:
-        function: Python function in numba's subset.
-
-    Returns:
-        The compiled function.
-    """
-    return _compile(function, _nrt=True)
-
-
-def inline(function: F) -> F:
-    """Compile into the callers: what takes many numbers and is called often.
-
-    A call of a plant's function passes some sixty numbers through memory, which takes as long as
-    the function itself.
-
-    Args:
-        function: Python function in numba's subset.
-
-    Returns:
-        The compiled function.
-    """
-    return _compile(function, forceinline=True)
-
-
-def noinline(function: F) -> F:
-    """Compile once, to machine code that all callers call: what is long and called seldom.
-
-    Stock numba compiles the function as `jit` does.
-
-    Args:
-        function: Python function in numba's subset.
-
-    Returns:
-        The compiled function.
-    """
-    return _compile(function, apart=True)
-
-
-def compile_call(function: F, *arguments: object) -> F:
-    """Compile a function for the types of some arguments alone, which saves numba's dispatch.
-
-    Args:
-        function: Function compiled by `jit`.
-        arguments: Arguments of the types that it will be called with.
-
-    Returns:
-        The function for these types.
-    """
-    if config.DISABLE_JIT:
-        return function
-    compiled: Any = function
-    return cast(F, compiled.compile(tuple(map(numba.typeof, arguments))))
-
-
-def _compile(function: F, apart: bool = False, **options_more: bool) -> F:
+def _compile(function: F, apart: bool, **options_more: bool) -> F:
     if config.DISABLE_JIT:
         return function
     make_kernel = _load_compiler()
@@ -127,6 +56,45 @@ def _load_compiler() -> Callable[..., object] | None:
     text = "compiles by itself: longer, in every process, and for the same numbers"
     report_once("stock", f"numba {numba.__version__} {text} ({reason})")
     return None
+
+
+class _Decorator(Protocol):
+    """A decorator of Python functions in numba's subset, whose types it keeps."""
+
+    def __call__(self, function: F) -> F: ...
+
+
+def _make_decorator(apart: bool = False, **options: bool) -> _Decorator:
+    return lambda function: _compile(function, apart, **options)
+
+
+jit = _make_decorator()
+"""Compile with numba: IEEE arithmetic in the order written; stock numba has no disk cache."""
+jit_nrt = _make_decorator(_nrt=True)
+"""Compile with reference counting: what allocates or reshapes arrays, and its callers. All others
+in `envs` and `estimators` do without it, which halves the time of a filter's tick."""
+inline = _make_decorator(forceinline=True)
+"""Compile into the callers: what takes many numbers and is called often. A call of a plant's
+function passes some sixty numbers through memory, which takes as long as the function itself."""
+noinline = _make_decorator(apart=True)
+"""Compile once, to machine code that all callers call: what is long and called seldom. Stock numba
+compiles it as `jit` does."""
+
+
+def compile_call(function: F, *arguments: object) -> F:
+    """Compile a function for the types of some arguments alone, which saves numba's dispatch.
+
+    Args:
+        function: Function compiled by `jit`.
+        arguments: Arguments of the types that it will be called with.
+
+    Returns:
+        The function for these types.
+    """
+    if config.DISABLE_JIT:
+        return function
+    compiled: Any = function
+    return cast(F, compiled.compile(tuple(map(numba.typeof, arguments))))
 
 
 @jit

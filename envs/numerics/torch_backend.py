@@ -99,3 +99,20 @@ def compile_method(function: Any) -> Any:
     copy = FunctionType(code, names, source.__name__, source.__defaults__, source.__closure__)
     method = MethodType(copy, function.__self__)
     return torch.compile(method, fullgraph=True, options={"realize_opcount_threshold": 16})
+
+
+class GradientGate:
+    """Gate of gradients: they pass to rows that are `open` (N,), finite ones alone, else zeros."""
+
+    open: torch.Tensor
+
+    def __call__(self, value: torch.Tensor) -> torch.Tensor:
+        """Gate a value (..., N); `open` may be set until the gradients come."""
+        if not (torch.is_grad_enabled() and value.requires_grad):
+            return value
+        gated = value.view_as(value)
+        gated.register_hook(self._filter_gradient)  # type: ignore[no-untyped-call]
+        return gated
+
+    def _filter_gradient(self, slope: torch.Tensor) -> torch.Tensor:
+        return torch.where(self.open & torch.isfinite(slope), slope, 0.0)

@@ -11,16 +11,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..engine.layout import P, Z
+from ..engine.layout import P, StepVariant, Z
+from ..engine.outputs import finish_step
 from ..engine.step import (
+    StepEnd,
     check_action_range,
     clip_action,
-    finish_step,
     make_step_params,
     make_step_variant,
     write_final_state,
 )
-from ..engine.tick import StepParams, StepState, StepVariant, compute_inputs, measure_tick
+from ..engine.tick import (
+    StepParams,
+    StepState,
+    TickInputs,
+    compute_inputs,
+    measure_tick,
+)
 from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
 from ..numerics.jit import as_python
 from ..numerics.packed import load_element, read, write
@@ -106,60 +113,65 @@ class PlantEnv(StabilityEnv):
     _has_tyre_forces = False
     plant: PlantProtocol
 
+    def _refuse_world(self) -> None:
+        """Raise ValueError for what the plant cannot have."""
+        if not self.config.world.is_ideal or self.config.lead_in:
+            raise ValueError("world and lead_in are of our own plant; an outside one has neither")
+
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive one control period of the plant: `step_vehicle` with another motion."""
-        yaw_share, steer_share = clip_action(command)
-        if yaw_share != yaw_share:
+        shares = clip_action(command)
+        if shares[0] != shares[0]:
             return super()._advance(command)  # refuses or fails before it moves anything
         if check_action_range(command):
             warn_once(self, command)
-        p, z, n = self._params, self._state, self.control_period
-        variant = _make_step_variant(p, self._switches)
-        precompute_window(p, z, n, variant.has_driver, self._window)
-        done = self._integrate_step(_make_step_params(p), variant, yaw_share, steer_share)
-        finish_step(self._row, n, done, self._bounds, self._window)
+        row, n = self._row, self.control_period
+        variant = _make_step_variant(row.p, row.switches)
+        precompute_window(row, n, variant)
+        done = self._integrate_step(_make_step_params(row.p), variant, shares)
+        finish_step(row, n, done)
         return done
 
     def _integrate_step(
-        self, params: StepParams, variant: StepVariant, yaw_share: float, steer_share: float
+        self, params: StepParams, variant: StepVariant, shares: tuple[float, ...]
     ) -> int:
         """Integrate as `step.integrate_step`, with the plant's motion; return the ticks done."""
-        z, plant, task = self._state, self.plant, params.task
+        row, plant, task = self._row, self.plant, params.task
+        z, window = row.z, row.window
         motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
         nominal_motion = read(z, Z.nominal_motion)
-        state = StepState(motion, drive, None, float(z[Z.driver]), params.car, refs, nominal_motion)
+        driver, errors = float(z[Z.driver]), read(z, Z.errors)
+        state = StepState(motion, drive, None, driver, params.car, refs, nominal_motion, errors)
         tick, cost, done, is_over, failure = float(z[Z.clock.tick]), 0.0, 0, False, 0.0
-        N_z, added = yaw_share * task.yaw_scale, steer_share * task.authority
+        N_z, added = shares[0] * task.yaw_scale, shares[1] * task.authority
         while not is_over:
-            draws = read_draws(self._window, done)
-            inputs = _compute_inputs(params, N_z, added, state, tick, draws)
-            applied = inputs.applied
+            next_steer = load_element(window, WINDOW.steer, done)
+            tick_inputs = TickInputs(N_z, added, read_draws(window, done), next_steer, 0.0)
+            inputs = _compute_inputs(params, tick_inputs, state, tick, variant)
             # not the product of `compute_inputs`: all drives so far have a quotient's rounding
-            applied = applied._replace(effort=applied.moment / task.yaw_scale)
+            applied = inputs.applied._replace(effort=inputs.applied.moment / task.yaw_scale)
             forces = (applied.steer, applied.T_l, applied.T_r, *inputs.disturbance)
             plant.step(OutsideInputs(*forces), TICK)
             motion, force = state.motion, (0.0, 0.0)
             if plant.is_finite:
                 motion, force = plant.motion, plant.specific_force
-            next_steer = load_element(self._window, WINDOW.steer, done)
             driver, measured = _measure_tick(
-                params, motion, force, applied, state.refs, next_steer, draws, variant
+                params, motion, force, applied, state.refs, tick_inputs, variant
             )
             measured = measured._replace(lost=not plant.is_finite)
             state = StepState(
-                motion, inputs.drive, None, driver, state.car, measured.refs, nominal_motion
-            )
-            write(self.rows[done], measured.row, FAST)
-            write(self._window, motion, WINDOW.track, done)
+                motion, inputs.drive, None, driver, state.car, measured.refs, nominal_motion,
+                inputs.applied.errors,
+            )  # fmt: skip
+            write(row.rows[done], measured.row, FAST)
+            write(window, motion, WINDOW.track, done)
             tick_cost = _compute_tick_cost(motion, measured.cost_inputs, task, params.path, variant)
             tick, cost, done = tick + 1.0, cost + tick_cost.cost * TICK, done + 1
             failure = _select_failure(measured.lost, tick_cost.spun, tick_cost.off)
             is_over = failure != RUNNING or tick >= task.duration or done == self.control_period
         write(z, state.motion, Z.motion)
-        beta, refs, duration = tick_cost.beta, measured.refs, task.duration
-        _write_final_state(
-            z, self._report, state, measured, failure, beta, refs, tick, cost, duration
-        )
+        end = StepEnd(failure, tick_cost.beta, measured.refs, tick, cost)
+        _write_final_state(row, state, measured, end, task.duration)
         return done
 
 
@@ -188,7 +200,7 @@ class OutsideEnv(PlantEnv):
         ValueError: For an unknown model, and for a scenario with a road or a plant that it lacks:
             curvature, bank, grade, small_angle, tyres, vehicle, friction_right, tyre_change_time.
             For wind_height on other models than multi-body, and for that model below 1 m/s or
-            without roll.
+            without roll. For a world that is not ideal, and for a lead_in.
     """
 
     plant: OutsidePlant
@@ -207,6 +219,7 @@ class OutsideEnv(PlantEnv):
         self.model = model
         _check_scenario(make_scenario(scenario), model)
         super().__init__(sensors, scenario, make_outside_vehicle(), reference=reference, **options)
+        self._refuse_world()
         self.plant = OUTSIDE_PLANTS[model]()
 
     def reset(
@@ -228,7 +241,7 @@ class OutsideEnv(PlantEnv):
             state = reset_options["state"]
             reset_options["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
         result = super().reset(seed=seed, options=reset_options)
-        p, base = self._params, self._episode.vehicle
+        p, base = self._row.p, self._episode.vehicle
         scale = 0.5 * (p[P.car.C_f] / base.front_stiffness + p[P.car.C_r] / base.rear_stiffness)
         p[P.car.C_f], p[P.car.C_r] = scale * base.front_stiffness, scale * base.rear_stiffness
         self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car.mu]), float(scale))

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ..record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Fast, Log, Record
-from ..sensors.gps import COURSE_SPEED
 from ..sensors.link import SlowSensor
-from ..sensors.slow import SLOW_NAMES
+from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
 from ..ticks import TICK
 from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
 from .tables import read_quantities

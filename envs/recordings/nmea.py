@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..numerics import require_extra
-from ..sensors.gps import COURSE_SPEED
+from ..sensors.slow import COURSE_SPEED
 
 with require_extra("wires", "decoding NMEA needs pynmeagps"):
     from pynmeagps import NMEAMessage, calc_checksum, get_parts

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ..numerics import require_extra
 from ..validation import short_repr
@@ -20,14 +20,6 @@ _CHUNK_SIZE = 65_536  # bytes of a chunk, and those that show what a file holds
 _LINE = re.compile(rb"\$(?:[A-Z]{2}(?:RMC|GGA|GNS|GLL),|[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2})")
 
 
-class Connection(NamedTuple):
-    """An open file, port or connection."""
-
-    read: Callable[[], bytes]
-    """Some bytes, b"" after a pause; raises EOFError at a file's end, OSError on a lost line."""
-    close: Callable[[], None]
-
-
 @dataclass
 class ByteSource:
     """The bytes of a receiver in chunks, b"" where none came for a while; only a file ends.
@@ -37,39 +29,30 @@ class ByteSource:
     """
 
     name: str  # for messages
-    connect: Callable[[], Connection]  # opens the line
+    read: Callable[[], Iterator[bytes]]  # opens the line, and yields b"" first
     tries: int = 5  # to open a lost line again before a byte comes
     wait: float = 1.0  # s, before each
     losses: int = 0  # of the line so far
 
     def __iter__(self) -> Iterator[bytes]:
-        connection: Connection | None = self.connect()
-        failures = 0
-        try:
-            while True:
-                chunk = b""
-                try:
-                    if connection is None:
-                        time.sleep(self.wait)
-                        connection = self.connect()
-                    chunk = connection.read()
-                except EOFError:
-                    return
-                except OSError as error:
-                    if connection is not None:
-                        self.losses += 1
-                        connection.close()
-                        connection = None
-                    failures += 1
-                    if failures > self.tries:
-                        raise ConnectionError(
-                            f"{self.name}: lost, and not back after {self.tries} tries: {error}"
-                        ) from None
-                failures = 0 if chunk else failures
-                yield chunk
-        finally:
-            if connection is not None:
-                connection.close()
+        failures, is_open, is_first = 0, False, True
+        while True:
+            try:
+                for chunk in self.read():
+                    is_open, failures = True, 0 if chunk else failures
+                    yield chunk
+                return
+            except OSError as error:
+                if is_first and not is_open:
+                    raise
+                self.losses += is_open
+                failures += 1
+                if failures > self.tries:
+                    text = f"{self.name}: lost, and not back after {self.tries} tries: {error}"
+                    raise ConnectionError(text) from None
+            is_open = is_first = False
+            yield b""
+            time.sleep(self.wait)
 
 
 def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
@@ -91,18 +74,18 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
     head, _, number = rest.rpartition(":")
     if kind == "serial" and rest:
         port, baud = (head, int(number)) if head and number.isdecimal() else (rest, BAUD)
-        return ByteSource(text, lambda: _make_serial_connection(port, baud), tries, wait)
+        return ByteSource(text, lambda: _read_serial(port, baud), tries, wait)
     if kind == "tcp":
         if not (head and number.isdecimal() and 0 < int(number) < 65_536):
             raise ValueError(f"expected tcp:HOST:PORT, got {short_repr(text)}")
         host = head.strip("[]")
-        return ByteSource(text, lambda: _make_tcp_connection(host, int(number)), tries, wait)
+        return ByteSource(text, lambda: _read_tcp(host, int(number)), tries, wait)
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file, found a folder")
-    return ByteSource(text, lambda: _make_file_connection(path), tries=0)
+    return ByteSource(text, lambda: _read_file(path), tries=0)
 
 
 def is_nmea(path: str | Path) -> bool:
@@ -157,38 +140,30 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
     return epochs, counts
 
 
-def _make_file_connection(path: Path) -> Connection:
-    stream = path.open("rb", buffering=0)
-
-    def read() -> bytes:
-        chunk = stream.read(_CHUNK_SIZE)
-        if not chunk:
-            raise EOFError
-        return chunk
-
-    return Connection(read, stream.close)
+def _read_file(path: Path) -> Iterator[bytes]:
+    with path.open("rb", buffering=0) as stream:
+        yield b""
+        while chunk := stream.read(_CHUNK_SIZE):
+            yield chunk
 
 
-def _make_serial_connection(port: str, baud: int) -> Connection:
+def _read_serial(port: str, baud: int) -> Iterator[bytes]:
     with require_extra("wires", "a serial port needs pyserial"):
         import serial
-    device = serial.Serial(port, baud, timeout=_PAUSE)
-    return Connection(
-        lambda: bytes(device.read(min(device.in_waiting or 1, _CHUNK_SIZE))), device.close
-    )
+    with serial.Serial(port, baud, timeout=_PAUSE) as device:
+        yield b""
+        while True:
+            yield bytes(device.read(min(device.in_waiting or 1, _CHUNK_SIZE)))
 
 
-def _make_tcp_connection(host: str, port: int) -> Connection:
-    peer = socket.create_connection((host, port), timeout=5.0)
-    peer.settimeout(_PAUSE)
-
-    def read() -> bytes:
-        try:
-            chunk = peer.recv(_CHUNK_SIZE)
-        except TimeoutError:
-            return b""
-        if not chunk:
-            raise ConnectionError("the peer closed")
-        return chunk
-
-    return Connection(read, peer.close)
+def _read_tcp(host: str, port: int) -> Iterator[bytes]:
+    with socket.create_connection((host, port), timeout=5.0) as peer:
+        yield b""
+        peer.settimeout(_PAUSE)
+        chunk: bytes | None = None
+        while chunk != b"":
+            try:
+                yield (chunk := peer.recv(_CHUNK_SIZE))
+            except TimeoutError:
+                yield b""
+        raise ConnectionError("the peer closed")

@@ -74,41 +74,31 @@ class Canvas:
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
-    def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
+    def draw_line(
+        self,
+        points: Points,
+        colour: str,
+        width: float = 1.0,
+        dash: tuple[float, float] | None = None,
+    ) -> None:
         """Draw a line.
 
         Args:
             points: Points on it (px), shape (n, 2), two at least.
             colour: Its colour.
             width: Its width (px).
+            dash: Length of a dash and of a gap (px); None: without gaps.
         """
-        scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
+        thick = max(round(_OVERSAMPLING * width), 1)
+        if dash is not None:
+            scaled = _scale_points(_find_dashes(np.asarray(points, float), *dash))
+            for start, end in zip(scaled[::2], scaled[1::2], strict=True):
+                pygame.draw.line(self._large, colour, start, end, thick)
+            return
+        scaled = _scale_points(points)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
-        if thick > 4:
-            for point in scaled:
-                pygame.draw.circle(self._large, colour, point, thick / 2)
-
-    def draw_dashes(
-        self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
-    ) -> None:
-        """Draw a dashed line.
-
-        Args:
-            points: Points on it (px), shape (n, 2), two at least.
-            colour: Its colour.
-            width: Its width (px).
-            dash: Length of a dash (px).
-            gap: Length of a gap (px).
-        """
-        vertices = np.asarray(points, float)
-        steps = np.hypot(*np.diff(vertices, axis=0).T)
-        length = np.concatenate([[0.0], np.cumsum(steps)])
-        starts = np.arange(0.0, length[-1], dash + gap)
-        ends = np.stack([starts, np.minimum(starts + dash, length[-1])], 1).ravel()
-        places = [np.interp(ends, length, coordinate) for coordinate in vertices.T]
-        scaled = _scale_points(np.stack(places, 1))
-        for start, end in zip(scaled[::2], scaled[1::2], strict=True):
-            pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
+        for point in scaled if thick > 4 else ():
+            pygame.draw.circle(self._large, colour, point, thick / 2)
 
     def draw_disc(
         self, centre: Points, radius: float, colour: str, width: float | None = None
@@ -192,6 +182,15 @@ def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     width, height = picture.get_size()
     flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
     return flat.reshape(height, width, 3).copy()
+
+
+def _find_dashes(vertices: Array, dash: float, gap: float) -> Array:
+    """Find the ends of a line's dashes, one after the other, (n, 2)."""
+    steps = np.hypot(*np.diff(vertices, axis=0).T)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    starts = np.arange(0.0, length[-1], dash + gap)
+    ends = np.stack([starts, np.minimum(starts + dash, length[-1])], 1).ravel()
+    return np.stack([np.interp(ends, length, coordinate) for coordinate in vertices.T], 1)
 
 
 def _scale_box(box: Box) -> list[int]:

@@ -6,7 +6,7 @@ standard deviation.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from .trace import TRACE_POINT, RenderState
 MAX_SPAN = 10.0  # s that are shown at most
 _DEGREES = math.degrees(1.0)
 _GRID, _ROW = "#E3E6E9", 20.0
+_DASH = (6.0, 5.0)  # pixels of a dash and a gap
 
 
 class _ChartLine(NamedTuple):
@@ -125,8 +126,7 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
         is_known = np.isfinite(line.values)
         points = to_pixels(line.t[is_known], line.values[is_known])
         if len(points) > 1:
-            draw_points = canvas.draw_dashes if line.dashed else canvas.draw_line
-            draw_points(points, line.colour, line.width)
+            canvas.draw_line(points, line.colour, line.width, _DASH if line.dashed else None)
         if len(points) and not line.dashed:
             canvas.draw_disc(points[-1], 2.6, line.colour)
     canvas.set_clip(None)
@@ -139,7 +139,6 @@ def _find_nice_limit(limit: float) -> float:
     return next(candidate for candidate in candidates if candidate >= limit - 1e-9)
 
 
-_ToPixels = Callable[[Array], Array]  # from car axes to pixels
 _GREEN = PALETTE[2]
 _PAPER = "#F7F8F8"
 MAGNIFIED = 4.0  # times the sideslip angle is drawn
@@ -155,18 +154,14 @@ def _draw_closeup(
     estimates: dict[str, tuple[float, str]],
 ) -> None:
     """Draw a car, its sideslip angle, reference and estimates (rad) with their colours by label."""
-    front, rear, half = road.compute_body(scene.vehicle)
+    body = front, rear, half = road.compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
     x_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear)
     y_0 = box[1] + 0.5 * box[3]
-
-    def to_pixels(points: Array) -> Array:
-        x, y = np.asarray(points, float).T * scale
-        return np.stack([x_0 + x, y_0 - y], 1)
-
-    canvas.draw_polygon(to_pixels(road.make_body_outline(rear, front, half)), "#C9CED4")
-    inner = road.make_body_outline(rear + 0.02, front - 0.02, half - 1.5 / scale)
-    canvas.draw_polygon(to_pixels(inner), "#EDEFF1")
+    to_pixels = road.Projection((x_0, y_0), scale)
+    canvas.draw_polygon(to_pixels(body.outline), "#C9CED4")
+    inner = body._replace(front=front - 0.02, rear=rear + 0.02, half=half - 1.5 / scale)
+    canvas.draw_polygon(to_pixels(inner.outline), "#EDEFF1")
     per_newton = _CIRCLE / (0.3 * scene.vehicle.mass * GRAVITY)
     for wheel in scene.wheels:
         centre = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
@@ -175,7 +170,7 @@ def _draw_closeup(
             canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
             canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
     for wheel in scene.wheels:
-        outline = road.make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)
+        outline = wheel.outline(scene.vehicle.wheel_radius)
         canvas.draw_polygon(to_pixels(outline), "#A9B0B7")
     _draw_forces(canvas, scene, to_pixels, per_newton)
     _draw_motors(canvas, box, scene, to_pixels)
@@ -193,7 +188,7 @@ def _draw_closeup(
 
 
 def _draw_forces(
-    canvas: Canvas, scene: road.CarScene, to_pixels: _ToPixels, per_newton: float
+    canvas: Canvas, scene: road.CarScene, to_pixels: road.Projection, per_newton: float
 ) -> None:
     """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
@@ -210,7 +205,9 @@ def _draw_forces(
             canvas.draw_text((start[0], start[1] - gap), words, colour, 12, 0.5)
 
 
-def _draw_motors(canvas: Canvas, box: Box, scene: road.CarScene, to_pixels: _ToPixels) -> None:
+def _draw_motors(
+    canvas: Canvas, box: Box, scene: road.CarScene, to_pixels: road.Projection
+) -> None:
     """Draw each rear motor's torque as a bar, to the right where it drives."""
     for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
         _, y = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
@@ -237,7 +234,7 @@ def _draw_directions(
         return foot + length * np.array([math.cos(magnified), -math.sin(magnified)])
 
     canvas.draw_line(np.array([foot, find_tip(0.0, 138.0)]), "#C3C8CE", 1.0)
-    canvas.draw_dashes(np.array([foot, find_tip(reference, 138.0)]), INK, 1.0, 4.0, 3.0)
+    canvas.draw_line(np.array([foot, find_tip(reference, 138.0)]), INK, 1.0, (4.0, 3.0))
     for angle, colour in estimates.values():
         canvas.draw_line(np.array([foot, find_tip(angle, 132.0)]), colour, 2.0)
     canvas.draw_arrow(foot, find_tip(beta, 122.0), INK, 3.0)
@@ -314,8 +311,8 @@ def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[
     entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
-        draw_sample = canvas.draw_dashes if dashed else canvas.draw_line
-        draw_sample([(x, 272.0), (x + 20.0, 272.0)], shade, 1.5 if dashed else 2.5)
+        width, dash = (1.5, _DASH) if dashed else (2.5, None)
+        canvas.draw_line([(x, 272.0), (x + 20.0, 272.0)], shade, width, dash)
         x += 26.0 + canvas.draw_text((x + 26.0, 272.0), words, INK, 12) + 18.0
 
 

@@ -7,16 +7,14 @@ import numpy.typing as npt
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
-from ..engine.config import EpisodeConfig
 from ..engine.layout import P, Z
+from ..engine.views import Episode
 from ..record import Array
 from ..ticks import TICK
 from ..validation import check_choice
 from .trace import EpisodeTrace, RenderState
 
 Frame = npt.NDArray[np.uint8]
-PackedArrays = tuple[Array, Array, npt.NDArray[np.int64], Array, EpisodeConfig]
-"""The first fields of a `RenderState`."""
 _MODES = ("human", "rgb_array")
 _TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a control period
 
@@ -46,8 +44,8 @@ class RenderMixin:
         self.metadata = {**self.metadata, "render_fps": rate}
         self._traces = [EpisodeTrace()] if mode == "human" else []
 
-    def _get_packed_arrays(self, row: int) -> PackedArrays:
-        """Get a car's packed numbers: views, which change with the car."""
+    def _get_episode(self, row: int) -> Episode:
+        """Get a car's episode: views, which change with the car."""
         raise NotImplementedError
 
     def _record_step(self) -> None:
@@ -56,8 +54,8 @@ class RenderMixin:
         Called where `_traces` has some. The window is an estimate behind: wrappers estimate later.
         """
         for row, trace in enumerate(self._traces):
-            _, state, _, report, _ = self._get_packed_arrays(row)
-            trace.add(report, state)
+            episode = self._get_episode(row)
+            trace.add(episode.report, episode.state)
         if self.render_mode == "human":
             self._show()
 
@@ -85,12 +83,12 @@ class RenderMixin:
         """
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(getattr(self, "num_envs", 1))]
-        arrays, trace = self._get_packed_arrays(row), self._traces[row]
-        render_state = RenderState(*arrays, trace, self._has_tyre_forces)
+        episode, trace = self._get_episode(row), self._traces[row]
+        render_state = RenderState(*episode[:5], trace, self._has_tyre_forces)
         if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
-        if render_state.trace.is_empty:
-            render_state.trace.add(render_state.report, render_state.state)
+        if trace.is_empty:
+            trace.add(render_state.report, render_state.state)
         return render_state
 
     def _render_frames(self) -> tuple[Frame, ...] | None:

@@ -36,15 +36,11 @@ from .canvas import Box, Canvas
 from .palette import INK, PALETTE, mix_colours
 from .trace import TRACE_POINT, RenderState
 
-_make_step_params = as_python(make_step_params)
-_make_step_variant = as_python(make_step_variant)
-_compute_static_load = as_python(compute_static_load)
-_compute_tyres = as_python(compute_tyres)
+_make_step_params, _make_step_variant = as_python(make_step_params), as_python(make_step_variant)
+_compute_static_load, _compute_tyres = as_python(compute_static_load), as_python(compute_tyres)
 _compute_lateral_forces = as_python(compute_lateral_forces)
-_apply_tyre_change = as_python(apply_tyre_change)
-_compute_gravity = as_python(compute_gravity)
-_compute_torque_limit = as_python(compute_torque_limit)
-_compute_wind = as_python(compute_wind)
+_apply_tyre_change, _compute_gravity = as_python(apply_tyre_change), as_python(compute_gravity)
+_compute_torque_limit, _compute_wind = as_python(compute_torque_limit), as_python(compute_wind)
 _compute_lane_quality = as_python(compute_lane_quality)
 _step_nominal_car = as_python(step_nominal_car)
 _compute_curvature = as_python(compute_curvature, ARRAYS)
@@ -54,7 +50,29 @@ _KNOWN_LENGTH = 45  # m of road in a scene before the car, and behind it; fewer 
 _DEFAULT_HALF_ANGLE = 0.35  # rad to either side, where the scenario's camera sees at any heading
 
 
-class Wheel(NamedTuple):
+class _Body(NamedTuple):
+    """The extent of a car's body from its centre of gravity (m)."""
+
+    front: float
+    rear: float  # negative
+    half: float  # of the width
+
+    @property
+    def outline(self) -> Array:
+        """A box with elliptic corners, longer at the front: points in car axes (m), (n, 2)."""
+        front, rear, half = self
+        turn = np.linspace(0.0, 0.5 * np.pi, 6)
+        outline = []
+        for x, a, b in ((front, 0.45, 0.4), (rear, 0.2, 0.25)):
+            a, b = min(a, 0.3 * (front - rear)), min(b, 0.7 * half)
+            sign = 1.0 if x > 0.0 else -1.0
+            corner = x - sign * a * (1.0 - np.cos(turn)), half - b * (1.0 - np.sin(turn))
+            outline.append(np.stack(corner, 1)[:: int(sign)])
+        left = np.concatenate(outline)
+        return np.concatenate([left, left[::-1] * (1.0, -1.0)])
+
+
+class _Wheel(NamedTuple):
     """A wheel in car axes, x ahead and y to the left of the centre of gravity."""
 
     x: float  # m
@@ -63,6 +81,13 @@ class Wheel(NamedTuple):
     F_x: float  # N, in the wheel's own axes, of the road on the tyre
     F_y: float
     capacity: float  # N in all directions; 0: without a limit
+
+    def outline(self, r: float) -> Array:
+        """Make the corners of a wheel of a radius (m), points in car axes (m), (4, 2)."""
+        w, cos, sin = 0.3 * r, np.cos(self.angle), np.sin(self.angle)
+        corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
+        rotated: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (self.x, self.y)
+        return rotated
 
 
 class _CameraOverlay(NamedTuple):
@@ -81,7 +106,7 @@ class CarScene(NamedTuple):
     steer: float  # rad, front wheels
     torques: tuple[float, float]  # N m, left and right motor
     max_torque: float  # N m, of one motor
-    wheels: tuple[Wheel, ...]  # front left and right, rear left and right
+    wheels: tuple[_Wheel, ...]  # front left and right, rear left and right
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
     field_of_view: _CameraOverlay | None  # None without a camera
@@ -107,9 +132,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
     car = _apply_tyre_change(params.car, params.tyre_change, tick >= params.tyre_change.tick)
     load = _compute_static_load(drive, car, variant)
     _, g_y = _compute_gravity(motion, params.road, variant.small_angle)
-    a, b, c, d, F_x, N_z = _compute_tyres(
-        motion, load, car, g_y, variant.small_angle, variant.law, variant.roll
-    )
+    a, b, c, d, F_x, N_z = _compute_tyres(motion, load, car, g_y, variant)
     tyres = a, b, c, d
     lateral = _compute_lateral_forces(*tyres, variant.law, variant.small_angle)
     turn = N_z / car.d_r
@@ -121,7 +144,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if variant.law == LINEAR else math.hypot(tyre.limit, F_wx)
         forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
-        wheels.append(Wheel(*place, *forces))
+        wheels.append(_Wheel(*place, *forces))
     lanes = _find_lanes(params.path, config)
     s = np.arange(motion.s - _KNOWN_LENGTH, motion.s + _KNOWN_LENGTH, 0.5) if lanes else np.empty(0)
     return CarScene(
@@ -188,18 +211,18 @@ class CarTrack(NamedTuple):
     name: str = ""
 
 
-class _GroundProjection(NamedTuple):
-    """A projection from the ground to pixels."""
+class Projection(NamedTuple):
+    """A projection from the ground, or a car's axes, to pixels."""
 
-    x: float  # m, the place on the ground that is drawn at `centre`
-    y: float
-    cos: float  # of the direction that is drawn to the right
-    sin: float
     centre: tuple[float, float]  # pixels
     scale: float  # pixels a metre
+    x: float = 0.0  # m, the place that is drawn at `centre`
+    y: float = 0.0
+    cos: float = 1.0  # of the direction that is drawn to the right
+    sin: float = 0.0
 
     def __call__(self, points: Array) -> Array:
-        """Project places on the ground to pixels, both of shape (n, 2)."""
+        """Project places to pixels, both of shape (n, 2)."""
         rel = np.asarray(points, float) - (self.x, self.y)
         right = rel[:, 0] * self.cos + rel[:, 1] * self.sin
         up = rel[:, 1] * self.cos - rel[:, 0] * self.sin
@@ -235,7 +258,7 @@ class _RoadPicture(NamedTuple):
 
     canvas: Canvas
     box: Box
-    project: _GroundProjection
+    project: Projection
     centre_line: _CentreLine
     scene: CarScene
     s: Array  # m, places along the road that are drawn
@@ -286,7 +309,7 @@ class _RoadPicture(NamedTuple):
             canvas.draw_text((x + 4.0, bottom - 10.0), f"{place:.0f} m", SOFT, 11)
         if scene.lanes:
             path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
-            canvas.draw_dashes(self.locate(*path.T), SOFT, 1.0, 2.0, 4.0)
+            canvas.draw_line(self.locate(*path.T), SOFT, 1.0, (2.0, 4.0))
         else:
             edge = scene.half_width if scene.half_width <= 10.0 else _LANE
             for side in (-edge, edge):
@@ -311,9 +334,9 @@ class _RoadPicture(NamedTuple):
         for car, (x, y) in zip(cars, poses, strict=True):
             front, rear, half = self.project.scale * np.array(compute_body(car.scene.vehicle))
             heading = car.scene.motion.psi - self.scene.motion.theta
-            cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
+            cos, sin, long, shift = np.cos(heading), np.sin(heading), front - rear, front + rear
             size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
-            taken.append((x + 0.5 * ahead * cos, y - 0.5 * ahead * sin, *size))
+            taken.append((x + 0.5 * shift * cos, y - 0.5 * shift * sin, *size))
         for i, car in enumerate(cars):
             x, y, _, tall = taken[i]
             below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
@@ -345,7 +368,7 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     y = motion.y - min(max(motion.y, -reach), reach)
     x_0, y_0 = road.locate(np.array([motion.s]), np.array([y]))[0]
     centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
-    view = _GroundProjection(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
+    view = Projection(centre, scale, x_0, y_0, np.cos(motion.theta), np.sin(motion.theta))
     s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
     picture = _RoadPicture(canvas, box, view, road, scene, s)
     canvas.set_clip(box)
@@ -360,82 +383,34 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     poses = [view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0] for car in cars]
     for car, pose in zip(cars, poses, strict=True):
         heading = car.scene.motion.psi - motion.theta
-        _draw_car(canvas, pose, heading, scale, car.scene, car.colour)
+        turned = Projection((pose[0], pose[1]), scale, cos=np.cos(heading), sin=-np.sin(heading))
+        _draw_car(canvas, turned, car.scene, car.colour)
     picture.draw_names(cars, poses)
     canvas.set_clip(None)
 
 
-def _draw_car(
-    canvas: Canvas, place: Array, heading: float, scale: float, scene: CarScene, colour: str
-) -> None:
-    """Draw a car at a place (px), its heading (rad) from the right, left positive."""
-    cos, sin = np.cos(heading), np.sin(heading)
-
-    def to_pixels(points: Array) -> Array:
-        x, y = np.asarray(points, float).T * scale
-        return np.stack([place[0] + x * cos - y * sin, place[1] - x * sin - y * cos], 1)
-
-    front, rear, half = compute_body(scene.vehicle)
+def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str) -> None:
+    """Draw a car by the projection of its axes."""
+    body = front, rear, half = compute_body(scene.vehicle)
     for wheel in scene.wheels:  # further out than they are, to be seen
-        outline = make_wheel_outline(wheel.x, np.sign(wheel.y) * half, wheel.angle, scene.vehicle)
-        canvas.draw_polygon(to_pixels(outline), _TYRE)
-    canvas.draw_polygon(to_pixels(make_body_outline(rear, front, half)), colour)
+        shown = wheel._replace(y=np.sign(wheel.y) * half)
+        canvas.draw_polygon(project(shown.outline(scene.vehicle.wheel_radius)), _TYRE)
+    canvas.draw_polygon(project(body.outline), colour)
     glass, length = mix_colours(INK, colour, 0.55), front - rear
     for rear_share, front_share, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
         x, y = rear + np.array([rear_share, front_share]) * length, np.array([foot, tip]) * half
         window = np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)
-        canvas.draw_polygon(to_pixels(window), glass)
+        canvas.draw_polygon(project(window), glass)
 
 
-def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
-    """Compute the extent of a car's body from its centre of gravity.
+def compute_body(vehicle: Vehicle) -> _Body:
+    """Compute the extent of a car's body.
 
     Args:
         vehicle: Vehicle with the axles' places and the width.
 
     Returns:
-        Front, rear (negative) and half width (m).
+        Front, rear and half width (m).
     """
     over = 0.5 * (_LENGTH_RATIO - 1.0) * vehicle.wheelbase
-    return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
-
-
-def make_body_outline(rear: float, front: float, half: float) -> Array:
-    """Make a body's outline: a box with elliptic corners, longer at the front.
-
-    Args:
-        rear: Place of the rear (m), negative.
-        front: Place of the front (m).
-        half: Half the width (m).
-
-    Returns:
-        Points in car axes (m), shape (n, 2).
-    """
-    turn = np.linspace(0.0, 0.5 * np.pi, 6)
-    outline = []
-    for x, y, a, b in ((front, half, 0.45, 0.4), (rear, half, 0.2, 0.25)):
-        a, b = min(a, 0.3 * (front - rear)), min(b, 0.7 * half)
-        sign = 1.0 if x > 0.0 else -1.0
-        corner = np.stack([x - sign * a * (1.0 - np.cos(turn)), y - b * (1.0 - np.sin(turn))], 1)
-        outline.append(corner if x > 0.0 else corner[::-1])
-    left = np.concatenate(outline)
-    return np.concatenate([left, left[::-1] * (1.0, -1.0)])
-
-
-def make_wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Array:
-    """Make the corners of a wheel.
-
-    Args:
-        x: Place ahead of the centre of gravity (m).
-        y: Place to its left (m).
-        angle: Steering angle (rad).
-        vehicle: Vehicle with the wheels' radius.
-
-    Returns:
-        Points in car axes (m), shape (4, 2).
-    """
-    r, w = vehicle.wheel_radius, 0.3 * vehicle.wheel_radius
-    corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
-    cos, sin = np.cos(angle), np.sin(angle)
-    rotated: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
-    return rotated
+    return _Body(vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width)

@@ -35,15 +35,16 @@ class TracePoint(NamedTuple):
 TRACE_POINT = TracePoint()
 _REPORT_COLUMNS = [getattr(REPORT, name) for name in TracePoint._fields[: TRACE_POINT.X]]
 _STATE_COLUMNS = [getattr(Z.motion, name) for name in TracePoint._fields[TRACE_POINT.X :]]
+_UNKNOWN = (np.nan, np.nan)
 
 
 class EpisodeTrace:
     """The recorded steps of an episode: truth and estimates."""
 
     def __init__(self) -> None:
-        self._rows = np.empty((256, len(TRACE_POINT)))
-        self._count = 0
-        self._estimates: dict[str, Array] = {}
+        self._rows: list[Array] = []
+        self._estimates: list[dict[str, tuple[float, float]]] = []  # of each row, by label
+        self._labels: dict[str, None] = {}
 
     def add(self, report: Array, state: Array) -> None:
         """Add a step; one that is not after the last begins a new episode.
@@ -52,15 +53,10 @@ class EpisodeTrace:
             report: Report of the step, shape (len(StepReport),).
             state: Packed state of the car.
         """
-        t, k = report[REPORT.t], self._count
-        if k and t <= self._rows[k - 1, TRACE_POINT.t]:
-            k, self._estimates = 0, {}
-        if k == len(self._rows):
-            self._rows = _extend_rows(self._rows)
-            self._estimates = {name: _extend_rows(x) for name, x in self._estimates.items()}
-        self._rows[k, : TRACE_POINT.X] = report[_REPORT_COLUMNS]
-        self._rows[k, TRACE_POINT.X :] = state[_STATE_COLUMNS]
-        self._count = k + 1
+        if self._rows and report[REPORT.t] <= self.newest[TRACE_POINT.t]:
+            self._rows, self._estimates, self._labels = [], [], {}
+        self._rows.append(np.concatenate([report[_REPORT_COLUMNS], state[_STATE_COLUMNS]]))
+        self._estimates.append({})
 
     def add_estimate(self, label: str, value: float, deviation: float) -> None:
         """Add an estimate of the sideslip angle to the newest step.
@@ -70,20 +66,18 @@ class EpisodeTrace:
             value: Sideslip angle (rad).
             deviation: Standard deviation (rad).
         """
-        if label not in self._estimates:
-            self._estimates[label] = np.full((len(self._rows), 2), np.nan)
-        self._estimates[label][self._count - 1] = value, deviation
+        self._labels[label] = None
+        self._estimates[-1][label] = value, deviation
 
     @property
     def is_empty(self) -> bool:
         """Whether no step is recorded."""
-        return self._count == 0
+        return not self._rows
 
     @property
     def newest(self) -> Array:
         """The truth of the newest step, shape (len(TracePoint),)."""
-        newest: Array = self._rows[self._count - 1]
-        return newest
+        return self._rows[-1]
 
     def select_since(self, t: float, max_points: int = 400) -> tuple[Array, dict[str, Array]]:
         """Select the steps from a time on, thinned out.
@@ -96,10 +90,15 @@ class EpisodeTrace:
             The truth, shape (n, len(TracePoint)), and by label estimates and deviations (rad),
             shape (n, 2), NaN where there are none.
         """
-        first = int(np.searchsorted(self._rows[: self._count, TRACE_POINT.t], t))
-        step = max((self._count - first) // max_points, 1)
-        chosen = np.arange(self._count - 1, first - 1, -step)[::-1]
-        return self._rows[chosen], {name: x[chosen] for name, x in self._estimates.items()}
+        times = [row[TRACE_POINT.t] for row in self._rows]
+        first = int(np.searchsorted(times, t))
+        step = max((len(times) - first) // max_points, 1)
+        chosen = range(len(times) - 1, first - 1, -step)[::-1]
+        estimates = {
+            label: np.array([self._estimates[k].get(label, _UNKNOWN) for k in chosen])
+            for label in self._labels
+        }
+        return np.array([self._rows[k] for k in chosen]), estimates
 
 
 _RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]
@@ -117,7 +116,3 @@ class RenderState(NamedTuple):
     trace: EpisodeTrace
     has_tyre_forces: bool = True  # its tyres are those of our plant
     world: _RoadPainter | None = None  # draws the road instead
-
-
-def _extend_rows(rows: Array) -> Array:
-    return np.concatenate([rows, np.full_like(rows, np.nan)])

@@ -1,14 +1,12 @@
 """Random draws of an episode: ranges, numbers drawn from them, and redraws of unstable cars."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
 from ..numerics.packed import make_offsets, read
 from ..numerics.primitives import Scalar, Vector, select
-
-if TYPE_CHECKING:
-    from ..vehicle.dynamics import CarParams
+from ..vehicle.dynamics import CarParams
 
 _ATTEMPTS = 64
 
@@ -46,6 +44,40 @@ class Draws(NamedTuple):
     bank: Scalar  # rad
     initial_beta: Scalar  # rad, where the episode begins
     initial_gamma: Scalar  # rad/s
+    # from here on the ranges of a `World`, in its order
+    camera_yaw: Scalar  # rad
+    camera_pitch: Scalar  # rad
+    camera_height: Scalar
+    steer_offset: Scalar  # rad
+    steer_scale: Scalar
+    wheel_scale: Scalar
+    wheel_left: Scalar
+    torque_scale: Scalar
+    torque_left: Scalar
+    torque_rate: Scalar  # 1/s
+    gyro_scale: Scalar
+    gyro_drift: Scalar  # rad/s2
+    accel_scale: Scalar
+    accel_roll: Scalar  # rad
+    accel_ahead: Scalar  # m
+    vibration: Scalar  # m/s2
+    course_error: Scalar  # rad m/s
+    course_period: Scalar  # s
+    gps_stamp: Scalar  # s
+    map_error: Scalar  # 1/m
+    map_length: Scalar  # m
+    map_lag: Scalar  # s
+    load: Scalar
+    inertia: Scalar
+    gravity_shift: Scalar
+    bank_wave: Scalar  # rad
+    bank_length: Scalar  # m
+    gust: Scalar  # m/s2
+    friction_wave: Scalar
+    friction_length: Scalar  # m
+    friction_across: Scalar
+    relaxation: Scalar
+    phase: Scalar  # uniform in (0, 1): where the waves of a world begin
 
 
 DRAWS, DRAWS_WIDTH = make_offsets(Draws)
@@ -64,19 +96,39 @@ def _draw_numbers(
 
 
 @jit
-def _is_stable(d: Draws, car: "CarParams") -> Scalar:
+def draw_car(d: Draws, car: CarParams) -> CarParams:
+    """Load a car and draw its tyres.
+
+    Args:
+        d: `Draws`.
+        car: `CarParams` of the vehicle.
+
+    Returns:
+        `CarParams` with the load, which rolls with the body, and the drawn stiffness.
+    """
+    laden, shift = 1.0 + d.load, d.gravity_shift * (car.l_f + car.l_r)
+    drawn = (
+        car.m * laden, car.I * laden * d.inertia, car.l_f + shift, car.l_r - shift,
+        car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness,
+    )  # fmt: skip
+    body = (car.S * laden, car.I_x * laden)  # fields 12 and 13
+    return CarParams(*(drawn + car[6:12] + body + car[14:]))
+
+
+@jit
+def _is_stable(d: Draws, car: CarParams) -> Scalar:
     """Check whether the drawn car is stable, before its tyres change and after."""
-    C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
+    drawn = draw_car(d, car)
     has_change = d.tyre_change_time > 0.0
-    later_f = C_f * select(has_change, d.front_change, 1.0)
-    later_r = C_r * select(has_change, d.rear_change, 1.0)
-    return _is_below_critical(C_f, C_r, d.speed, car) & _is_below_critical(
-        later_f, later_r, d.speed, car
+    later_f = drawn.C_f * select(has_change, d.front_change, 1.0)
+    later_r = drawn.C_r * select(has_change, d.rear_change, 1.0)
+    return _is_below_critical(drawn.C_f, drawn.C_r, d.speed, drawn) & _is_below_critical(
+        later_f, later_r, d.speed, drawn
     )
 
 
 @jit
-def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: "CarParams") -> Scalar:
+def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: CarParams) -> Scalar:
     """Check whether 1.05 times a speed (m/s) is below the critical speed of linear tyres."""
     excess = C_f * car.l_f - C_r * car.l_r
     l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
@@ -85,7 +137,7 @@ def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: "CarParams"
 
 @jit
 def draw_stable(
-    low: Vector, high: Vector, key_low: int, key_high: int, car: "CarParams", out: Vector
+    low: Vector, high: Vector, key_low: int, key_high: int, car: CarParams, out: Vector
 ) -> tuple[Draws, int]:
     """Draw until the vehicle is stable, at most 64 times.
 

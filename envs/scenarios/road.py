@@ -10,9 +10,9 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
-from ..numerics.functions import smoothstep
+from ..numerics.functions import PI, sincos, smoothstep
 from ..numerics.jit import inline, jit
-from ..numerics.primitives import Scalar, maximum
+from ..numerics.primitives import Scalar, any_lane, floor, maximum, select
 from ..ticks import TICK
 from ..vehicle.linear import Bicycle, compute_bicycle_coefficients
 
@@ -79,6 +79,11 @@ class TrackPath(NamedTuple):
     shift_2: Scalar
     start_2: Scalar
     length_2: Scalar
+    # a weave to the left before it, from the start of an episode on
+    weave: Scalar = 0.0  # m
+    weave_start: Scalar = 0.0  # m, along the road
+    weave_end: Scalar = 0.0
+    weave_rate: Scalar = 0.0  # rad/m
 
 
 def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
@@ -172,7 +177,30 @@ def transform_path(path: TrackPath, start: Scalar, scale: Scalar, side: Scalar) 
     return TrackPath(
         side * path.shift_1, start + scale * path.start_1, scale * path.length_1,
         side * path.shift_2, start + scale * path.start_2, scale * path.length_2,
+        path.weave, path.weave_start, path.weave_end, path.weave_rate,
     )  # fmt: skip
+
+
+_WEAVE, _WEAVE_TIME = 1.0, 5.0  # m, s: gentle, 0.8 m/s2
+
+
+@jit
+def add_weave(path: TrackPath, start: Scalar, speed: Scalar, length: Scalar) -> TrackPath:
+    """Add a gentle weave before the track, in whole waves.
+
+    Args:
+        path: `TrackPath`.
+        start: Place along the road where it begins (m).
+        speed: Speed of the car (m/s).
+        length: Time that it takes (s), positive.
+
+    Returns:
+        The `TrackPath`.
+    """
+    distance = maximum(speed, _MIN_SPEED) * length
+    rate = 2.0 * PI * maximum(floor(length / _WEAVE_TIME + 0.5), 1.0) / distance
+    weave = (_WEAVE, start, start + distance, rate)
+    return TrackPath(*(path[:6] + weave))
 
 
 @jit
@@ -187,4 +215,9 @@ def compute_path_offset(path: TrackPath, s: Scalar) -> Scalar:
         Offset (m), to the left.
     """
     first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
-    return first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)
+    offset = first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)
+    if any_lane(path.weave != 0.0):
+        is_within = (s > path.weave_start) & (s < path.weave_end)
+        cosine = sincos(path.weave_rate * (s - path.weave_start))[1]
+        offset = offset + select(is_within, path.weave * 0.5 * (1.0 - cosine), 0.0)
+    return offset

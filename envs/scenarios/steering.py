@@ -19,7 +19,8 @@ SINES, STEPS = 4, 3
 _RAMP_START = 5 * SINES + 3 * STEPS
 _SWEEP_START = _RAMP_START + 3
 WANDER_START = _SWEEP_START + 5
-STEERING_WIDTH = WANDER_START + 3
+_LEAD_START = WANDER_START + 3
+STEERING_WIDTH = _LEAD_START + 4
 _RISE = 0.2  # s, of a step
 
 
@@ -66,6 +67,12 @@ def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
             + (t - sweep_time)
         )
         angle = angle + load_element(profile, k) * sincos(phase)[0]
+    k = _LEAD_START
+    if any_lane(load_element(profile, k) != 0.0):
+        first, _ = sincos(load_element(profile, k + 1) * tick)
+        second, _ = sincos(load_element(profile, k + 2) * tick)
+        lead = load_element(profile, k) * (first + second)
+        angle = angle + select(tick < load_element(profile, k + 3), lead, 0.0)
     return angle
 
 
@@ -198,3 +205,22 @@ def write_steering(kind: int, d: Draws, profile: Vector) -> None:
         decay, noise_gain = compute_wander_gains(d.amplitude, d.frequency, d.hold)
         k = WANDER_START
         profile[k], profile[k + 1], profile[k + 2] = decay, noise_gain, round_to_ticks(d.hold)
+
+
+_LEAD_FREQUENCIES = 0.2, 0.35  # Hz, about: whole waves, so that heading and angle come back to zero
+
+
+@jit
+def write_gentle_steering(length: Scalar, amplitude: Scalar, profile: Vector) -> None:
+    """Write the gentle steering before a manoeuvre: two sines.
+
+    Args:
+        length: Its length (ticks), positive.
+        amplitude: Amplitude of each sine (rad).
+        profile: Array of the profile, at least STEERING_WIDTH long.
+    """
+    k, seconds = _LEAD_START, length * TICK
+    profile[k], profile[k + 3] = amplitude, length
+    for i in range(2):
+        waves = maximum(floor(_LEAD_FREQUENCIES[i] * seconds + 0.5), 1.0)
+        profile[k + 1 + i] = 2.0 * PI * waves / length

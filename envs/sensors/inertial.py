@@ -14,8 +14,9 @@ from ..vehicle.parameters import GRAVITY
 class NormalDraws(NamedTuple):
     """Random numbers of a tick, four standard normal ones each."""
 
-    inertial: Vector
-    wheels: Vector
+    inertial: Vector  # gyro, accel_y, accel_x, roll rate
+    wheels: Vector  # left and right wheel speed; lateral force and yaw moment that disturb
+    vibration: Scalar  # of a_y
 
 
 @inline
@@ -41,7 +42,7 @@ def compute_specific_force(
     a_y = (after.v_y - before.v_y) * (1.0 / TICK) + turn_y
     if roll:
         a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
-    if any_lane((road.longitudinal != 0.0) | (road.lateral != 0.0)):
+    if any_lane((road.longitudinal != 0.0) | (road.lateral != 0.0) | (road.wave != 0.0)):
         first = compute_gravity(before, road, small_angle)
         last = compute_gravity(after, road, small_angle)
         a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])

@@ -77,6 +77,14 @@ class Link(NamedTuple):
     duplicate: Scalar
     outage_start: Scalar
     outage_end: Scalar
+    stamp: Scalar  # what a packet's stamp is after its capture; drawn
+
+    @property
+    def max_in_flight(self) -> int:
+        """The most packets of a present sensor under way at once, duplicates included."""
+        longest = max(self.delay_0, self.delay_1, self.delay_2, self.delay_3) + self.jitter
+        n_packets = int(longest // self.period) + 1
+        return 2 * (n_packets + 1) if self.duplicate > 0.0 else n_packets
 
 
 def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
@@ -95,39 +103,18 @@ def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = No
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
     delays = [count_ticks(delay) for delay in sensor.delays]
+    phase = -1.0 if sensor.phase is None else count_ticks(sensor.phase)
     link = Link._make(
-        [
-            count_ticks(sensor.period),
-            -1.0 if sensor.phase is None else count_ticks(sensor.phase),
-            float(len(delays)),
-            *(delays + [0.0] * (4 - len(delays))),
-            count_ticks(sensor.jitter),
-            sensor.loss,
-            sensor.duplicate,
-            *map(count_ticks, outage or (0.0, 0.0)),
-        ]
-    )
-    max_in_flight = count_max_in_flight(link)
-    if max_in_flight > MAX_IN_FLIGHT:
+        [count_ticks(sensor.period), phase, float(len(delays)), *delays, *[0.0] * (4 - len(delays)),
+         count_ticks(sensor.jitter), sensor.loss, sensor.duplicate,
+         *map(count_ticks, outage or (0.0, 0.0)), 0.0]
+    )  # fmt: skip
+    if link.max_in_flight > MAX_IN_FLIGHT:
         raise ValueError(
             f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s puts "
-            f"{max_in_flight} packets under way at once; there is room for {MAX_IN_FLIGHT}"
+            f"{link.max_in_flight} packets under way at once; there is room for {MAX_IN_FLIGHT}"
         )
     return link
-
-
-def count_max_in_flight(link: Link) -> int:
-    """Count the packets of a sensor that may be under way at once, duplicates included.
-
-    Args:
-        link: Clock and link of a sensor that is present.
-
-    Returns:
-        Largest number of packets.
-    """
-    longest = max(link.delay_0, link.delay_1, link.delay_2, link.delay_3) + link.jitter
-    max_in_flight = int(longest // link.period) + 1
-    return 2 * (max_in_flight + 1) if link.duplicate > 0.0 else max_in_flight
 
 
 @jit
@@ -178,7 +165,8 @@ def draw_clock_phase(link: Link, key_low: int, key_high: int, sensor: int) -> Sc
         The tick.
     """
     u = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)
-    return select(link.phase < 0.0, floor(u[0] * link.period), link.phase)
+    phase = select(link.phase < 0.0, floor(u[0] * link.period), link.phase)
+    return phase + select(phase + link.stamp < 0.0, link.period, 0.0)  # no stamp is before tick 0
 
 
 class PacketValue(NamedTuple):

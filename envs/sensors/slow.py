@@ -1,22 +1,61 @@
-"""The slow sensors: their table, a sample of any of them, and the sensors of each id.
+"""The slow sensors: their table, a sample of any of them, the GPS, and the sensors of each id.
 
-A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`:
-packets, observation, random numbers, reset and the gradient engine follow from the table.
+A new one is a file beside `camera`, a row of `SLOW` and a branch of `sample_sensor`: packets,
+observation, random numbers, reset and the gradient engine follow from the table.
 """
 
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..numerics.functions import draw_normals, exp
+from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos, wrap
 from ..numerics.jit import jit
-from ..numerics.primitives import Scalar, Vector, to_int
+from ..numerics.primitives import (
+    Scalar,
+    Vector,
+    floor,
+    maximum,
+    minimum,
+    select,
+    sqrt,
+    to_float,
+    to_int,
+)
 from ..validation import check_mapping, describe_unknown
-from ..vehicle.dynamics import CarParams, Motion, RoadParams
+from ..vehicle.dynamics import CarParams, Motion, RoadParams, compute_sideslip_angle
+from ..vehicle.tyres import MIN_SPEED
 from .camera import CAMERA_KIND, FieldOfView, compute_lane_quality, sample_camera
-from .gps import GPS_KIND, SatelliteGeometry, compute_hdop_deviation, sample_gps
+from .errors import SensorErrors, compute_course_error
 from .inertial import Noise
-from .link import Blocks, Link, SlowSensor
+from .link import Blocks, Link, PacketValue, SlowKind, SlowSensor
+
+GPS_KIND = SlowKind(
+    "gps",
+    (
+        PacketValue("course", "rad", PI),
+        PacketValue("speed", "m/s", 100.0),
+        PacketValue("X", "m", 1e5),
+        PacketValue("Y", "m", 1e5),
+        PacketValue("hdop", "-", 100.0),
+        PacketValue("satellites", "-", 50.0),
+    ),
+    Blocks(noise=CHANNELS.gps, link=CHANNELS.gps_link, drift=CHANNELS.sky),
+)
+COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
+HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
+"""Weights w by law: the GPS's standard deviations are (1 + w (HDOP - 1)) times those of `Noise`."""
+OUTAGE_JUMP = 3.0  # spreads by which log HDOP rises where an outage ends
+
+
+class SatelliteGeometry(NamedTuple):
+    """Satellite geometry: log HDOP is an Ornstein-Uhlenbeck process."""
+
+    median: Scalar  # log of the median HDOP
+    spread: Scalar  # standard deviation of log HDOP
+    decay: Scalar  # fraction of a deviation that remains after one period of the GPS
+    noise_gain: Scalar  # sqrt(1 - decay^2)
+    weight: Scalar  # of HDOP in the noise, HDOP_LAWS
+
 
 SLOW = (CAMERA_KIND, GPS_KIND)
 CAMERA, GPS = range(len(SLOW))
@@ -25,23 +64,13 @@ WIDTHS = tuple(len(kind.values) for kind in SLOW)  # values of each one's packet
 NEEDS_QUALITY = tuple(kind.needs_quality for kind in SLOW)
 VALUES = max(WIDTHS)  # of any packet, filled up with zeros
 
-_FIRST_BLOCK, _BLOCKS_PER_SENSOR = 1000, 10  # of random numbers, clear of `CHANNELS`
+
+def _make_blocks(place: int) -> Blocks:
+    """Make the channels of a sensor that names none itself, clear of `CHANNELS`."""
+    return Blocks(*range(1000 + 10 * place, 1003 + 10 * place))
 
 
-def make_blocks(place: int) -> Blocks:
-    """Make the channels of random numbers of a sensor that names none itself.
-
-    Args:
-        place: Place of the sensor in `SLOW`.
-
-    Returns:
-        The channels.
-    """
-    first = _FIRST_BLOCK + _BLOCKS_PER_SENSOR * place
-    return Blocks(noise=first, link=first + 1, drift=first + 2)
-
-
-BLOCKS = tuple(kind.blocks or make_blocks(place) for place, kind in enumerate(SLOW))
+BLOCKS = tuple(kind.blocks or _make_blocks(place) for place, kind in enumerate(SLOW))
 
 
 class MeasurementContext(NamedTuple):
@@ -53,6 +82,7 @@ class MeasurementContext(NamedTuple):
     noise: Noise
     sky: SatelliteGeometry
     field_of_view: FieldOfView
+    errors: SensorErrors
     small_angle: int
     key_low: Scalar
     key_high: Scalar
@@ -65,6 +95,53 @@ class Sample(NamedTuple):
     values: Vector  # VALUES numbers
     quality: Scalar
     drift: Scalar  # a number that the sensor carries from sample to sample
+
+
+@jit
+def _compute_hdop_deviation(
+    before: Scalar, sky: SatelliteGeometry, link: Link, tick: Scalar, n: Vector
+) -> Scalar:
+    """Compute the deviation of log HDOP from its median at a capture, from that before."""
+    is_after_outage = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
+    is_after_outage = is_after_outage & (tick - link.period < link.outage_end)
+    jump = select(is_after_outage, OUTAGE_JUMP * sky.spread, 0.0)
+    return sky.decay * before + sky.noise_gain * sky.spread * n[0] + jump
+
+
+@jit
+def _count_satellites(hdop: Scalar) -> Scalar:
+    """Count the satellites that a receiver sees: 12 at HDOP 1, 4 at HDOP 5, fewer above."""
+    return floor(2.0 + minimum(10.0 / hdop, 28.0))
+
+
+@jit
+def _sample_gps(context: "MeasurementContext", hdop: Scalar, n: Vector) -> tuple[Scalar, ...]:
+    """Sample the GPS at its antenna, with noise: six values and the quality."""
+    motion, noise, forward, left = (
+        context.motion,
+        context.noise,
+        context.car.forward,
+        context.car.left,
+    )
+    v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * forward
+    s, c = sincos(motion.psi)
+    noise_scale = 1.0 + context.sky.weight * (hdop - 1.0)
+    v = sqrt(v_x * v_x + v_y * v_y)
+    # course = psi + beta, dakf-stability (3), with the antenna's beta
+    angle = motion.psi + compute_sideslip_angle(v_x, v_y, context.small_angle)
+    angle = angle + compute_course_error(
+        to_float(to_int(context.tick)), maximum(v, MIN_SPEED), context.errors
+    )
+    course = wrap(angle + noise.course * noise_scale / maximum(v, MIN_SPEED) * n[0])
+    return (
+        course,
+        v + noise.gps_speed * noise_scale * n[1],
+        motion.X + (forward * c - left * s) + noise.gps_position * noise_scale * n[2],
+        motion.Y + (forward * s + left * c) + noise.gps_position * noise_scale * n[3],
+        hdop,
+        _count_satellites(hdop),
+        select(v < COURSE_SPEED, 0.0, 1.0),
+    )
 
 
 @jit
@@ -83,17 +160,16 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: S
     blocks, tick = BLOCKS[sensor], to_int(context.tick)
     n = draw_normals(context.key_low, context.key_high, tick, blocks.noise)
     if sensor == CAMERA:
-        psi, y_l = sample_camera(context.motion, context.road, context.car.l_pre, context.noise, n)
+        motion, l_pre, noise = context.motion, context.car.l_pre, context.noise
+        psi, y_l = sample_camera(motion, context.road, l_pre, noise, n, context.errors)
         quality = compute_lane_quality(context.motion, context.field_of_view)
         return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), quality, drift)
-    sky, car = context.sky, context.car
+    sky = context.sky
     drift_noise = draw_normals(context.key_low, context.key_high, tick, blocks.drift)
-    drift = compute_hdop_deviation(drift, sky, link, context.tick, drift_noise)
-    hdop = exp(sky.median + drift)
-    course, speed, X, Y, hdop, satellites, quality = sample_gps(
-        context.motion, car.forward, car.left, hdop, sky.weight, context.noise, n,
-        context.small_angle,
-    )  # fmt: skip
+    drift = _compute_hdop_deviation(drift, sky, link, context.tick, drift_noise)
+    course, speed, X, Y, hdop, satellites, quality = _sample_gps(
+        context, exp(sky.median + drift), n
+    )
     return Sample((course, speed, X, Y, hdop, satellites), quality, drift)
 
 

@@ -142,4 +142,4 @@ def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: "CarParams") -> Scalar:
     Returns:
         N_z (N m).
     """
-    return 0.5 * car.d_r / car.r * (T_r - T_l)
+    return 0.5 * car.d_r / car.r * (car.k_r * T_r - car.k_l * T_l)

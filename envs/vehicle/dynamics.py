@@ -12,7 +12,15 @@ from ..numerics.functions import atan2, sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from .parameters import GRAVITY
-from .tyres import MIN_SPEED, TyreLoad, compute_tyre_forces
+from .tyres import (
+    MAGIC_FORMULA,
+    MIN_SPEED,
+    PlantVariant,
+    TyreLoad,
+    Variant,
+    compute_slip_rates,
+    compute_tyre_forces,
+)
 
 
 class CarParams(NamedTuple):
@@ -40,10 +48,13 @@ class CarParams(NamedTuple):
     mu_r: Scalar  # friction under the right wheels
     P: Scalar  # W, power limit of one motor; 0: no limit
     h_x: Scalar  # m, height by which drive force moves load between the axles
+    k_l: Scalar  # left motor's torque over the commanded
+    k_r: Scalar  # right motor's
+    relaxation: Scalar = 0.0  # m, relaxation length of the Magic Formula's tyres; 0: none
 
 
 class Motion(NamedTuple):
-    """The integrated state of the plant: velocities, heading, place on ground and road, roll."""
+    """The integrated state of the plant: velocities, heading, place, roll, slip of the tyres."""
 
     v_x: Scalar  # m/s
     v_y: Scalar  # m/s
@@ -56,6 +67,8 @@ class Motion(NamedTuple):
     theta: Scalar  # rad, the road's direction at the car
     phi: Scalar = 0.0  # rad, roll of the body against the road
     phi_dot: Scalar = 0.0  # rad/s
+    slip_f: Scalar = 0.0  # tangent of slip that acts in front, 0 where tyres do not relax
+    slip_r: Scalar = 0.0  # at the rear
 
 
 class RoadParams(NamedTuple):
@@ -67,6 +80,9 @@ class RoadParams(NamedTuple):
     lateral: Scalar = 0.0  # m/s2, g sin(bank), left side up positive
     longitudinal: Scalar = 0.0  # m/s2, g sin(grade), uphill positive
     turn: Scalar = 0.0  # rad/s, turning rate of its direction where it is laid tick by tick
+    wave: Scalar = 0.0  # m/s2, g sin(amplitude) of a bank that varies along it
+    wave_rate: Scalar = 0.0  # rad/m
+    wave_phase: Scalar = 0.0  # rad
 
 
 @jit
@@ -113,6 +129,8 @@ def _rotate_gravity(
     """(x, y) of the gravity that a car without roll measures (m/s2), by its heading on the road."""
     ramp = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * ramp, road.lateral * ramp  # along the road, to its left
+    if any_lane(road.wave != 0.0):
+        g_n = g_n + road.wave * sincos(road.wave_rate * s + road.wave_phase)[0]
     return g_s * cos_r + g_n * sin_r, g_n * cos_r - g_s * sin_r
 
 
@@ -150,6 +168,8 @@ class Velocity(NamedTuple):
     gamma: Scalar
     phi: Scalar
     phi_dot: Scalar
+    slip_f: Scalar
+    slip_r: Scalar
 
 
 @inline
@@ -163,29 +183,16 @@ def _compute_roll_acceleration(
 
 
 @inline
-def compute_rates(
+def _compute_rates(
     motion: Motion | Velocity, load: TyreLoad, disturbance: DisturbanceForces, car: CarParams,
-    gravity: tuple[Scalar, Scalar], small_angle: int, law: int, roll: int,
+    gravity: tuple[Scalar, Scalar], variant: Variant,
 ) -> Velocity:  # fmt: skip
-    """Compute the time derivative of the velocities and the roll.
-
-    Args:
-        motion: `Motion` or `Velocity` of the car.
-        load: `TyreLoad` of the inputs.
-        disturbance: `DisturbanceForces`.
-        car: `CarParams`.
-        gravity: (x, y) of `compute_gravity` (m/s2).
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
-
-    Returns:
-        The derivative as a `Velocity`.
-    """
+    """Compute the time derivative of a `Velocity`; gravity (x, y) in m/s2."""
+    small_angle, roll = variant.small_angle, variant.roll
     per_m, per_I = 1.0 / car.m, 1.0 / car.I
     v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
     g_x, g_y = gravity
-    F_yf, F_yr, F_x, N_z = compute_tyre_forces(motion, load, car, g_y, small_angle, law, roll)
+    F_yf, F_yr, F_x, N_z = compute_tyre_forces(motion, load, car, g_y, variant)
     F_yc = F_yf if small_angle else F_yf * load.cos_d
     F_y = F_yc + F_yr + disturbance.F_d
     phi_dot, phi_ddot = 0.0, 0.0
@@ -200,7 +207,10 @@ def compute_rates(
         dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
     dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
     dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + disturbance.N_d) * per_I  # tie-vision (2)
-    return Velocity(dv_x, dv_y, dgamma, phi_dot, phi_ddot)
+    dslip_f, dslip_r = 0.0, 0.0
+    if variant.law == MAGIC_FORMULA:
+        dslip_f, dslip_r = compute_slip_rates(motion, load, car, small_angle)
+    return Velocity(dv_x, dv_y, dgamma, phi_dot, phi_ddot, dslip_f, dslip_r)
 
 
 @inline
@@ -227,15 +237,9 @@ def _compute_course_rates(
 
 @inline
 def derivative(
-    motion: Motion,
-    load: TyreLoad,
-    disturbance: DisturbanceForces,
-    car: CarParams,
-    road: RoadParams,
-    small_angle: int,
-    law: int,
-    roll: int = 0,
-) -> Motion:
+    motion: Motion, load: TyreLoad, disturbance: DisturbanceForces, car: CarParams,
+    road: RoadParams, variant: Variant,
+) -> Motion:  # fmt: skip
     """Compute the time derivative of a Motion.
 
     Args:
@@ -244,20 +248,15 @@ def derivative(
         disturbance: `DisturbanceForces`.
         car: `CarParams`.
         road: `RoadParams`.
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         The derivative as a `Motion`.
     """
-    gravity = compute_gravity(motion, road, small_angle)
-    rate = compute_rates(motion, load, disturbance, car, gravity, small_angle, law, roll)
-    course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
-    dX, dY, ds, dy, dtheta = course
-    return Motion(
-        rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, dtheta, rate.phi, rate.phi_dot
-    )  # fmt: skip
+    gravity = compute_gravity(motion, road, variant.small_angle)
+    rate = _compute_rates(motion, load, disturbance, car, gravity, variant)
+    course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, variant.small_angle)
+    return Motion(*(rate[:3] + (motion.gamma,) + course + rate[3:]))  # noqa: RUF005
 
 
 @inline
@@ -279,15 +278,20 @@ def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar
 
 
 @jit
+def _take_velocity(motion: Motion) -> Velocity:
+    """Velocity part of a Motion."""
+    m = motion
+    return Velocity(m.v_x, m.v_y, m.gamma, m.phi, m.phi_dot, m.slip_f, m.slip_r)
+
+
+@jit
 def _step_euler(start: Velocity, h: Scalar, rate: Velocity) -> Velocity:
     """Velocity start + h rate, written out so that it compiles for every number type."""
     return Velocity(
-        start.v_x + h * rate.v_x,
-        start.v_y + h * rate.v_y,
-        start.gamma + h * rate.gamma,
-        start.phi + h * rate.phi,
-        start.phi_dot + h * rate.phi_dot,
-    )
+        start.v_x + h * rate.v_x, start.v_y + h * rate.v_y, start.gamma + h * rate.gamma,
+        start.phi + h * rate.phi, start.phi_dot + h * rate.phi_dot, start.slip_f + h * rate.slip_f,
+        start.slip_r + h * rate.slip_r,
+    )  # fmt: skip
 
 
 @jit
@@ -300,24 +304,21 @@ def _average(first: Scalar, middle: Scalar, last: Scalar) -> Scalar:
 def _average_velocities(a: Velocity, b: Velocity, c: Velocity) -> Velocity:
     """Mean of three Velocities by Simpson's rule."""
     return Velocity(
-        _average(a.v_x, b.v_x, c.v_x),
-        _average(a.v_y, b.v_y, c.v_y),
-        _average(a.gamma, b.gamma, c.gamma),
-        _average(a.phi, b.phi, c.phi),
-        _average(a.phi_dot, b.phi_dot, c.phi_dot),
-    )
+        _average(a.v_x, b.v_x, c.v_x), _average(a.v_y, b.v_y, c.v_y),
+        _average(a.gamma, b.gamma, c.gamma), _average(a.phi, b.phi, c.phi),
+        _average(a.phi_dot, b.phi_dot, c.phi_dot), _average(a.slip_f, b.slip_f, c.slip_f),
+        _average(a.slip_r, b.slip_r, c.slip_r),
+    )  # fmt: skip
 
 
 @jit
 def _average_two(a: Velocity, b: Velocity) -> Velocity:
     """Mean of two Velocities."""
     return Velocity(
-        0.5 * (a.v_x + b.v_x),
-        0.5 * (a.v_y + b.v_y),
-        0.5 * (a.gamma + b.gamma),
-        0.5 * (a.phi + b.phi),
-        0.5 * (a.phi_dot + b.phi_dot),
-    )
+        0.5 * (a.v_x + b.v_x), 0.5 * (a.v_y + b.v_y), 0.5 * (a.gamma + b.gamma),
+        0.5 * (a.phi + b.phi), 0.5 * (a.phi_dot + b.phi_dot), 0.5 * (a.slip_f + b.slip_f),
+        0.5 * (a.slip_r + b.slip_r),
+    )  # fmt: skip
 
 
 @inline
@@ -326,7 +327,7 @@ def _compute_mid_gravity(
 ) -> tuple[Scalar, Scalar]:
     """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
     s_mid = motion.s + 0.5 * h * motion.v_x
-    if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
+    if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0) | (road.wave != 0.0)):
         return 0.0, 0.0
     if small_angle:
         return _rotate_gravity(road, s_mid, 0.0, 1.0)
@@ -349,34 +350,29 @@ def _integrate_motion(
     shrink, side_gain = 1.0 - angle * angle * (1.0 / 24.0), angle * (1.0 / 12.0)
     v_x = shrink * mean.v_x - side_gain * (end.v_y - motion.v_y)
     v_y = shrink * mean.v_y + side_gain * (end.v_x - motion.v_x)
-    psi = motion.psi + h * (motion.gamma + 2.0 * middle.gamma) * (1.0 / 6.0)  # in the mean
+    psi = motion.psi + h * (motion.gamma + 2.0 * middle.gamma) * (1.0 / 6.0)  # mean heading
     s, y, theta = motion.s, motion.y, motion.theta
     if any_lane(road.curvature != 0.0) or any_lane(road.turn != 0.0):
         course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
         _, _, ds, dy, dtheta = course
         s, y, theta = s + half * ds, y + half * dy, theta + half * dtheta
     mid_motion = Motion(
-        v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, end.phi, end.phi_dot
-    )
+        v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, end.phi, end.phi_dot,
+        end.slip_f, end.slip_r,
+    )  # fmt: skip
     dX, dY, ds, dy, dtheta = _compute_course_rates(mid_motion, v_x, v_y, road, small_angle)
     return Motion(
         end.v_x, end.v_y, end.gamma, motion.psi + angle, motion.X + h * dX, motion.Y + h * dY,
         motion.s + h * ds, motion.y + h * dy, motion.theta + h * dtheta, end.phi, end.phi_dot,
+        end.slip_f, end.slip_r,
     )  # fmt: skip
 
 
 @inline
 def kutta3(
-    motion: Motion,
-    load: tuple[TyreLoad, TyreLoad, TyreLoad],
-    disturbance: DisturbanceForces,
-    car: CarParams,
-    road: RoadParams,
-    h: Scalar,
-    small_angle: int,
-    law: int,
-    roll: int = 0,
-) -> Motion:
+    motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
+    car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
+) -> Motion:  # fmt: skip
     """Integrate the plant over h seconds by Kutta's third-order rule (errors: docs/physics.md).
 
     Args:
@@ -386,37 +382,45 @@ def kutta3(
         car: `CarParams`.
         road: `RoadParams`.
         h: Length of the step (s).
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         The `Motion` at the end.
     """
-    gravity = _compute_mid_gravity(motion, road, h, small_angle)
-    start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
-    a = compute_rates(start, load[0], disturbance, car, gravity, small_angle, law, roll)
-    middle = _step_euler(start, 0.5 * h, a)
-    b = compute_rates(middle, load[1], disturbance, car, gravity, small_angle, law, roll)
-    end = _step_euler(_step_euler(start, 0.0 - h, a), 2.0 * h, b)
-    c = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
-    mean = _average_velocities(start, middle, end)
-    last = _step_euler(start, h, _average_velocities(a, b, c))
-    return _integrate_motion(motion, middle, last, mean, road, h, small_angle)
+    if variant.law == MAGIC_FORMULA:  # apart: the code of other laws stays short, and as fast
+        magic = PlantVariant(variant.small_angle, MAGIC_FORMULA, variant.roll)
+        return _integrate_stages(motion, load, disturbance, car, road, h, magic)
+    return _integrate_stages(motion, load, disturbance, car, road, h, variant)
 
 
 @inline
-def rk4(
+def _integrate_stages(
     motion: Motion,
     load: tuple[TyreLoad, TyreLoad, TyreLoad],
     disturbance: DisturbanceForces,
     car: CarParams,
     road: RoadParams,
     h: Scalar,
-    small_angle: int,
-    law: int,
-    roll: int = 0,
+    variant: Variant,
 ) -> Motion:
+    """`kutta3` of one law or of several."""
+    gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
+    start = _take_velocity(motion)
+    a = _compute_rates(start, load[0], disturbance, car, gravity, variant)
+    middle = _step_euler(start, 0.5 * h, a)
+    b = _compute_rates(middle, load[1], disturbance, car, gravity, variant)
+    trial = _step_euler(_step_euler(start, 0.0 - h, a), 2.0 * h, b)
+    c = _compute_rates(trial, load[2], disturbance, car, gravity, variant)
+    mean = _average_velocities(start, middle, trial)
+    end = _step_euler(start, h, _average_velocities(a, b, c))
+    return _integrate_motion(motion, middle, end, mean, road, h, variant.small_angle)
+
+
+@inline
+def rk4(
+    motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
+    car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
+) -> Motion:  # fmt: skip
     """Integrate the plant over h seconds, longer in plans, by the classical Runge-Kutta method.
 
     Args:
@@ -426,23 +430,21 @@ def rk4(
         car: `CarParams`.
         road: `RoadParams`.
         h: Length of the step (s).
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         The `Motion` at the end.
     """
-    gravity = _compute_mid_gravity(motion, road, h, small_angle)
-    start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
-    a = compute_rates(start, load[0], disturbance, car, gravity, small_angle, law, roll)
+    gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
+    start = _take_velocity(motion)
+    a = _compute_rates(start, load[0], disturbance, car, gravity, variant)
     first = _step_euler(start, 0.5 * h, a)
-    b = compute_rates(first, load[1], disturbance, car, gravity, small_angle, law, roll)
+    b = _compute_rates(first, load[1], disturbance, car, gravity, variant)
     second = _step_euler(start, 0.5 * h, b)
-    c = compute_rates(second, load[1], disturbance, car, gravity, small_angle, law, roll)
+    c = _compute_rates(second, load[1], disturbance, car, gravity, variant)
     end = _step_euler(start, h, c)
-    d = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
+    d = _compute_rates(end, load[2], disturbance, car, gravity, variant)
     middle, mid_rate = _average_two(first, second), _average_two(b, c)
     mean = _average_velocities(start, middle, end)
     last = _step_euler(start, h, _average_velocities(a, mid_rate, d))
-    return _integrate_motion(motion, middle, last, mean, road, h, small_angle)
+    return _integrate_motion(motion, middle, last, mean, road, h, variant.small_angle)

@@ -130,20 +130,11 @@ _write_kinematic = as_python(write_kinematic)
 
 @dataclass(frozen=True)
 class LinearModel:
-    """A linear model dx/dt = A x + B u, y = C x, with names.
+    """A linear model dx/dt = A x + B u, y = C x, with names."""
 
-    Attributes:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, m).
-        C: Output matrix, shape (p, n).
-        states: Names of the n states.
-        inputs: Names of the m inputs.
-        outputs: Names of the p outputs.
-    """
-
-    A: Array
-    B: Array
-    C: Array
+    A: Array  # (n, n), of the states
+    B: Array  # (n, m), of the inputs
+    C: Array  # (p, n), of the outputs
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -161,7 +152,7 @@ class LinearModel:
 
         n, m = self.B.shape
         block = np.zeros((n + m, n + m))
-        block[:n, :n], block[:n, n:] = self.A * dt, self.B * dt
+        block[:n] = np.hstack([self.A, self.B]) * dt
         exact = expm(block)
         return exact[:n, :n], exact[:n, n:]
 

@@ -25,6 +25,7 @@ LATERAL_FIELDS = (
 )  # fmt: skip
 """Parameters of a linear bicycle, in the order of `linear.Bicycle`."""
 _POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # inertia of two points over the axles
+_MIN_RELAXATION = 0.05  # m: a tick of 1 ms follows no shorter one at 100 m/s
 _MIN_NUMBER = 1.0 / MAX_NUMBER  # a parameter below it counts as zero: it is divided by
 
 
@@ -36,8 +37,9 @@ class Vehicle:
     stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit,
     and the plausible range that `make_vehicle` and environments check.
 
-    Raises ValueError on a value that is not finite or not positive (lags, motor_power and
-    transfer_height may be zero, the antenna's place may be negative).
+    Raises ValueError on a value that is not finite or not positive (lags, motor_power,
+    transfer_height and relaxation may be zero, the antenna's place may be negative), or a
+    relaxation too short for the plant's steps.
     """
 
     name: str = "vehicle"
@@ -69,6 +71,7 @@ class Vehicle:
     antenna_left: float = quantity("m", -20, 20, "GPS antenna left of the centre of gravity", 0.0)
     motor_power: float = quantity("W", 0, 1e7, "limit of one motor, also braking; 0: none", 0.0)
     transfer_height: float = quantity("m", 0, 5, "where drive force moves load between axles", 0.0)
+    relaxation: float = quantity("m", 0, 3, "length of magic-formula tyres: 0, or 0.05 up", 0.0)
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):
@@ -87,6 +90,9 @@ class Vehicle:
             if not (is_finite(value) and is_low_ok):
                 got = f"{short_repr(value)} {entry.metadata['unit']}"
                 raise ValueError(f"Vehicle.{entry.name}: {got} is not {requirement}finite")
+        if 0.0 < self.relaxation < _MIN_RELAXATION:
+            got, rule = short_repr(self.relaxation), f"neither 0 nor {_MIN_RELAXATION} or more"
+            raise ValueError(f"Vehicle.relaxation: {got} m is {rule}")
 
     def replace(self, **changes: Any) -> "Vehicle":
         """Copy the vehicle with some parameters changed; TypeError on an unknown name.
@@ -175,26 +181,8 @@ def critical_speed(vehicle: Vehicle) -> float:
     return math.sqrt(product / (vehicle.mass * excess))
 
 
-PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel motors
-    name="passenger-car",
-    mass=1500.0,
-    yaw_inertia=2400.0,
-    front_arm=1.2,
-    rear_arm=1.5,
-    front_stiffness=55000.0,
-    rear_stiffness=60000.0,
-    front_track=1.55,
-    rear_track=1.55,
-    wheel_radius=0.31,
-    gravity_height=0.55,
-    motor_torque=700.0,
-    preview=12.0,
-    sprung_mass=1300.0,
-    roll_arm=0.45,
-    roll_inertia=760.0,
-    roll_stiffness=90000.0,  # 3.9 degrees of roll at 1 g
-    roll_damping=4000.0,  # a quarter of the critical damping
-)
+_PRESETS = Path(__file__).parent / "presets"
+PASSENGER_CAR = Vehicle(**read_document(_PRESETS / "passenger-car.toml", "vehicle"))
 
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
@@ -205,6 +193,7 @@ WIRE_TABLES = ("steering", "latency", "noise")
 """Tables of a vehicle's file that `sideslip identify` writes and only `sideslip replay` reads."""
 _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
+_YOUNGER = ("relaxation",)  # parameters that complete mappings in older files lack
 
 
 def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
@@ -233,8 +222,9 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     if isinstance(source, Vehicle):
         return source
     if isinstance(source, Mapping):
-        is_complete = all(name in source for name in _FIELDS)
-        return _parse_vehicle(dict(source), strict, is_complete)
+        is_complete = all(name in source for name in _FIELDS if name not in _YOUNGER)
+        older = dict.fromkeys(_YOUNGER, 0.0) if is_complete else {}
+        return _parse_vehicle(older | dict(source), strict, is_complete)
     if is_document(source):
         return _read_vehicle(Path(source), strict)
     if not isinstance(source, str):
@@ -288,10 +278,8 @@ def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = Fal
     return vehicle
 
 
-_PRESETS = Path(__file__).parent / "presets"
 COMS = _read_vehicle(_PRESETS / "coms.toml")
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
-"""Vehicles by name: two presets, and those of recorded drives; all but one from files."""
-
-for _path in sorted(_PRESETS.glob("*.toml")):
-    VEHICLES.setdefault(_path.stem, _read_vehicle(_path))
+"""Vehicles by name: two presets, and those of recorded drives."""
+for _path in sorted({*_PRESETS.glob("*.toml")} - {_PRESETS / f"{name}.toml" for name in VEHICLES}):
+    VEHICLES[_path.stem] = _read_vehicle(_path)

@@ -3,23 +3,53 @@
 As in `dynamics`, no function branches on values, except by `any_lane`. A law of the lateral force
 has its name in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.model`
 has Fiala's once more, with slopes; a test holds both equal.
+
+The Magic Formula's numbers are published: Pacejka, Tyre and Vehicle Dynamics, 2nd ed. (2006), Table
+A3.1, 205/60R15 91V at 2.2 bar, without camber, ply steer and conicity: shape, and what F_z changes.
+Nominal is the axle's standing load, with the car's stiffness and friction: it scales to small cars.
 """
 
 from typing import Any, NamedTuple, TypeAlias
 
-from ..numerics.functions import atan, sincos
-from ..numerics.jit import inline, jit
-from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, sqrt
-from .parameters import GRAVITY
+import numpy as np
+
+from ..numerics.functions import atan, compute_arctan, compute_sine, sincos
+from ..numerics.jit import as_python, inline, jit
+from ..numerics.primitives import (
+    ARRAYS,
+    Scalar,
+    absolute,
+    any_lane,
+    maximum,
+    minimum,
+    select,
+    sqrt,
+)
+from .parameters import GRAVITY, Vehicle
 
 Car: TypeAlias = Any  # `CarParams` of `dynamics`, which imports this file
 State: TypeAlias = Any  # its `Motion` or `Velocity`
+Variant: TypeAlias = Any  # a `PlantVariant`, or the engine's `StepVariant`, which has its fields
 
-TYRE_LAWS = ("linear", "fiala", "dugoff")
+TYRE_LAWS = ("linear", "fiala", "dugoff", "magic-formula")
 """The laws by the names that `Scenario.tyres` takes; a law's code is its place."""
-LINEAR, FIALA, DUGOFF = range(len(TYRE_LAWS))
+LINEAR, FIALA, DUGOFF, MAGIC_FORMULA = range(len(TYRE_LAWS))
 
 MIN_SPEED = 0.5  # m/s: below it slip is computed as at this speed, and beta is zero
+
+_P_CY1 = 1.193  # shape factor C
+_P_DY2 = 0.145 / -0.990  # pDy2 / pDy1: change of friction with load
+_P_EY1, _P_EY2 = -1.003, -0.537  # curvature factor E, and its change with load
+_P_KY2 = 2.130  # load of the largest cornering stiffness
+_MAX_LOAD = 2.0  # largest load by drive that these numbers take, over the standing load
+
+
+class PlantVariant(NamedTuple):
+    """Integers that choose the plant's equations."""
+
+    small_angle: int  # 1: the small-angle plant
+    law: int  # place in `TYRE_LAWS`
+    roll: int = 0  # 1: the body rolls
 
 
 class TyreInputs(NamedTuple):
@@ -31,23 +61,25 @@ class TyreInputs(NamedTuple):
 
 
 class TyreLoad(NamedTuple):
-    """Steering, drive forces and lateral capacities under one instant's inputs."""
+    """What steering and torques make of the tyres at one instant; "load" is not F_z here."""
 
     sin_d: Scalar  # sine of the front steering angle
     cos_d: Scalar  # its cosine
     steer: Scalar  # rad, the angle itself
     F_x: Scalar  # N, drive force
     N_z: Scalar  # N m, yaw moment of the motors
-    limit_f: Scalar  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
-    limit_l: Scalar
-    limit_r: Scalar
-    slope_f: Scalar  # C / (3 F_max) of the same tyres
-    slope_l: Scalar
-    slope_r: Scalar
+    limit_f: Scalar  # N, lateral capacity F_max of one front tyre
+    limit_l: Scalar  # N, of the left rear tyre
+    limit_r: Scalar  # N, of the right rear tyre
+    slope_f: Scalar  # 1/rad, C / (3 F_max) of a front tyre
+    slope_l: Scalar  # 1/rad, of the left rear tyre
+    slope_r: Scalar  # 1/rad, of the right rear tyre
     rear_l: Scalar  # N, friction of the left and right rear tyre in all directions, without roll
     rear_r: Scalar
     F_l: Scalar  # N, drive force that the left motor commands
     F_r: Scalar  # N, that of the right motor
+    load_f: Scalar  # F_z of a front and a rear tyre over its standing load, without roll
+    load_r: Scalar
 
 
 @inline
@@ -58,7 +90,7 @@ def _compute_squared_capacity(limit: Scalar, drive: Scalar) -> Scalar:
 
 @jit
 def has_load_shift(small_angle: int, law: int, roll: int) -> int:
-    """Check whether roll moves load from side to side, so that tyre limits depend on the motion.
+    """Check whether the tyres' limits depend on loads that the motion shifts, or on F_z itself.
 
     Args:
         small_angle: 1 for the small-angle plant, else 0.
@@ -68,7 +100,7 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
     Returns:
         1 if it does, else 0.
     """
-    return int(small_angle == 0 and law != LINEAR and roll == 1)
+    return int(small_angle == 0 and (law == MAGIC_FORMULA or (law != LINEAR and roll == 1)))
 
 
 @inline
@@ -84,7 +116,9 @@ def _compute_axle_shift(
 
 
 @inline
-def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> TyreLoad:
+def compute_tyre_load(
+    inputs: TyreInputs, car: Car, small_angle: int, load_shift: int = 0
+) -> TyreLoad:
     """Compute the tyres' load under the inputs of one instant.
 
     The front tyres have the mean friction of both sides. Each rear tyre's friction limits its
@@ -103,12 +137,14 @@ def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int =
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
     rear_l, rear_r = car.mu * weight * car.l_f, car.mu_r * weight * car.l_f
-    command_l, command_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
-    F_l, F_r = command_l, command_r
+    command_l, command_r = inputs.T_l * (car.k_l / car.r), inputs.T_r * (car.k_r / car.r)
+    F_l, F_r, load_f, load_r = command_l, command_r, 1.0, 1.0
     if not small_angle and any_lane(car.h_x > 0.0):
         shift = _compute_axle_shift(F_l, F_r, rear_l, rear_r, weight, car)
         front = front - 0.5 * (car.mu + car.mu_r) * shift
         rear_l, rear_r = rear_l + car.mu * shift, rear_r + car.mu_r * shift
+        load_f = minimum(1.0 - shift / (weight * car.l_r), _MAX_LOAD)
+        load_r = minimum(1.0 + shift / (weight * car.l_f), _MAX_LOAD)
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
     if not small_angle and not load_shift:
@@ -119,7 +155,7 @@ def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int =
     return TyreLoad(
         s, c, inputs.delta_f, F_l + F_r, 0.5 * car.d_r * (F_r - F_l), front, left, right,
         car.C_f / (3.0 * front), car.C_r / (3.0 * left), car.C_r / (3.0 * right),
-        rear_l, rear_r, command_l, command_r,
+        rear_l, rear_r, command_l, command_r, load_f, load_r,
     )  # fmt: skip
 
 
@@ -129,6 +165,7 @@ class Tyre(NamedTuple):
     tangent: Scalar  # t, tangent of its slip angle; on the small-angle plant the angle itself
     limit: Scalar  # N, F_max: what the drive force leaves of mu F_z on the friction circle
     slope: Scalar  # C / (3 F_max)
+    load: Scalar = 1.0  # F_z over the standing load; the Magic Formula alone reads it
 
 
 @jit
@@ -157,6 +194,17 @@ def _dugoff(tyre: Tyre) -> Scalar:
     return tyre.limit * minimum(maximum(u, 0.0 - max_ratio), max_ratio)
 
 
+@jit
+def _apply_magic_formula(tyre: Tyre) -> Scalar:
+    """Lateral force (N) F_max sin(C atan(B t - E (B t - atan B t))), B C F_max = slope at zero."""
+    # Pacejka (2006), (4.E19)-(4.E26)
+    Bt = absolute((3.0 / _P_CY1) * (tyre.slope * tyre.tangent))
+    E = (_P_EY1 - _P_EY2) + _P_EY2 * tyre.load
+    angle = _P_CY1 * compute_arctan(Bt - E * (Bt - compute_arctan(Bt)))
+    force = tyre.limit * compute_sine(angle)
+    return select(tyre.tangent < 0.0, 0.0 - force, force)
+
+
 @inline
 def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_angle: int) -> Any:
     """Compute the lateral forces of the four tyres; the law is chosen once for all of them.
@@ -177,6 +225,9 @@ def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_a
         return _linear(a, s), _linear(b, s), _linear(c, s), _linear(d, s)
     if law == DUGOFF:
         return _dugoff(a), _dugoff(b), _dugoff(c), _dugoff(d)
+    if law == MAGIC_FORMULA:
+        a_b = _apply_magic_formula(a), _apply_magic_formula(b)
+        return *a_b, _apply_magic_formula(c), _apply_magic_formula(d)
     return _fiala(a), _fiala(b), _fiala(c), _fiala(d)
 
 
@@ -197,22 +248,49 @@ def _split_slip_tangents(
 
 
 @jit
-def compute_slips(
+def _compute_slips(
     motion: State, load: TyreLoad, car: Car, small_angle: int
 ) -> tuple[Scalar, Scalar]:
-    """Compute the tangents of the front and rear slip angle.
+    """Compute the tangents (front, rear) of the slip angles, positive for a force to the left."""
+    across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
+    return across_f / along_f, across_r / along_r
+
+
+@jit
+def compute_slip_rates(
+    motion: State, load: TyreLoad, car: Car, small_angle: int
+) -> tuple[Scalar, Scalar]:
+    """Compute the rates (1/s) at which the slip of relaxing tyres follows, of (front, rear).
+
+    sigma dt'/dt = |v_along| (t - t'): Pacejka (2006), (7.7). Without a length both are zero.
 
     Args:
         motion: `Motion` or `Velocity` of the car.
         load: `TyreLoad` of the inputs.
         car: `CarParams`.
-        small_angle: 1 for the small-angle plant, which takes the angles themselves; else 0.
+        small_angle: 1 for the small-angle plant, else 0.
 
     Returns:
-        (front, rear), positive where the force is to the left.
+        Rates of the front and the rear tangent.
     """
     across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
-    return across_f / along_f, across_r / along_r
+    is_relaxing = car.relaxation > 0.0
+    per_length = select(is_relaxing, 1.0 / select(is_relaxing, car.relaxation, 1.0), 0.0)
+    front = (across_f - along_f * motion.slip_f) * per_length
+    return front, (across_r - along_r * motion.slip_r) * per_length
+
+
+@jit
+def _compute_relaxed_slips(
+    motion: State, load: TyreLoad, car: Car, small_angle: int
+) -> tuple[Scalar, Scalar]:
+    """Compute the tangents (front, rear) that act: the states, or without a length the slips."""
+    t_f, t_r = motion.slip_f, motion.slip_r
+    is_rigid = car.relaxation == 0.0
+    if any_lane(is_rigid):
+        direct_f, direct_r = _compute_slips(motion, load, car, small_angle)
+        t_f, t_r = select(is_rigid, direct_f, t_f), select(is_rigid, direct_r, t_r)
+    return t_f, t_r
 
 
 @inline
@@ -233,7 +311,7 @@ def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar
 
 @inline
 def compute_tyre_forces(
-    motion: State, load: TyreLoad, car: Car, g_y: Scalar, small_angle: int, law: int, roll: int
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Compute the forces of the axles and the moment of the motors.
 
@@ -242,21 +320,19 @@ def compute_tyre_forces(
         load: `TyreLoad` of the inputs.
         car: `CarParams`.
         g_y: Lateral gravity that the car feels on a banked road (m/s2).
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), yaw moment (N m).
     """
-    a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, small_angle, law, roll)
-    F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, law, small_angle)
+    a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, variant)
+    F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, variant.law, variant.small_angle)
     return F_fl + F_fr, F_rl + F_rr, F_x, N_z
 
 
 @inline
 def compute_tyres(
-    motion: State, load: TyreLoad, car: Car, g_y: Scalar, small_angle: int, law: int, roll: int
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
@@ -265,19 +341,22 @@ def compute_tyres(
         load: `TyreLoad` of the inputs.
         car: `CarParams`.
         g_y: Lateral gravity that the car feels on a banked road (m/s2).
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         Four `Tyre` (front left and right, rear left and right), F_x (N) and N_z (N m).
     """
-    if has_load_shift(small_angle, law, roll):
+    if variant.law == MAGIC_FORMULA and not variant.small_angle:
+        return _compute_magic_tyres(motion, load, car, g_y, variant)
+    if has_load_shift(variant.small_angle, variant.law, variant.roll):
         return _compute_shifted_tyres(motion, load, car, g_y)
-    t_f, t_r = compute_slips(motion, load, car, small_angle)
-    front = Tyre(t_f, load.limit_f, load.slope_f)
-    left = Tyre(t_r, load.limit_l, load.slope_l)
-    right = Tyre(t_r, load.limit_r, load.slope_r)
+    if variant.law == MAGIC_FORMULA:
+        t_f, t_r = _compute_relaxed_slips(motion, load, car, variant.small_angle)
+    else:
+        t_f, t_r = _compute_slips(motion, load, car, variant.small_angle)
+    front = Tyre(t_f, load.limit_f, load.slope_f, load.load_f)
+    left = Tyre(t_r, load.limit_l, load.slope_l, load.load_r)
+    right = Tyre(t_r, load.limit_r, load.slope_r, load.load_r)
     return front, front, left, right, load.F_x, load.N_z
 
 
@@ -300,10 +379,72 @@ def _compute_shifted_tyres(
     front = load.slope_f * (along_r * squares * inv_product)  # C_f / (3 F_max), standing
     rear = car.C_r * (1.0 / 3.0) * (along_f * sides * inv_product)
     return (
-        Tyre(across_f, load.limit_f * relieved, front * burdened),
-        Tyre(across_f, load.limit_f * burdened, front * relieved),
-        Tyre(across_r, left, rear * square_r * left),
-        Tyre(across_r, right, rear * square_l * right),
+        Tyre(across_f, load.limit_f * relieved, front * burdened, load.load_f * relieved),
+        Tyre(across_f, load.limit_f * burdened, front * relieved, load.load_f * burdened),
+        Tyre(across_r, left, rear * square_r * left, load.load_r * (1.0 - e_r)),
+        Tyre(across_r, right, rear * square_l * right, load.load_r * (1.0 + e_r)),
         F_l + F_r,
         0.5 * car.d_r * (F_r - F_l),
     )
+
+
+@inline
+def _compute_magic_tyres(
+    motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
+) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
+    """`compute_tyres` of the Magic Formula: with f = F_z over the standing load, p = pKy2, friction
+    is mu (1 + (f - 1) pDy2 / pDy1), stiffness C f (p^2 + 1) / (p^2 + f^2); all quotients from one.
+    """
+    t_f, t_r = _compute_relaxed_slips(motion, load, car, 0)
+    e_f, e_r = 0.0, 0.0
+    if variant.roll:
+        e_f, e_r = _compute_load_transfer(motion, car, g_y)
+    a, b = load.load_f * (1.0 - e_f), load.load_f * (1.0 + e_f)
+    c, d = load.load_r * (1.0 - e_r), load.load_r * (1.0 + e_r)
+    mu_a, mu_b = (1.0 - _P_DY2) + _P_DY2 * a, (1.0 - _P_DY2) + _P_DY2 * b
+    mu_c, mu_d = (1.0 - _P_DY2) + _P_DY2 * c, (1.0 - _P_DY2) + _P_DY2 * d
+    rear_l, rear_r = load.rear_l * (1.0 - e_r) * mu_c, load.rear_r * (1.0 + e_r) * mu_d
+    F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
+    F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
+    square_l = _compute_squared_capacity(rear_l, F_l)
+    square_r = _compute_squared_capacity(rear_r, F_r)
+    left, right = sqrt(square_l), sqrt(square_r)
+    p2 = _P_KY2 * _P_KY2
+    per_a, per_b = mu_a * (p2 + a * a), mu_b * (p2 + b * b)
+    per_c, per_d = square_l * (p2 + c * c), square_r * (p2 + d * d)
+    fronts, rears = per_a * per_b, per_c * per_d
+    inv_product = (p2 + 1.0) / (fronts * rears)
+    front = load.slope_f * load.load_f * (rears * inv_product)
+    rear = car.C_r * (1.0 / 3.0) * (fronts * inv_product)
+    return (
+        Tyre(t_f, load.limit_f * (1.0 - e_f) * mu_a, front * per_b, a),
+        Tyre(t_f, load.limit_f * (1.0 + e_f) * mu_b, front * per_a, b),
+        Tyre(t_r, left, rear * per_d * c * left, c),
+        Tyre(t_r, right, rear * per_c * d * right, d),
+        F_l + F_r,
+        0.5 * car.d_r * (F_r - F_l),
+    )
+
+
+def fit_fiala(vehicle: Vehicle) -> Vehicle:
+    """Fit Fiala's law to a car's Magic Formula, for filters and planners that have no other.
+
+    Least squares of the forces at the standing load, over slips from zero to the peak's with equal
+    weights. As fractions of mu F_z, over C t / (mu F_z), both axles have one curve: so one pair of
+    factors, on stiffness and friction, fits both.
+
+    Args:
+        vehicle: Vehicle with the Magic Formula's stiffnesses and friction.
+
+    Returns:
+        The vehicle with Fiala's.
+    """
+    from scipy.optimize import curve_fit
+
+    u = np.linspace(0.0, 6.0, 601)
+    force = as_python(_apply_magic_formula, ARRAYS)(Tyre(u, 1.0, 1.0 / 3.0))
+    n, fiala = int(force.argmax()) + 1, as_python(_fiala, ARRAYS)
+    (C, mu), _ = curve_fit(
+        lambda u, C, mu: fiala(Tyre(u, mu, C / (3.0 * mu))), u[:n], force[:n], (1.0, 1.0)
+    )
+    return vehicle.scale_stiffness(float(C)).replace(friction=vehicle.friction * float(mu))

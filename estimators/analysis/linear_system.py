@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from ..core.filter import reset_filters
+from ..core.filter import advance, process_packet_all, reset_filters
 from ..core.innovation import DUAL_RATE, IGNORE
 from ..core.model import LINEAR
 from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS, FilterRecords
-from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
+from ..design.dual_rate import GAINS, RULES, SampledSystem, frame_map
 from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius
-from ..estimator import EMPTY, NO_NIS, compile_advance, compile_process_packet
+from ..estimator import EMPTY, NO_NIS, compile_filter_call
 from ..protocol import Estimates, UnobservableWarning
 
 _SENSOR = 0  # the place of the slow sensor in a filter's memory
@@ -96,14 +96,15 @@ class DualRate:
         noise[m:, m:] = _parse_covariance("Q_d", Q_d, d)
         measured, r = np.hstack([c, np.zeros((q, d))]), _parse_covariance("R", R, q, definite=True)
         placed = _parse_poles(intersample, gains, poles, n)
+        system = SampledSystem(F, noise, measured, r, int(ratio))
         with np.errstate(invalid="ignore", over="ignore"):
-            shares = compute_shares(intersample, gains, placed, F, noise, measured, r, int(ratio))
+            shares = system.compute_shares(intersample, gains, placed)
         self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
         self.shares, self.ratio, self.inputs = shares, int(ratio), b.shape[1]
         self._check_stability(F, measured, allow_unstable)
         self.gains = np.zeros((1, 1 + q + (1 + q) * self.ratio, n + n * (n + 1) // 2))
         self.gains[0, 0, 0] = 1.0
-        write_shares(F, noise, measured, r, shares, self.gains[0], 1 + q + self.ratio, n)
+        system.write_shares(shares, self.gains[0], 1 + q + self.ratio, n)
         self._start = np.zeros(n)
         self._start[:m] = _parse_vector("start", 0.0 if start is None else start, m)
         self._filters = _make_record(F, b, drift, measured, self.ratio)
@@ -135,8 +136,8 @@ class DualRate:
         self._take(fast, packets, X, S)
 
     def _take(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
-        advance, count = compile_advance(), len(packets)
-        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, NO_NIS)
+        record = fast, len(fast), packets, len(packets)
+        compile_filter_call(advance)(self._filters, self.gains, *record, 0, X, S, NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
         """Step from k to k+1: dual-rate (17), (19).
@@ -165,7 +166,7 @@ class DualRate:
         packet, q = np.zeros(PACKET_WIDTH), int(f.rows[_SENSOR])
         packet[: PACKET.value] = _SENSOR, self.k, self.k, 1.0, 0.0
         packet[PACKET.value : PACKET.value + q] = _parse_vector("y", y, q)
-        compile_process_packet()(self._filters, self.gains, packet)
+        compile_filter_call(process_packet_all)(self._filters, self.gains, packet)
 
     def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
         """Reset, then filter inputs and samples of k = 0, r, 2 r, ...

@@ -7,7 +7,7 @@ that every estimate knows at least one lag of its future, and at most two.
 
 import copy
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,6 +95,15 @@ def _remove_delay(estimator: Estimator) -> Estimator:
     return undelayed
 
 
+class _FilteredBlock(NamedTuple):
+    """Filtered rows."""
+
+    F: Matrix  # transition from the row before, shape (K, n, n)
+    before: Matrix  # prediction, shape (K, n)
+    x: Matrix  # state after the row's samples, shape (K, n)
+    P: Matrix  # its covariance, shape (K, n, n)
+
+
 @jit
 def _filter_forwards(
     f: FilterRecord,
@@ -103,18 +112,15 @@ def _filter_forwards(
     packets: Matrix,
     position: int,
     nis: Vector,
-    F: Matrix,
-    before: Matrix,
-    x: Matrix,
-    P: Matrix,
+    block: _FilteredBlock,
 ) -> int:
     """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `position` on.
 
     Packets that arrive by the rows' end are taken; returns the packets done. nis (count,): of the
-    packets used. F (K, n, n): each row's transition from the one before. before (K, n): its
-    prediction. x (K, n), P (K, n, n): after its samples.
+    packets used. block: filled.
     """
     n, dense = f.n, f.dense
+    F, before, x, P = block
     for j in range(len(fast)):
         read_fast_row(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
         run_tick(f, gains)
@@ -144,24 +150,24 @@ def _smooth_blocks(
     Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)
-    # F, before, x, P of two blocks, as `_filter_forwards` fills them
-    blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,))]
+    blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,))]  # two, side by side
     done = position = 0  # rows, packets
     for start in range(0, rows, lag):
         for array in blocks if start > 0 else ():  # what was the next block is the present one
             array[: span - lag] = array[lag:]
         first, end = done - start, min(start + span, rows)
-        views = (array[first : end - start] for array in blocks)
-        position = _filter_forwards(f, gains, fast[done:end], packets, position, nis, *views)
+        block = _FilteredBlock(*(array[first : end - start] for array in blocks))
+        position = _filter_forwards(f, gains, fast[done:end], packets, position, nis, block)
         done = end
-        x, std = _smooth_backwards(Q, *(array[: end - start] for array in blocks))
+        x, std = _smooth_backwards(Q, _FilteredBlock(*(array[: end - start] for array in blocks)))
         stop = min(start + lag, rows)
         X[start:stop], S[start:stop] = x[: stop - start], std[: stop - start]
     return X, S, nis
 
 
-def _smooth_backwards(Q: Array, F: Array, before: Array, x: Array, P: Array) -> tuple[Array, Array]:
+def _smooth_backwards(Q: Array, block: _FilteredBlock) -> tuple[Array, Array]:
     """Smooth by Rauch, Tung and Striebel from the last filtered state to the first."""
+    F, before, x, P = block
     predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
     sd = np.sqrt(np.einsum("kii->ki", predicted))
     sd[sd == 0.0] = 1.0

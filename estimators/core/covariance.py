@@ -177,14 +177,6 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
 
 @jit
-def _update(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
-    """Correct, and update a bank member's log-likelihood: -(residual^2 / s + log s) / 2."""
-    if f.members > 0:
-        f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
-    correct_scalar(f, variance, residual)
-
-
-@jit
 def project(f: FilterRecord, row: Vector) -> Scalar:
     """Compute f.PC = P C^T of a measurement of the states.
 
@@ -232,30 +224,16 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
 
 
 @jit
-def update_with_states(f: FilterRecord, row: Vector, r: Scalar, residual: Scalar) -> None:
-    """Correct by the residual of a measurement of the states.
+def update_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
+    """Correct as `correct_scalar` does, and update the log-likelihood of a bank's member.
+
+    The logarithm changes by -(residual^2 / s + log s) / 2.
 
     Args:
-        f: Memory of the filter.
-        row: Row of C, shape (n,).
-        r: Variance of its noise.
+        f: Memory of the filter with P C^T of the measurement.
+        variance: Variance s of the residual.
         residual: Measurement minus its prediction.
     """
-    _update(f, project(f, row) + r, residual)
-
-
-@jit
-def update_with_row(
-    f: FilterRecord, s: int, i: int, first: int, r: Scalar, residual: Scalar
-) -> None:
-    """Correct by the residual of a sensor's row.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        first: Clone of its first row, negative where it measures the states.
-        r: Variance of its noise.
-        residual: Measurement minus its prediction.
-    """
-    _update(f, project_row(f, s, i, first) + r, residual)
+    if f.members > 0:
+        f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
+    correct_scalar(f, variance, residual)

@@ -16,20 +16,12 @@ from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
-from .model import (
-    BETA,
-    CURVATURE,
-    LATERAL,
-    build_model,
-    compute_road_turn,
-    find_next_cell,
-    is_finite,
-)
+from .model import BETA, CURVATURE, LATERAL, build_model, is_finite
 from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
 from .packets import apply_waiting, process_packet, store_history
-from .predict import advance_state, linearise, read_fast_row
+from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
-from .update import correct_fast, locate_step_row
+from .update import correct_fast
 
 
 @jit
@@ -110,7 +102,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
                 f.u_sum[i] /= f.u_count
         u = f.u_sum if f.stride > 1 else f.u
         if f.kind == LATERAL and f.inputs > CURVATURE:
-            f.road_turn += compute_road_turn(f.model_speed, u[CURVATURE], f.step)
+            f.road_turn += f.model_speed * u[CURVATURE] * f.step
         advance_state(f, u)
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
     else:  # the first step has nothing to predict from
@@ -147,7 +139,8 @@ def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scala
         P[i, j].
     """
     if f.periodic == 1:
-        return gains[f.cell, locate_step_row(f), f.total + i * f.n - i * (i - 1) // 2 + j - i]
+        row = 1 + f.at * maximum(f.fasts, 1)  # that of this step
+        return gains[f.cell, row, f.total + i * f.n - i * (i - 1) // 2 + j - i]
     return f.P[i, j]
 
 
@@ -281,7 +274,7 @@ def advance(
     """
     first = _first_member(layers)
     f = layers[first]
-    position, last = 0 if start == 0 else f.cursor, f.tick + rows - start
+    position, end_tick = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
         wheel_speed = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
         if f.periodic == 1:
@@ -292,14 +285,15 @@ def advance(
         for layer in range(first, len(layers)):
             read_fast_row(layers[layer], fast[j], wheel_speed)
             run_tick(layers[layer], gains)
-        while position < count and not (f.tick < packets[position, PACKET.arrived] <= last):
-            # also one that arrives after the last row, which `process_packet` counts
-            was_used = process_packet(f, gains, packets[position])
+        # a packet waits only if it arrives at a later tick of this call; due, overdue or beyond the
+        # last row it goes now, and `process_packet` judges it
+        while position < count and not (f.tick < packets[position, PACKET.arrived] <= end_tick):
+            was_kept = process_packet(f, gains, packets[position])
             if len(nis) > 0:
                 nis[position] = f.nis
             if first > 0:
                 _process_packet_members(layers, gains, packets[position])
-            elif was_used and len(layers) > 1:
+            elif was_kept and len(layers) > 1:
                 _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:

@@ -11,7 +11,7 @@ from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Scalar, Vector, sqrt
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, project, project_row, update_with_states
+from .covariance import dot, predict_measurement, project, project_row, update_scalar
 from .model import compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 
@@ -63,7 +63,8 @@ def _update_covariance(f: FilterRecord, s: int) -> None:
     for i in range(f.rows[s]):
         row = f.C[s, i]
         f.larsen_expected[s, i] = predict_measurement(f, s, i)
-        update_with_states(f, row, compute_row_variance(f, s, i, f.speed_before), 0.0)
+        r = compute_row_variance(f, s, i, f.speed_before)
+        update_scalar(f, project(f, row) + r, 0.0)
         for j in range(i):
             _propagate_gain(f, s, j, row)
         for k in range(f.n):
@@ -94,11 +95,11 @@ def propagate_larsen_gains(f: FilterRecord, row: Vector) -> None:
 
 @jit
 def store_due_captures(f: FilterRecord, last: int) -> None:
-    """Store what every sensor measured that captured at a tick, and advance its clock.
+    """Store what the sensors that captured at this tick measured, and advance their clocks.
 
     Args:
         f: Memory of the filter.
-        last: The last tick.
+        last: Tick of the filter's previous step.
     """
     for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
@@ -141,7 +142,7 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
 
 @jit
 def find_clone(f: FilterRecord, s: int, captured: int) -> int:
-    """Find what a sample measures.
+    """Find what a sample measures, and mark it as taken: a second call finds nothing.
 
     Args:
         f: Memory of the filter.
@@ -304,11 +305,11 @@ def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
 
 @jit
 def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
-    """Forget what only sensor s measures, of each row the last state; False if there is nothing."""
+    """Forget what only sensor s measures, of each row the last dense state; False without one."""
     has_reset = False
     for i in range(f.rows[s]):
         state = 0
-        for k in range(f.n):
+        for k in range(f.dense):  # its misalignment stays
             if f.C[s, i, k] != 0.0:
                 state = k
         if not _is_observed_elsewhere(f, s, state):

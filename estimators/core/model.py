@@ -23,6 +23,7 @@ CURVATURE = 2
 """Place of the road's curvature among a bicycle's inputs."""
 
 MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
+SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
 
 
 @jit
@@ -41,6 +42,28 @@ def _build_lateral(f: FilterRecord, V: Scalar) -> None:
         _write_tyres(f, V)
     if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
         B[0, N_INPUTS + f.banked] = -GRAVITY / V
+    if f.steered > 0:  # the input is the measured angle, with the offset in it
+        felt = 1.0 if is_steering_felt(V) else 0.0
+        for i in range(f.dense):
+            B[i, N_INPUTS + f.steered - f.dense] = 0.0 - felt * B[i, 0]
+        if f.accel_row > 0:
+            f.C_fast[f.accel_row, f.steered] = 0.0 - felt * f.D_fast[f.accel_row, 0]
+
+
+@jit
+def is_steering_felt(V: Scalar) -> Scalar:
+    """Return whether the model lets the offset of the steering sensor act.
+
+    A standing car's wheels turn without effect, which would be taken for an offset. The margin is
+    more than the speed may move without a new model.
+
+    Args:
+        V: Speed of the model (m/s).
+
+    Returns:
+        True above walking pace.
+    """
+    return V * (1.0 - 2.0 * SPEED_TOLERANCE) > MIN_SPEED
 
 
 @jit
@@ -198,21 +221,6 @@ def discretise(f: FilterRecord) -> None:
 
 
 @jit
-def compute_road_turn(V: Scalar, curvature: Scalar, step: Scalar) -> Scalar:
-    """Compute the angle by which a road turns within a step.
-
-    Args:
-        V: Speed (m/s).
-        curvature: Curvature of the road (1/m).
-        step: Step (s).
-
-    Returns:
-        Angle (rad).
-    """
-    return V * curvature * step
-
-
-@jit
 def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
     """Compute the variance of a slow sensor's row at a speed.
 
@@ -301,7 +309,6 @@ def compute_axle_force(
 
 
 MAX_NUMBER = 1e15  # bound of the numbers that a filter takes: whole floats below are exact as int
-_SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
 
 
 @jit
@@ -315,85 +322,3 @@ def is_finite(value: float) -> Scalar:
         True for a usable number.
     """
     return absolute(value) < MAX_NUMBER
-
-
-@jit
-def smooth_speed(speed: Scalar, sample: Scalar, share: Scalar) -> Scalar:
-    """Low-pass the speed.
-
-    Args:
-        speed: Low-passed speed so far (m/s).
-        sample: New sample (m/s).
-        share: Weight of the sample, 0 to 1.
-
-    Returns:
-        Low-passed speed (m/s).
-    """
-    return speed + share * (sample - speed)
-
-
-@jit
-def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
-    """Return whether a speed is too far from the model's.
-
-    Args:
-        speed: Speed (m/s).
-        model_speed: Speed of the model (m/s).
-
-    Returns:
-        True beyond `_SPEED_TOLERANCE`.
-    """
-    return absolute(maximum(speed, MIN_SPEED) - model_speed) > _SPEED_TOLERANCE * model_speed
-
-
-@jit
-def filter_speed(f: FilterRecord, sample: float) -> Scalar:
-    """Compute the low-passed mean of the front wheels' speeds; a bad sample is skipped.
-
-    Args:
-        f: Memory of the filter.
-        sample: New sample of that mean (m/s).
-
-    Returns:
-        Low-passed speed (m/s).
-    """
-    if not is_finite(sample):
-        return f.speed
-    if f.model_speed == 0.0:
-        return sample
-    return smooth_speed(f.speed, sample, f.smoothing)
-
-
-@jit
-def find_cell(f: FilterRecord, speed: float) -> int:
-    """Find the table of gains nearest to a speed.
-
-    Args:
-        f: Memory of the filter.
-        speed: Speed (m/s).
-
-    Returns:
-        Index of the cell.
-    """
-    if f.spacing == 0.0:
-        return 0
-    V = minimum(maximum(speed, f.low), f.high)
-    return int((V - f.low) / f.spacing + 0.5)
-
-
-@jit
-def find_next_cell(f: FilterRecord, sample: float) -> Scalar:
-    """Find the table of gains that the next row will use.
-
-    Args:
-        f: Memory of the filter.
-        sample: The row's sample of the speed (m/s).
-
-    Returns:
-        Index of the cell.
-    """
-    if f.measured == 1:
-        speed = filter_speed(f, sample)
-        if is_speed_changed(speed, f.model_speed):
-            return find_cell(f, speed)
-    return f.cell

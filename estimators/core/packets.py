@@ -65,8 +65,8 @@ def _restore_history(f: FilterRecord, tick: int) -> None:
 
 
 @jit
-def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
-    """Return whether a sample is a duplicate of a stored one."""
+def _has_sample(f: FilterRecord, s: int, captured: int) -> bool:
+    """Return whether a sensor's sample of a captured tick is stored already."""
     for i in range(len(f.recent)):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
@@ -136,7 +136,7 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
     """Correct by a packet of any age within the window; return whether it was used."""
     captured = int(packet[PACKET.captured])
     first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
-    if _is_duplicate(f, s, captured):
+    if _has_sample(f, s, captured):
         f.counts[COUNTERS.duplicates] += 1
         return False
     place = 0  # an empty one, or that of the earliest captured, which is lost
@@ -150,7 +150,7 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
     f.lost = lost
     copy_into(packet, f.recent[place])
     copy_into(f.r[s], f.recent_r[place])
-    if captured == f.tick:
+    if captured == f.tick:  # is_new is True then
         return _apply_stored(f, gains, s, place, captured == f.tick)
     return _replay_window(f, gains, first, place)
 
@@ -161,7 +161,7 @@ def _apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) ->
     if f.late == BUFFER:
         return _rewind_update(f, gains, s, packet)
     first = find_clone(f, s, int(packet[PACKET.captured]))
-    is_usable = first != DROPPED
+    is_usable = first != DROPPED  # True where update_filter's is_gated reads it
     return is_usable and update_filter(f, gains, s, first, packet, is_usable)
 
 

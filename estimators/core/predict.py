@@ -14,13 +14,12 @@ from .model import (
     KINEMATIC,
     LINEAR,
     MIN_SPEED,
+    SPEED_TOLERANCE,
     VELOCITY_ROLL,
     build_model,
     compute_axle_force,
-    filter_speed,
-    find_cell,
     is_finite,
-    is_speed_changed,
+    is_steering_felt,
 )
 from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 
@@ -43,6 +42,57 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
     return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
         factor, 1
     ) * load_element(row, load_element(column, 1))
+
+
+@jit
+def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
+    """Return whether a speed is too far from the model's.
+
+    Args:
+        speed: Speed (m/s).
+        model_speed: Speed of the model (m/s).
+
+    Returns:
+        True beyond `SPEED_TOLERANCE`.
+    """
+    return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
+
+
+@jit
+def _filter_speed(f: FilterRecord, sample: float) -> Scalar:
+    """Compute the low-passed mean of the front wheels' speeds (m/s); a bad sample is skipped."""
+    if not is_finite(sample):
+        return f.speed
+    if f.model_speed == 0.0:
+        return sample
+    return f.speed + f.smoothing * (sample - f.speed)
+
+
+@jit
+def _find_cell(f: FilterRecord, speed: float) -> int:
+    """Find the table of gains nearest to a speed (m/s)."""
+    if f.spacing == 0.0:
+        return 0
+    V = minimum(maximum(speed, f.low), f.high)
+    return int((V - f.low) / f.spacing + 0.5)
+
+
+@jit
+def find_next_cell(f: FilterRecord, sample: float) -> Scalar:
+    """Find the table of gains that the next row will use.
+
+    Args:
+        f: Memory of the filter.
+        sample: The row's sample of the speed (m/s).
+
+    Returns:
+        Index of the cell.
+    """
+    if f.measured == 1:
+        speed = _filter_speed(f, sample)
+        if is_speed_changed(speed, f.model_speed):
+            return _find_cell(f, speed)
+    return f.cell
 
 
 @jit
@@ -86,10 +136,10 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         turning = row[FAST.gyro]
     is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
     if f.measured == 1:
-        f.speed = filter_speed(f, wheel_speed)
+        f.speed = _filter_speed(f, wheel_speed)
         if is_speed_changed(f.speed, f.model_speed):
             is_outdated, speed = True, f.speed
-            f.cell = find_cell(f, f.speed)
+            f.cell = _find_cell(f, f.speed)
     if is_outdated:
         build_model(f, speed, turning)
 
@@ -100,9 +150,11 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
 
     Args:
         f: Memory of the filter.
-        steer: Steering angle of the front wheels (rad).
+        steer: Measured steering angle of the front wheels (rad).
     """
     x, V = f.x, maximum(f.model_speed, MIN_SPEED)
+    if f.steered > 0 and is_steering_felt(V):
+        steer = steer - x[f.steered]
     for i in range(2):
         x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
     grip = 0.0

@@ -83,6 +83,7 @@ _FIELDS = [
     ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
     ("pushed", _INT, (N_CORE,)),  # the state that each state behind the dense ones pushes; -1: none
     ("banked", _INT),  # place of the road's bank behind the dense states; -1: none
+    ("steered", _INT),  # where the steering sensor's offset stands; 0: none
     ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
     ("car", _FLOAT, (len(CarIndex._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x

@@ -14,7 +14,7 @@ from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, project_row, update_with_row, update_with_states
+from .covariance import dot, predict_measurement, project, project_row, update_scalar
 from .innovation import (
     BUFFER,
     CONSTANT,
@@ -39,15 +39,8 @@ def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Scalar:
 
 
 @jit
-def locate_step_row(f: FilterRecord) -> Scalar:
-    """Locate the gain of the first fast measurement in this step.
-
-    Args:
-        f: Memory of the filter.
-
-    Returns:
-        Row of the table.
-    """
+def _locate_step_row(f: FilterRecord) -> Scalar:
+    """Locate the gain of the first fast measurement in this step."""
     return 1 + f.at * maximum(f.fasts, 1)
 
 
@@ -114,7 +107,8 @@ def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> N
         for j in range(N):
             f.x[j] -= f.share[m + i, j] * f.eps[m + i]
     for i in range(rows):
-        update_with_row(f, s, i, first, compute_packet_variance(f, s, i, packet), 0.0)
+        r = compute_packet_variance(f, s, i, packet)
+        update_scalar(f, project_row(f, s, i, first) + r, 0.0)
         for k in range(i):  # the rows before it correct what it measures
             correction = _apply_row(f, s, i, f.share[m + k])
             for j in range(N):
@@ -217,7 +211,7 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
             sample_scale = (residual * residual - projected) / r * f.scale[s, i]
             scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
             f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
-        update_with_row(f, s, i, first, r, residual)
+        update_scalar(f, project_row(f, s, i, first) + r, residual)
         _reduce_residuals(f, s, first, i, f.gain)
         if f.late == LARSEN:
             propagate_larsen_gains(f, f.C[s, i])
@@ -233,7 +227,8 @@ def update_filter(
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         s: Index of the slow sensor.
-        first: What the sample measures, see `find_clone`.
+        first: Index in f.x of the clone of the sample's first row; negative without one, see
+            `find_clone`.
         packet: Packet, shape (PACKET_WIDTH,).
         is_gated: Whether the gate judges it and its NIS is taken; not when it is used again in a
             rewound window.
@@ -294,7 +289,7 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
             _correct_between(f, gains, s)
             return
         for i in range(f.fasts):
-            _add_gain(f, gains, locate_step_row(f) + i, f.eps[i])
+            _add_gain(f, gains, _locate_step_row(f) + i, f.eps[i])
         return
     for i in range(f.fasts):
         residual = compute_residual(f, i)
@@ -302,9 +297,9 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            _add_gain(f, gains, locate_step_row(f) + i, residual)
+            _add_gain(f, gains, _locate_step_row(f) + i, residual)
             continue
-        update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
+        update_scalar(f, project(f, f.C_fast[i]) + f.r_fast[i], residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
         if f.between == PSEUDO:

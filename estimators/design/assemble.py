@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -129,11 +128,13 @@ def assemble(
     for f, model in zip(layers, config.models, strict=True):
         _write_clocks(f, config, dt)
         n, f.step = len(model.names), f.stride * dt
+        too_many = f"{n} states are more than the {size.N_CORE} of a filter: {model.names}"
+        _refuse(config.name, [(n > size.N_CORE, too_many)])
         block = slice(first, first + n)
         _write_model(f, model, vehicle, config, config.Q[block, block] * f.step)
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
         f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
-        for state, time in config.times.items():
+        for state, time in config.bias_times.items():
             if time > 0.0:
                 i, decay = model.names.index(state), math.exp(-f.step / time)
                 f.decay[i], f.Q[i, i] = decay, (1.0 - decay * decay) * f.prior[i, i]
@@ -176,39 +177,6 @@ def _build_bank(layers: FilterRecords, config: FilterConfig, dt: float) -> Filte
         gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
         changed.q_tyres[:2] += _TYRE_WALK * changed.step
     return bank
-
-
-def select_first_sensor(config: FilterConfig) -> FilterConfig:
-    """Reduce a filter to its first slow sensor.
-
-    Args:
-        config: Parsed options of the filter.
-
-    Returns:
-        Its options with that sensor alone.
-    """
-    return replace(config, sensors=dict(list(config.sensors.items())[:1]))
-
-
-def remove_tyre_states(config: FilterConfig) -> FilterConfig:
-    """Reduce a filter to nominal tyres and scale instead of states: that one is linear.
-
-    Args:
-        config: Parsed options of the filter.
-
-    Returns:
-        Its options without these states.
-    """
-    prior = {name: sd for name, sd in config.prior.items() if name not in models.NONLINEAR}
-    if len(prior) == len(config.prior):
-        return config
-    indices = [i for i, name in enumerate(config.states) if name in prior]
-    layers = tuple(
-        replace(model, biases=tuple(name for name in model.biases if name in prior))
-        for model in config.models
-    )
-    Q = config.Q[np.ix_(indices, indices)]
-    return replace(config, models=layers, Q=Q, prior=prior, members=1)
 
 
 def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
@@ -255,6 +223,7 @@ def _write_model(
         f.pushed[j] = names.index(pushed)
     f.pushed[n - len(model.biases) - dense : n - dense] = -1
     f.banked = names.index("bank") - dense if "bank" in model.biases else -1
+    f.steered = names.index("steer_offset") if "steer_offset" in model.biases else 0
     f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
     f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
     body = make_roll_model(vehicle)
@@ -263,20 +232,21 @@ def _write_model(
     f.preview = vehicle.preview
     f.Q[:n, :n] = Q
     f.decay[:] = 1.0
-    noise, weight = dict(config.noise), vehicle.mass * GRAVITY
-    arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
-    for name, share, length in zip(("force", "moment"), config.shares, (1.0, arm), strict=True):
-        if share > 0.0:
-            noise[name] = math.hypot(noise[name], share * weight * length)
     if model.forces:  # exact discretisation of the process
-        decay = math.exp(-f.step / noise["time"])
+        force_sd, moment_sd = config.force_sd, config.moment_sd
+        weight, arm = vehicle.mass * GRAVITY, 0.5 * (vehicle.front_arm + vehicle.rear_arm)
+        if config.force_share > 0.0:
+            force_sd = math.hypot(force_sd, config.force_share * weight)
+        if config.moment_share > 0.0:
+            moment_sd = math.hypot(moment_sd, config.moment_share * weight * arm)
+        decay = math.exp(-f.step / config.disturbance_time)
         f.decay[dense : dense + 2] = decay
-        f.Q[dense, dense] += (1.0 - decay * decay) * noise["force"] ** 2
-        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * noise["moment"] ** 2
+        f.Q[dense, dense] += (1.0 - decay * decay) * force_sd**2
+        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * moment_sd**2
         f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - decay * decay
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_tyres(f, model, vehicle)
-    _write_signals(f, model, vehicle, noise)
+    _write_signals(f, model, vehicle, config.noise)
     _write_rows(f, model, config)
 
 
@@ -313,8 +283,9 @@ def _write_signals(
         if name in measured_state:
             f.C_fast[i, names.index(measured_state[name])] = 1.0
     f.scaled = names.index(models.SCALE) if models.SCALE in model.biases else 0
-    for bias in filter(models.WANDER.get, model.biases):
-        f.C_fast[model.fast.index(models.BIASES[bias]), names.index(bias)] = 1.0
+    for bias in models.WANDER.keys() & model.biases:
+        if models.WANDER[bias] in model.fast:
+            f.C_fast[model.fast.index(models.WANDER[bias]), names.index(bias)] = 1.0
     if model.kind == LATERAL and "accel_y" in model.fast:
         f.accel_row = model.fast.index("accel_y")
     if model.kind == FORCES:  # m a_y = F_yf + F_yr
@@ -341,6 +312,8 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
             for state in row.states:
                 late = models.LATE.get(state)
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
+        if name == "camera" and "camera_yaw" in model.biases:  # it turns about the car, not y_l
+            f.C[s, :2, model.names.index("camera_yaw")] = 1.0, f.preview
         if is_second_layer:
             f.r_speed = f.r[s, 0]
 

@@ -1,7 +1,7 @@
 """The options of a call, parsed to a `FilterConfig`; each error names filter, option and value."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,18 +17,31 @@ from ..filters import FilterDefinition
 from . import dual_rate, models
 from .kalman import INVERSES, check_covariance
 from .models import BIASES, SCALE, STATES, TYRES, WANDER
-from .options import DISTURBANCE, EXTRA_NOISE, FAST_CHANNELS, FIND, NOISE, TUNINGS
-from .options import FilterConfig as FilterConfig
+from .options import (
+    FAST_CHANNELS,
+    FIND,
+    MAX_MEMBERS,
+    NOISE,
+    NOT_NEGATIVE,
+    NUMBER,
+    OPTIONS,
+    POSITIVE,
+    TUNINGS,
+    FilterConfig,
+    NumberRule,
+)
 
 _GATE_PROBABILITY = 1.0 - 1e-9
-_MIN_SATELLITES = 4.0  # double-layer-gps 4.3
-_ASSUMED_DELAY = 0.033  # s
 _MAX_LATENCY = 0.5  # s, largest latency that may be configured
-_MAX_MEMBERS = 8
+_LATENCY = NumberRule(f"is 0 to {_MAX_LATENCY} s or {FIND!r}", lambda v: 0.0 <= v <= _MAX_LATENCY)
 _N_IMM_MEMBERS = 4
+_Values = dict[str, Any]  # options by name
 
 
-_Fits = Callable[[float], bool]
+_NUMBERS = (  # options that every filter has
+    *("leak", "satellites", "robust", "model_error", "accel_time", "force_share", "moment_share"),
+    *("adapt", "allow_unstable"),
+)
 
 
 class _Reader:
@@ -40,10 +53,26 @@ class _Reader:
     def __contains__(self, key: str) -> bool:
         return key in self._unread
 
-    def read_value(self, key: str, default: Any) -> Any:
+    def read_raw(self, key: str, default: object = None) -> Any:
         """Read an option as it is."""
         self._known.append(key)
         return self._unread.pop(key, default)
+
+    def read(self, *keys: str, default: object = None) -> _Values:
+        """Read options that are numbers or flags, by their defaults and limits."""
+        values: _Values = {}
+        for key in keys:
+            about, usual = OPTIONS[key].metadata, OPTIONS[key].default
+            value = self.read_raw(key, usual if default is None else default)
+            limits, unit = about["limits"], about["unit"]
+            if value is not None or usual is not None:
+                value = self.check_number(key, value, limits, unit) if limits else bool(value)
+            values[key] = value
+        return values
+
+    def read_number(self, key: str, default: float, limits: NumberRule, unit: str = "") -> float:
+        """Read a number that `OPTIONS` does not name; errors as in `check_number`."""
+        return self.check_number(key, self.read_raw(key, default), limits, unit)
 
     def make_error(self, key: str, expected: str, value: object) -> ValueError:
         """Make the error for a value that an option cannot have; expected: "is ..."."""
@@ -51,48 +80,19 @@ class _Reader:
 
     def read_choice(self, key: str, default: str, known: Sequence[str]) -> str:
         """Read an option that is one of some words; else ValueError."""
-        value = self.read_value(key, default)
+        value = self.read_raw(key, default)
         if value not in known:
             raise self.make_error(key, f"is one of {', '.join(filter(None, known))}", value)
         return str(value)
 
-    def read_choices(
-        self, key: str, default: Sequence[str], known: Sequence[str]
-    ) -> tuple[str, ...]:
-        """Read the first of some words and any others, in the order of `known`; else ValueError."""
-        value = self.read_value(key, default)
-        words = list(value) if isinstance(value, list | tuple) else [value]
-        chosen = tuple(word for word in known if word in words)
-        if len(chosen) != len(words) or known[0] not in chosen:
-            raise self.make_error(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
-        return chosen
-
-    def read_non_negative(self, key: str, unit: str) -> float:
-        """Read a number that is 0 or more."""
-        expected = f"is in {unit} and not negative"
-        return self.read_number(key, 0.0, expected, lambda v: 0.0 <= v < np.inf)
-
-    def read_number(
-        self, key: str, default: float, expected: str = "", fits: _Fits = lambda _: True
-    ) -> float:
-        """Read an option that is a number; errors as in `check_number`."""
-        return self.check_number(key, self.read_value(key, default), expected, fits)
-
-    def read_positive(self, key: str, default: float) -> float:
-        """Read a number above zero."""
-        expected = "must be positive and finite"
-        return self.read_number(key, default, expected, lambda v: 0.0 < v < np.inf)
-
-    def check_number(
-        self, key: str, value: object, expected: str = "", fits: _Fits = lambda _: True
-    ) -> float:
+    def check_number(self, key: str, value: object, limits: NumberRule, unit: str = "") -> float:
         """Convert to a number that fits; TypeError for no number, ValueError where it does not."""
         try:
             number = float(value)  # type: ignore[arg-type]  # anything that a user passes
         except (TypeError, ValueError):
             raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
-        if not fits(number):
-            raise self.make_error(key, expected, number)
+        if not limits.fits(number):
+            raise self.make_error(key, limits.expected.format(unit=unit), number)
         return number
 
     def read_array(self, key: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -134,59 +134,53 @@ def parse_config(
     """
     reader = _Reader(name, dict(row.options) | dict(options))
     used = _select_slow_sensors(row, sensors, reader)
-    rules = _parse_rules(row, used, reader)
-    fast, biases = _parse_inertial(row, reader)
+    chosen: _Values = {"slow": used} | _parse_rules(row, used, reader)
+    chosen |= _parse_inertial(row, used, reader)
     if row.model == "bicycle":
         disturbances = reader.read_choice("disturbances", row.disturbances, models.DISTURBANCES)
-        late, rolls = rules["delay"] in ("literal", "lag"), fast != row.fast
-        first = models.make_bicycle_model(used, fast, disturbances, late, rolls, tuple(biases))
+        chosen |= {"disturbances": disturbances} | reader.read("steer_rate")
+        late, rolls = chosen["delay"] in ("literal", "lag"), chosen["fast"] != row.fast
+        biases = tuple(chosen["bias_sds"])
+        first = models.make_bicycle_model(used, chosen["fast"], disturbances, late, rolls, biases)
     else:
         first = models.MODELS[row.model]
     layers = (first, models.MODELS[row.second]) if row.second else (first,)
     states = [state for model in layers for state in model.names]
-    if rules["poles"] and len(rules["poles"]) != len(states):
-        raise reader.make_error("poles", f"are one for each of {', '.join(states)}", rules["poles"])
-    noise, noise_over_speed = _parse_noise(first.forces, reader)
-    is_steered = first.inputs[0] == "steer"
-    config = FilterConfig(
+    if chosen["poles"] and len(chosen["poles"]) != len(states):
+        text = f"are one for each of {', '.join(states)}"
+        raise reader.make_error("poles", text, chosen["poles"])
+    rows = [row for sensor in models.MEASUREMENTS.values() for row in sensor.rows]
+    growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
+    noise = {
+        key.removesuffix("_noise"): reader.read_number(key, sd, POSITIVE)
+        for key, sd in NOISE.items()
+    }
+    if first.forces:
+        chosen |= reader.read("force_sd", "moment_sd", "disturbance_time")
+    Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
+    chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
+    chosen |= reader.read(*_NUMBERS) | _parse_gate(chosen["delay"], reader)
+    chosen |= _parse_bank(states, first.forces, chosen["delay"], reader)
+    chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
+    prior = _parse_prior(states, first.forces, chosen, reader)
+    reader.check_unread()
+    return FilterConfig(
         name=name,
         row=row,
         sensors={sensor: sensors[sensor] for sensor in used},
         models=layers,
-        **rules,
-        leak=reader.read_non_negative("leak", "1/s"),
-        Q=_parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader),
-        noise=noise,
-        noise_over_speed=noise_over_speed,
-        hdop_table=_parse_hdop_table(row, reader),
-        satellites=reader.read_number("satellites", _MIN_SATELLITES),
-        **_parse_gate(rules["delay"], reader),
-        **_parse_bank(states, first.forces, rules["delay"], reader),
-        robust=reader.read_non_negative("robust", "standard deviations"),
-        steer_rate=reader.read_non_negative("steer_rate", "rad/s") if is_steered else 0.0,
-        model_error=reader.read_non_negative("model_error", "shares of a force"),
-        accel_time=reader.read_non_negative("accel_time", "s"),
-        shares=(
-            reader.read_non_negative("force_share", "1"),
-            reader.read_non_negative("moment_share", "1"),
-        ),
-        times={
-            name: reader.read_non_negative(f"{name}_time", "s") for name in biases if name in WANDER
-        },
-        adapt=reader.read_number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
-        prior=_parse_prior(states, noise, biases, reader),
-        latency=_parse_latency(reader, bool(used) and TYRES[0] in states),
-        allow_unstable=bool(reader.read_value("allow_unstable", False)),
+        noise_over_speed={name: noise[name] * models.COURSE_SPEED for name in growing},
+        Q=Q,
+        prior=prior,
+        **chosen,
     )
-    reader.check_unread()
-    return config
 
 
 def _select_slow_sensors(
     row: FilterDefinition, available: Mapping[str, SlowSensor], reader: _Reader
 ) -> tuple[str, ...]:
     """Select the slow sensors to use, in the order of `SLOW_NAMES`."""
-    slow = reader.read_value("slow", None)
+    slow = reader.read_raw("slow", None)
     if not row.slow:
         if slow is not None:
             raise ValueError(f"{reader.name} uses no slow sensor, got slow={slow!r}")
@@ -207,72 +201,78 @@ def _select_slow_sensors(
     return tuple(sensor for sensor in SLOW_NAMES if sensor in requested)
 
 
-def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> dict[str, Any]:
+def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> _Values:
     """Parse how gains are computed, and what happens to late samples and between samples."""
     is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
-    intersample, between, assumed, poles = row.intersample, "hold", 0.0, row.poles
-    if is_dual_rate:
-        intersample = reader.read_choice("intersample", "pseudo", dual_rate.RULES)
-    elif row.second:
-        intersample = reader.read_choice("intersample", intersample, (intersample, "predict"))
+    chosen: _Values = {"intersample": row.intersample, "poles": row.poles}
+    if is_dual_rate or row.second:
+        words = dual_rate.RULES if is_dual_rate else (row.intersample, "predict")
+        default = "pseudo" if is_dual_rate else row.intersample
+        chosen["intersample"] = reader.read_choice("intersample", default, words)
     known_gains = dual_rate.GAINS if is_dual_rate else ("", "periodic", "covariance")
     gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
-    if gains == "from-29" and intersample != "pseudo":
-        raise reader.make_error("intersample", "is 'pseudo' for gains='from-29'", intersample)
-    if intersample == "single-rate":
-        between = reader.read_choice("between", between, ("hold", "predict"))
-        if between == "hold" and len(used) > 1:
+    if gains == "from-29" and chosen["intersample"] != "pseudo":
+        text = "is 'pseudo' for gains='from-29'"
+        raise reader.make_error("intersample", text, chosen["intersample"])
+    if row.intersample == "single-rate":
+        chosen["between"] = reader.read_choice("between", "hold", ("hold", "predict"))
+        if chosen["between"] == "hold" and len(used) > 1:
             raise reader.make_error("slow", "is one sensor for between='hold'", used)
     inverse = reader.read_choice("inverse", INVERSES[0], INVERSES)
     delay = reader.read_choice("delay", row.delay, RULES)
     if delay in ("literal", "lag") and "camera" not in used:
         raise reader.make_error("delay", "needs the camera for tie-vision's rules", delay)
     if delay == "constant":
-        assumed = reader.read_positive("assumed_delay", _ASSUMED_DELAY)
+        chosen |= reader.read("assumed_delay")
     if gains == "placed":
-        placed = reader.read_array("poles", reader.read_value("poles", poles))
-        negative = (placed < 0.0) & np.isfinite(placed)
-        if placed.ndim != 1 or not len(placed) or not negative.all():
-            raise reader.make_error("poles", "are negative numbers in rad/s", placed.tolist())
-        poles = tuple(placed.tolist())
-    names = ("gains", "delay", "assumed_delay", "between", "intersample", "inverse", "poles")
-    values = (gains, delay, assumed, between, intersample, inverse, poles)
-    return dict(zip(names, values, strict=True))
+        poles = reader.read_array("poles", reader.read_raw("poles", row.poles))
+        is_negative = (poles < 0.0) & np.isfinite(poles)
+        if poles.ndim != 1 or not len(poles) or not is_negative.all():
+            raise reader.make_error("poles", "are negative numbers in rad/s", poles.tolist())
+        chosen["poles"] = tuple(poles.tolist())
+    return chosen | {"gains": gains, "inverse": inverse, "delay": delay}
 
 
-def _parse_inertial(
-    row: FilterDefinition, reader: _Reader
-) -> tuple[tuple[str, ...], dict[str, float]]:
-    """Parse the fast sensors, and the standard deviations of their biases by state."""
+def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> _Values:
+    """Parse the fast sensors, and the deviations and times of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
-        return row.fast, {}
-    fast = reader.read_choices("fast", row.fast, models.INERTIAL)
-    biases = {name: reader.read_non_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
-    known = [name for name in TYRES if not biases[name] > 0.0]
-    if known not in (list(TYRES), list(TYRES[2:]), []):
-        raise ValueError(f"{reader.name}: {known[0]}_sd is above 0 where another tyre's state is")
-    if biases[SCALE] > 0.0 and TYRES[0] in known:
+        return {"fast": row.fast, "bias_sds": {}}
+    value, known = reader.read_raw("fast", row.fast), models.INERTIAL
+    words = list(value) if isinstance(value, list | tuple) else [value]
+    fast = tuple(word for word in known if word in words)
+    if len(fast) != len(words) or known[0] not in fast:
+        raise reader.make_error("fast", f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
+    biases: dict[str, float] = {}
+    for name in BIASES:
+        key, unit = f"{name}_sd", STATES[name].unit
+        biases[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, unit)
+    nominal = [name for name in TYRES if not biases[name] > 0.0]
+    if nominal not in (list(TYRES), list(TYRES[2:]), []):
+        raise ValueError(f"{reader.name}: {nominal[0]}_sd is above 0 where another tyre's state is")
+    if biases[SCALE] > 0.0 and TYRES[0] in nominal:
         raise ValueError(f"{reader.name}: {SCALE}_sd needs tyres among the states: {TYRES[0]}_sd")
-    for name, sd in biases.items():
-        if sd > 0.0 and BIASES[name] not in (*fast, ""):
-            raise reader.make_error(f"{name}_sd", f"needs {BIASES[name]} among fast", fast)
-    return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
+    biases = {name: sd for name, sd in biases.items() if sd > 0.0}
+    times: dict[str, float] = {}
+    for name in biases:
+        option, usable = ("slow", used) if BIASES[name] in SLOW_NAMES else ("fast", fast)
+        if BIASES[name] not in (*usable, ""):
+            raise reader.make_error(f"{name}_sd", f"needs {BIASES[name]} among {option}", usable)
+        if name in WANDER:
+            key = f"{name}_time"
+            times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
+    return {"fast": fast, "bias_sds": biases, "bias_times": times}
 
 
-def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
-    """Parse `gate` and `wary` of a `FilterConfig`."""
-    count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
-    wary = int(count) if delay in ("clone", "buffer") else 0
-    gate = reader.read_value("gate", _GATE_PROBABILITY if wary else None)
-    if gate is not None:
-        expected = "is a probability between 0 and 1"
-        gate = reader.check_number("gate", gate, expected, lambda v: 0.0 < v < 1.0)
-    return {"gate": gate, "wary": wary}
+def _parse_gate(delay: str, reader: _Reader) -> _Values:
+    """Parse `gate` and `wary`."""
+    count = int(reader.read("wary")["wary"])
+    wary = count if delay in ("clone", "buffer") else 0
+    return reader.read("gate", default=_GATE_PROBABILITY if wary else None) | {"wary": wary}
 
 
 def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]:
     """Parse the latencies above zero (s, or `FIND` for one of them) by channel."""
-    value = reader.read_value("latency", {})
+    value = reader.read_raw("latency", {})
     if not isinstance(value, Mapping):
         raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
     for channel in value:
@@ -280,34 +280,19 @@ def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]
             raise reader.make_error("latency", f"is of {', '.join(FAST_CHANNELS)}", dict(value))
     latencies: dict[str, float | str] = {}
     for channel, late in value.items():
-        expected = f"is 0 to {_MAX_LATENCY} s or {FIND!r}"
         if late == FIND:
             latencies[channel] = FIND
-        elif reader.check_number(
-            f"latency of {channel}", late, expected, lambda s: 0 <= s <= _MAX_LATENCY
-        ):
-            latencies[channel] = float(late)
+        elif seconds := reader.check_number(f"latency of {channel}", late, _LATENCY):
+            latencies[channel] = seconds
     if list(latencies.values()).count(FIND) > (1 if is_findable else 0):
         expected = f"is {FIND!r} for one channel of a filter with tyres as states and slow sensors"
         raise reader.make_error("latency", expected, dict(value))
     return latencies
 
 
-def _parse_noise(forces: bool, reader: _Reader) -> tuple[dict[str, float], dict[str, float]]:
-    """Parse `FilterConfig.noise` and `FilterConfig.noise_over_speed`."""
-    rows = [row for sensor in models.MEASUREMENTS.values() for row in sensor.rows]
-    growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
-    sds = NOISE | EXTRA_NOISE
-    noise = {key.removesuffix("_noise"): reader.read_positive(key, sd) for key, sd in sds.items()}
-    if forces:
-        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
-        noise |= {short: reader.read_positive(key, default) for short, (key, default) in keys}
-    return noise, {name: noise[name] * models.COURSE_SPEED for name in growing}
-
-
 def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[float, float], ...]:
     """Parse the knots (HDOP, factor on the GPS's standard deviation), or none."""
-    table = reader.read_value("hdop_table", row.hdop)
+    table = reader.read_raw("hdop_table", row.hdop_table)
     if table is None or (isinstance(table, tuple) and not table):
         return ()
     knots = reader.read_array("hdop_table", table)
@@ -318,24 +303,21 @@ def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[flo
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
 
 
-def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader) -> dict[str, Any]:
-    """Parse `members`, `levels` and `sudden` of a `FilterConfig`."""
-    value = reader.read_value("levels", (1.0,))
+def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader) -> _Values:
+    """Parse `members`, `levels` and `sudden`."""
+    value = reader.read_raw("levels", (1.0,))
     levels = reader.read_array("levels", value)
     pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
-    fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= _MAX_MEMBERS
+    fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= MAX_MEMBERS
     if not (fits and (pairs > 0.0).all() and np.isfinite(pairs).all()):
-        expected = f"are 1 to {_MAX_MEMBERS} positive factors or pairs"
+        expected = f"are 1 to {MAX_MEMBERS} positive factors or pairs"
         raise reader.make_error("levels", expected, value)
-    expected = f"is a number of filters from 1 to {_MAX_MEMBERS}"
-    count = reader.read_number(
-        "members", len(pairs), expected, lambda v: v in range(1, _MAX_MEMBERS + 1)
-    )
+    count = reader.read("members", default=len(pairs))["members"]
     if count > 1 and TYRES[0] not in states:
         raise reader.make_error("members", "is 1 where tyres are known", count)
     if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
         raise reader.make_error("levels", "need disturbances='forces' and a member each", value)
-    sudden = bool(reader.read_value("sudden", False))
+    sudden = reader.read("sudden")["sudden"]
     if sudden and not (count == 1 and TYRES[0] in states and forces and delay == "clone"):
         expected = "needs unknown tyres, disturbances='forces', delay='clone', no members or levels"
         raise reader.make_error("sudden", expected, sudden)
@@ -346,37 +328,33 @@ def _parse_process_noise(
     states: Sequence[str], tuning: Mapping[str, float], reader: _Reader
 ) -> Array:
     """Parse Q per second, shape (n, n): the tuning's or the option's, with each `q_STATE` in it."""
-    n, matrix = len(states), reader.read_value("Q", None)
+    n, matrix = len(states), reader.read_raw("Q")
     tuned_diagonal = [tuning.get(state, 0.0) for state in states]
     Q = reader.read_array("Q", tuned_diagonal if matrix is None else matrix)
     if Q.shape not in ((n,), (n, n)):
         raise ValueError(f"{reader.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
     Q = np.diag(Q) if Q.ndim == 1 else Q
     for i, state in enumerate(states):
-        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]))
+        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]), NUMBER)
     check_covariance(f"{reader.name}: Q", Q)
     return Q
 
 
 def _parse_prior(
-    states: Sequence[str],
-    noise: Mapping[str, float],
-    biases: Mapping[str, float],
-    reader: _Reader,
+    states: Sequence[str], has_forces: bool, chosen: _Values, reader: _Reader
 ) -> dict[str, float]:
     """Parse the standard deviation of every state at the start, in the state's unit."""
-    deviations = {state: STATES[state].prior for state in states} | dict(biases)
-    if "force" in noise:
-        deviations |= {"F_d": noise["force"], "N_d": noise["moment"]}
-    prior = reader.read_value("prior", {})
+    deviations: dict[str, float] = {state: STATES[state].prior for state in states}
+    deviations |= chosen["bias_sds"]
+    if has_forces:
+        deviations |= {"F_d": chosen["force_sd"], "N_d": chosen["moment_sd"]}
+    prior = reader.read_raw("prior", {})
     if not isinstance(prior, Mapping):
         raise TypeError(f"{reader.name}: prior is standard deviations by state, got {prior!r}")
     for state, value in prior.items():
         if state not in states:
-            known = ", ".join(states)
-            raise ValueError(
-                f"{reader.name} has no state {state!r}; it has: {known}; prior={prior}"
-            )
+            text = f"has no state {state!r}; it has: {', '.join(states)}; prior={prior}"
+            raise ValueError(f"{reader.name} {text}")
         sd = reader.read_array(f"the prior of {state}", value)
         if sd.ndim > 0 or not 0.0 <= sd < math.inf:
             raise reader.make_error(f"the prior of {state}", "is a standard deviation", value)

@@ -4,6 +4,8 @@ At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H
 i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...envs.record import Array
@@ -15,33 +17,137 @@ GAINS = ("constant", "from-29", "placed")
 _CYCLES, _SETTLED = 400, 1e-12  # most samples of a recursion, relative change where it ends
 
 
-def _compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
-    """Compute the limit of the Kalman gain (n, q) of a sample every `steps` steps."""
-    n = len(F)
-    power, noise = np.eye(n), np.zeros((n, n))
-    for _ in range(steps):
-        power, noise = F @ power, F @ noise @ F.T + Q
-    P, K = noise.copy(), np.zeros((n, len(C)))
-    for _ in range(_CYCLES):
-        before, K = K, kalman.kalman_gain(P, C, R)
-        P = power @ kalman.joseph_form(P, K, C, R) @ power.T + noise
-        if np.abs(K - before).max() <= _SETTLED * np.abs(K).max():
-            break
-    return K
+class SampledSystem(NamedTuple):
+    """A linear system whose output is sampled every few steps."""
 
+    F: Array  # transition matrix of a step, shape (n, n)
+    Q: Array  # covariance of a step's process noise, shape (n, n)
+    C: Array  # measurement matrix, shape (q, n)
+    R: Array  # covariance of the measurement noise, shape (q, q)
+    steps: int  # between two samples
 
-def _compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
-    """Compute Hara's B_i = L for all i, shape (steps, n, q): the innovation is held.
+    def compute_shares(self, rule: str, gains: str, poles: Poles | None) -> Array:
+        """Compute B_i of a rule.
 
-    L gives the error from sample to sample its poles and its very map:
-    F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
-    """
-    power, total = np.eye(len(F)), np.zeros_like(F)
-    for _ in range(steps):
-        power = F @ power
-        total = total + power
-    L = np.linalg.solve(total, power @ K)
-    return np.repeat(L[None], steps, axis=0)
+        Args:
+            rule: Name of `RULES`.
+            gains: Name of `GAINS`.
+            poles: Poles in the z-plane for one step, shape (n,), for gains "placed": of the
+                fast-rate filter (I - L C) F for "oh" and "pseudo", of the single-rate one, to the
+                power of `steps`, for the others.
+
+        Returns:
+            B_i, shape (steps, n, q).
+        """
+        F, C, steps, is_single_rate = self.F, self.C, self.steps, rule in ("predict", "hold")
+        if gains == "from-29":
+            return self.compute_shares_29()
+        if gains == "placed":
+            assert poles is not None
+            exponent = steps if is_single_rate else 1
+            L = observer_gain(np.linalg.matrix_power(F, exponent), C, poles**exponent)
+        else:
+            L = self._compute_sampled_gain()
+        if rule == "hold":
+            return self._compute_hold_shares(L)
+        if rule == "predict":
+            return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
+        if gains == "constant":
+            L = L / steps  # every step takes an even part
+        inverse = compute_inverse("moore-penrose", C, np.eye(len(F)), self.R)
+        return compute_pseudo_shares(F, C, L, inverse - L, steps)
+
+    def _compute_sampled_gain(self) -> Array:
+        """Compute the limit of the Kalman gain (n, q) of a sample every `steps` steps."""
+        F, Q, C, R, steps = self
+        n = len(F)
+        power, noise = np.eye(n), np.zeros((n, n))
+        for _ in range(steps):
+            power, noise = F @ power, F @ noise @ F.T + Q
+        P, K = noise.copy(), np.zeros((n, len(C)))
+        for _ in range(_CYCLES):
+            before, K = K, kalman.kalman_gain(P, C, R)
+            P = power @ kalman.joseph_form(P, K, C, R) @ power.T + noise
+            if np.abs(K - before).max() <= _SETTLED * np.abs(K).max():
+                break
+        return K
+
+    def _compute_hold_shares(self, K: Array) -> Array:
+        """Compute Hara's B_i = L for all i, shape (steps, n, q): the innovation is held.
+
+        L gives the error from sample to sample its poles and its very map:
+        F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
+        """
+        power, total = np.eye(len(self.F)), np.zeros_like(self.F)
+        for _ in range(self.steps):
+            power = self.F @ power
+            total = total + power
+        L = np.linalg.solve(total, power @ K)
+        return np.repeat(L[None], self.steps, axis=0)
+
+    def compute_shares_29(self) -> Array:
+        """Compute the limits of B_i = L_i G_i, with G_i of (31) and the Kalman gain for (29).
+
+        The covariance recursion is the paper's, which takes pseudo measurements for independent
+        ones; its error can grow (by 1.17 to 1.22 a sample for a course alone).
+
+        Returns:
+            B_i, shape (steps, n, q).
+        """
+        F, Q, C, R, steps = self
+        n, q = len(F), len(C)
+        pinv = compute_inverse("moore-penrose", C, np.eye(n), R)
+        P, shares = Q.copy(), np.zeros((steps, n, q))
+        for _ in range(_CYCLES):
+            before = shares.copy()
+            P = F @ P @ F.T + Q
+            for i in range(steps):
+                if i == 0:
+                    G, noise = np.eye(q), R
+                    Psi, Upsilon, Lambda = np.eye(n), np.zeros((n, n)), np.zeros((n, q))
+                else:  # (26)-(28), one step on: all that came before is moved by F
+                    Psi = F @ (Psi - shares[i - 1] @ C)
+                    Upsilon = F @ Upsilon @ F.T + Q
+                    Lambda = F @ (Lambda + shares[i - 1])
+                    G = C @ Psi @ pinv  # (31)
+                    v = G + C @ Lambda
+                    noise = C @ Upsilon @ C.T + v @ R @ v.T  # (29)
+                    P = F @ P @ F.T + Q
+                L = kalman.kalman_gain(P, C, noise)
+                P = kalman.joseph_form(P, L, C, noise)
+                shares[i] = L @ G
+            if np.abs(shares - before).max() <= _SETTLED * np.abs(shares).max():
+                break
+        return shares
+
+    def write_shares(self, B: Array, table: Array, first: int, behind: int) -> None:
+        """Write B_i, and the covariances they lead to, into a table of gains.
+
+        Args:
+            B: B_i, shape (steps, n, q).
+            table: Output, shape (rows, columns).
+            first: Row at which B_i start.
+            behind: Column at which the covariances start.
+        """
+        steps, n, q = B.shape
+        table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
+        upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
+        P = np.zeros((n + q, n + q))  # of the error and the last innovation
+        predict_map = np.eye(n + q)
+        predict_map[:n, :n] = self.F
+        for _ in range(30):
+            for i, share in enumerate(B):
+                P = predict_map @ P @ predict_map.T
+                P[:n, :n] += self.Q
+                if i == 0:
+                    zero = np.zeros((n, q))
+                    measure_map = np.block([[np.eye(n), zero], [self.C, np.zeros((q, q))]])
+                    P = measure_map @ P @ measure_map.T
+                    P[n:, n:] += self.R
+                correct_map = np.eye(n + q)
+                correct_map[:n, n:] = -share
+                P = correct_map @ P @ correct_map.T
+                table[1 + i, behind:] = P[:n, :n][upper]
 
 
 def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
@@ -67,87 +173,6 @@ def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int
     return np.array(shares)
 
 
-def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
-    """Compute the limits of B_i = L_i G_i, with G_i of (31) and the Kalman gain for (29).
-
-    The covariance recursion is the paper's, which takes pseudo measurements for independent ones;
-    its error can grow (by 1.17 to 1.22 a sample for a course alone).
-
-    Args:
-        F: Transition matrix of a step, shape (n, n).
-        Q: Covariance of a step's process noise, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        R: Covariance of the measurement noise, shape (q, q).
-        steps: Number of steps between two samples.
-
-    Returns:
-        B_i, shape (steps, n, q).
-    """
-    n, q = len(F), len(C)
-    pinv = compute_inverse("moore-penrose", C, np.eye(n), R)
-    P, shares = Q.copy(), np.zeros((steps, n, q))
-    for _ in range(_CYCLES):
-        before = shares.copy()
-        P = F @ P @ F.T + Q
-        for i in range(steps):
-            if i == 0:
-                G, noise = np.eye(q), R
-                Psi, Upsilon, Lambda = np.eye(n), np.zeros((n, n)), np.zeros((n, q))
-            else:  # (26)-(28), one step on: all that came before is moved by F
-                Psi = F @ (Psi - shares[i - 1] @ C)
-                Upsilon = F @ Upsilon @ F.T + Q
-                Lambda = F @ (Lambda + shares[i - 1])
-                G = C @ Psi @ pinv  # (31)
-                v = G + C @ Lambda
-                noise = C @ Upsilon @ C.T + v @ R @ v.T  # (29)
-                P = F @ P @ F.T + Q
-            L = kalman.kalman_gain(P, C, noise)
-            P = kalman.joseph_form(P, L, C, noise)
-            shares[i] = L @ G
-        if np.abs(shares - before).max() <= _SETTLED * np.abs(shares).max():
-            break
-    return shares
-
-
-def compute_shares(
-    rule: str, gains: str, poles: Poles | None, F: Array, Q: Array, C: Array, R: Array, steps: int
-) -> Array:
-    """Compute B_i of a rule.
-
-    Args:
-        rule: Name of `RULES`.
-        gains: Name of `GAINS`.
-        poles: Poles in the z-plane for one step, shape (n,), for gains "placed": of the fast-rate
-            filter (I - L C) F for "oh" and "pseudo", of the single-rate one, to the power of
-            `steps`, for the others.
-        F: Transition matrix of a step, shape (n, n).
-        Q: Covariance of a step's process noise, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        R: Covariance of the measurement noise, shape (q, q).
-        steps: Number of steps between two samples.
-
-    Returns:
-        B_i, shape (steps, n, q).
-    """
-    is_single_rate = rule in ("predict", "hold")
-    if gains == "from-29":
-        return compute_shares_29(F, Q, C, R, steps)
-    if gains == "placed":
-        assert poles is not None
-        exponent = steps if is_single_rate else 1
-        L = observer_gain(np.linalg.matrix_power(F, exponent), C, poles**exponent)
-    else:
-        L = _compute_sampled_gain(F, Q, C, R, steps)
-    if rule == "hold":
-        return _compute_hold_shares(F, C, L, steps)
-    if rule == "predict":
-        return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
-    if gains == "constant":
-        L = L / steps  # every step takes an even part
-    inverse = compute_inverse("moore-penrose", C, np.eye(len(F)), R)
-    return compute_pseudo_shares(F, C, L, inverse - L, steps)
-
-
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
     """Compute the map from the error before a sample to that before the next one.
 
@@ -163,38 +188,3 @@ def frame_map(F: Array, C: Array, shares: Array) -> Array:
     for B in shares:
         M = F @ (M - B @ eps)
     return M
-
-
-def write_shares(
-    F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, first: int, behind: int
-) -> None:
-    """Write B_i, and the covariances they lead to, into a table of gains.
-
-    Args:
-        F: Transition matrix of a step, shape (n, n).
-        Q: Covariance of a step's process noise, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        R: Covariance of the measurement noise, shape (q, q).
-        B: B_i, shape (steps, n, q).
-        table: Output, shape (rows, columns).
-        first: Row at which B_i start.
-        behind: Column at which the covariances start.
-    """
-    steps, n, q = B.shape
-    table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-    upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
-    P = np.zeros((n + q, n + q))  # of the error and the last innovation
-    predict_map = np.eye(n + q)
-    predict_map[:n, :n] = F
-    for _ in range(30):
-        for i, share in enumerate(B):
-            P = predict_map @ P @ predict_map.T
-            P[:n, :n] += Q
-            if i == 0:
-                measure_map = np.block([[np.eye(n), np.zeros((n, q))], [C, np.zeros((q, q))]])
-                P = measure_map @ P @ measure_map.T
-                P[n:, n:] += R
-            correct_map = np.eye(n + q)
-            correct_map[:n, n:] = -share
-            P = correct_map @ P @ correct_map.T
-            table[1 + i, behind:] = P[:n, :n][upper]

@@ -100,6 +100,8 @@ STATES = {
     "accel_bias": StateInfo("m/s2", 0.0, 50.0),
     "accel_scale": StateInfo("-", 0.0, 1.0),
     "bank": StateInfo("rad", 0.0, 1.0),
+    "camera_yaw": StateInfo("rad", 0.0, 1.0),
+    "steer_offset": StateInfo("rad", 0.0, 1.0),
     "front_tyres": StateInfo("-", 0.0, 5.0),
     "rear_tyres": StateInfo("-", 0.0, 5.0),
     "inverse_friction": StateInfo("-", 0.0, 5.0),
@@ -133,12 +135,19 @@ _ORDER = ("beta", "gamma", "psi", "y_l")
 _BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
 TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
-WANDER = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
+WANDER = {
+    "bias": "gyro",
+    "accel_bias": "accel_y",
+    "bank": "",
+    "camera_yaw": "camera",
+    "steer_offset": "",
+}
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
-"""States that nothing drives but noise, and the fast sensor that each needs, if any: biases of fast
-sensors, the road's bank, the error of the accelerometer's scale. The tyres' states count as biases
-too: factors of stiffness, and the reciprocal of friction."""
+"""States that nothing drives but noise, and the sensor that each needs, if any: biases of fast
+sensors, the road's bank, the camera's yaw against the car, what the steering sensor measures too
+much, the error of the accelerometer's scale. The tyres' states count as biases too: factors of
+stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
 _WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 _WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)

@@ -1,55 +1,51 @@
-"""The options of a filter, the default noise levels and the tuned process noise.
+"""The options of filters, each described once, and the tuned process noise.
 
-The process noise of each filter with its slow sensors is in `tunings.toml`, as `sideslip tune
-estimator` found it: per second, in (unit of the state)^2 / s, with the command that found it.
+Messages, the signature of `make_estimator` and the table in the docs of `FilterOptions` come from
+its fields. The process noise of each filter with its slow sensors is in `tunings.toml`, as
+`sideslip tune estimator` found it: per second, in (unit of the state)^2 / s, with the command that
+found it.
 """
 
+import math
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from inspect import Parameter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import FAST, Array
 from ...envs.sensors.link import SlowSensor
+from ..core.innovation import RULES
 from ..filters import FilterDefinition
-from .models import MEASUREMENTS, FilterModel
+from .kalman import INVERSES
+from .models import BIASES, MEASUREMENTS, NONLINEAR, STATES, WANDER, FilterModel
 
-FAST_CHANNELS = {
-    "steer": ("steer",),
-    "gyro": ("gyro",),
-    "accel_x": ("accel_x",),
-    "accel_y": ("accel_y",),
-    "roll_rate": ("roll_rate",),
-    "wheels": ("wheel_left", "wheel_right"),
+FAST_CHANNELS: dict[str, tuple[int, ...]] = {
+    "steer": (FAST.steer,),
+    "gyro": (FAST.gyro,),
+    "accel_x": (FAST.accel_x,),
+    "accel_y": (FAST.accel_y,),
+    "roll_rate": (FAST.roll_rate,),
+    "wheels": (FAST.wheel_left, FAST.wheel_right),
 }
-"""The columns of `envs.record.Fast` that are late together."""
+"""The columns of a fast row that are late together."""
 FIND = "find"
-
-
-def find_columns(channel: str) -> tuple[int, ...]:
-    """Find the columns of a fast row that a channel has.
-
-    Args:
-        channel: Name of `FAST_CHANNELS`.
-
-    Returns:
-        Their indices.
-    """
-    return tuple(int(getattr(FAST, name)) for name in FAST_CHANNELS[channel])
-
-
-NOISE = {"gyro_noise": 0.005} | {  # rad/s
-    f"{row.noise}_noise": row.sd for sensor in MEASUREMENTS.values() for row in sensor.rows
-}
-EXTRA_NOISE = {
+MAX_MEMBERS = 8
+NOISE = {
+    "gyro_noise": 0.005,  # rad/s
     "accel_y_noise": 0.1,  # m/s2
     "roll_rate_noise": 0.005,  # rad/s
     "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
-} | {f"{row.noise}_noise": row.sd for sensor in MEASUREMENTS.values() for row in sensor.velocities}
-DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
-
-
+} | {
+    f"{row.noise}_noise": row.sd
+    for sensor in MEASUREMENTS.values()
+    for row in (*sensor.rows, *sensor.velocities)
+}
+"""Standard deviations of what is measured, by option."""
 FILE = Path(__file__).with_name("tunings.toml")
 
 
@@ -80,100 +76,175 @@ TUNINGS: dict[tuple[str, str], dict[str, float]] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterConfig:
-    """Decisions about a filter before its design: its name in `FILTERS` and its options.
+class NumberRule(NamedTuple):
+    """What a number has to be."""
 
-    Options, as `make_estimator` takes them
-    ---------------------------------------
-    slow: the slow sensor to use (default: the row's first that is there); several by "covariance".
-    gains: "periodic" (precomputed), "covariance"; of dual-rate "constant", "from-29" or "placed".
-    delay: the rule for late samples, see `sideslip.estimators.core.innovation`: "clone" or "buffer"
-        (exact), "larsen", "stored", "constant" (with assumed_delay, s), "literal", "lag", "ignore".
-    between: of single-rate-kf, "hold" (default) or "predict" between its steps.
-    intersample: of double-layer "pseudo-residual" or "predict"; of dual-rate "pseudo", "predict",
-        "hold" or "oh".
-    inverse: of the pseudo-residual rule, "moore-penrose", "p-weighted", "tikhonov" or "bayes".
-    poles: of placed gains, negative numbers in rad/s, one a state; of dual-rate see `DualRate`.
-    disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
-        pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
-    leak: 1/s, by which disturbances decay on top of that.
-    fast: of exact-kf, course-kf and dakf, what is measured in every row: "gyro" (default), and any
-        of "accel_y" and "roll_rate", with which the body rolls: states phi and phi_rate.
-    front_tyres_sd, rear_tyres_sd, inverse_friction_sd: of the same, above 0 (default of all but
-        joint) states: factors on both stiffnesses, and the reciprocal of friction, tyres having no
-        limit where it is known. The model is then expanded at the estimate (an EKF).
-    accel_scale_sd: of joint, above 0 (default) a state: the fraction by which the accelerometer
-        measures too much, as one does whose roll is not known.
-    bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
-        `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
-        which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
-        above 0 it wanders about 0 with that deviation and forgets within that time.
-    q_beta, q_gamma, ...: process noise per second, (unit)^2/s; or Q, (n, n) or (n,); tuned ones.
-    gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
-        0.14 deg at 60 km/h growing as 1/V), accel_y_noise (m/s2), roll_rate_noise (rad/s),
-        wheel_noise, gps_speed_noise (m/s): standard deviations.
-    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise
-        (default of all but double-layer, where the factor is the HDOP).
-    satellites: the least that a GPS fix needs (default 4).
-    robust: standard deviations of an innovation from which it counts less (Huber); 0: none does.
-    steer_rate: rad/s; a steering angle that changes faster waits for the next row; 0: none does.
-    force_share, moment_share: fractions of the car's weight, and of that at half the wheelbase,
-        that are added to force_sd and moment_sd, as variances (default 0).
-    model_error: of joint, the fraction of the axles' forces by which its tyres err, added likewise.
-    accel_time: s over which the accelerometer's noise is found, from `accel_y_noise` up; 0: fixed.
-    members: of joint, filters side by side (default: one for each of `levels`), of which the least
-        likely forgets the tyres twice a second.
-    levels: of joint, factors on force_sd and moment_sd, or pairs, which members take in turn.
-    sudden: of joint, True runs four filters that interact, without members or levels: nothing
-        happens, a gust blows, the tyres have just changed, they settle.
-    gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
-    wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
-        a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
-        where none is configured, a sensor's first sample passes it, and after so many gated samples
-        in a row that agree with each other the filter begins anew with the sensor.
-    adapt: fraction of a new innovation in an R that follows them (0: R as configured).
-    force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
-    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) come late,
-        {"gyro": 0.06}; "find" for one that joint finds while driving.
-    prior: standard deviations of states at the start, by state.
-    allow_unstable: build a filter whose error grows.
+    expected: str  # for messages, with {unit}
+    fits: Callable[[float], bool]
+
+
+NUMBER = NumberRule("", lambda _: True)
+POSITIVE = NumberRule("must be positive and finite", lambda v: 0.0 < v < math.inf)
+NOT_NEGATIVE = NumberRule("is in {unit} and not negative", lambda v: 0.0 <= v < math.inf)
+_PROBABILITY = NumberRule("is a probability between 0 and 1", lambda v: 0.0 < v < 1.0)
+_FRACTION = NumberRule("is a share from 0 to 1", lambda v: 0.0 <= v < 1.0)
+_SAMPLES = NumberRule("is a number of samples", lambda v: v in range(1000))
+_FILTERS = NumberRule(
+    f"is a number of filters from 1 to {MAX_MEMBERS}", lambda v: v in range(1, MAX_MEMBERS + 1)
+)
+_Field = Any  # a field, which stands for its default
+
+
+def _make(default: object, text: str, unit: str = "", limits: NumberRule | None = None) -> _Field:
+    text = f" ({unit}): {text}." if unit else f": {text}."
+    return field(default=default, metadata={"text": text, "unit": unit, "limits": limits})
+
+
+def _group(defaults: Mapping[str, float | None], text: str) -> _Field:
+    """Describe options that are alike: their defaults by name."""
+    return field(default_factory=dict, metadata={"text": f": {text}.", "family": defaults})
+
+
+def _add(text: str, unit: str) -> _Field:
+    return _make(0.0, text, unit, NOT_NEGATIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """Options of a filter, as `make_estimator` takes them; each has those that its rules need.
+
+    Defaults are the common ones; a row of `FILTERS` has its own.
+    """
+
+    slow: tuple[str, ...] = _make(None, "slow sensors; several by covariance; None: the first")
+    gains: str = _make("", "periodic or covariance; of dual-rate constant, from-29 or placed")
+    delay: str = _make("clone", f"rule for late samples: {', '.join(RULES)}; see core.innovation")
+    assumed_delay: float = _make(0.033, "delay of all samples, by the rule constant", "s", POSITIVE)
+    between: str = _make("hold", "of single-rate-kf: hold or predict between its steps")
+    intersample: str = _make(
+        "predict", "of double-layer pseudo-residual or predict, of dual-rate pseudo, hold, oh too"
+    )
+    inverse: str = _make(INVERSES[0], f"of pseudo-residuals: {', '.join(INVERSES)}")
+    poles: tuple[float, ...] = _make((), "of placed gains, one a state; see `DualRate`", "rad/s")
+    disturbances: str = _make(
+        "none", "walk, walk-all (psi too) or forces, an Ornstein-Uhlenbeck force and moment"
+    )
+    leak: float = _add("by which disturbances decay on top of that", "1/s")
+    fast: tuple[str, ...] = _make(
+        ("gyro",), "gyro and any of accel_y and roll_rate, with which the body rolls"
+    )
+    bias_sds: Mapping[str, float] = _group(
+        dict.fromkeys([f"{name}_sd" for name in BIASES], 0.0),
+        "above 0 a state of this deviation: a bias of the gyro (rad/s) or the accelerometer "
+        "(m/s2), the road's bank (rad), the camera's yaw to the left (rad), what the steering "
+        "sensor measures too much (rad), the fraction that the accelerometer does, "
+        "factors on both axles' stiffness, the reciprocal of friction (0: tyres without a limit)",
+    )
+    bias_times: Mapping[str, float] = _group(
+        dict.fromkeys([f"{name}_time" for name in WANDER], 0.0),
+        "s within which such a state forgets, and wanders about 0 with its deviation; 0: never",
+    )
+    Q: npt.ArrayLike | None = _make(  # noqa: RUF009
+        None, "process noise, (n, n) or (n,); None: the tuned one", "unit^2/s"
+    )
+    q: Mapping[str, float] = _group(
+        dict.fromkeys([f"q_{name}" for name in STATES]), "entries of Q, (unit)^2/s"
+    )
+    noise: Mapping[str, float] = _group(
+        NOISE,
+        "deviations of measurements; the course's, if not set, is for 60 km/h and grows as 1/V",
+    )
+    hdop_table: tuple[tuple[float, float], ...] = _make(
+        (), "pairs (HDOP, factor on the GPS's noise), linear in between"
+    )
+    satellites: float = _make(4.0, "that a fix needs, double-layer-gps 4.3", limits=NUMBER)
+    robust: float = _add("innovation beyond which it counts less (Huber)", "standard deviations")
+    steer_rate: float = _add("a faster change of steering waits for the next row", "rad/s")
+    model_error: float = _add("error of the tyres, added to force_sd", "shares of a force")
+    accel_time: float = _add("time over which the accelerometer's noise is found; 0: fixed", "s")
+    force_share: float = _add("of the weight, added to force_sd as a variance", "1")
+    moment_share: float = _add("of that at half the wheelbase, added to moment_sd", "1")
+    force_sd: float = _make(50.0, "of disturbances that are forces", "N", POSITIVE)
+    moment_sd: float = _make(20.0, "of disturbances that are forces", "N m", POSITIVE)
+    disturbance_time: float = _make(0.3, "time constant of both", "s", POSITIVE)
+    members: int = _make(
+        1, "filters of which the least likely forgets the tyres twice a second", limits=_FILTERS
+    )
+    levels: npt.ArrayLike = _make(  # noqa: RUF009
+        (1.0,), "factors on force_sd, moment_sd, or pairs, of members in turn"
+    )
+    sudden: bool = _make(
+        False,
+        "four filters that interact: nothing happens, a gust, tyres just changed, they settle",
+    )
+    gate: float | None = _make(
+        None, "a sample less likely than 1 - gate is skipped; with wary 1 - 1e-9", "", _PROBABILITY
+    )
+    wary: int = _make(
+        0,
+        "gated samples that agree, after which the filter trusts their sensor; by clone or buffer; "
+        "repeated packets are skipped while the car moves, a first sample passes the gate; 0: off",
+        limits=_SAMPLES,
+    )
+    adapt: float = _make(0.0, "fraction of an innovation in R; 0: R as set", limits=_FRACTION)
+    latency: Mapping[str, float | str] = _make(
+        None, f"of late channels, {{'gyro': 0.06}}; {FIND!r}: joint finds one of them", "s"
+    )
+    prior: Mapping[str, float] = _make(None, "standard deviations at the start, by state")
+    allow_unstable: bool = _make(False, "build a filter whose error grows")
+
+
+OPTIONS = {option.name: option for option in fields(FilterOptions)}
+"""Options and families of them, in the order of the docs."""
+PARAMETERS = [
+    Parameter(name, Parameter.KEYWORD_ONLY, default=default)
+    for key, option in OPTIONS.items()
+    for name, default in option.metadata.get("family", {key: option.default}).items()
+]
+"""All options, for the signature of `make_estimator`."""
+
+
+_LINES = [
+    f"    - **{', '.join(option.metadata.get('family', [key]))}**{option.metadata['text']}"
+    for key, option in OPTIONS.items()
+]
+FilterOptions.__doc__ = "\n".join([f"{FilterOptions.__doc__}", *_LINES])
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterConfig(FilterOptions):
+    """Decisions about a filter before its design: its name in `FILTERS` and its parsed options.
+
+    `prior` has all states; `bias_sds`, `bias_times` and `noise` are by names without their ends.
     """
 
     name: str
     row: FilterDefinition
     sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
     models: tuple[FilterModel, ...]  # of each layer
-    gains: str  # "": the row's, where that can be
-    delay: str
-    assumed_delay: float
-    between: str
-    intersample: str
-    inverse: str
-    poles: tuple[float, ...]
-    leak: float
     Q: Array  # (n, n) per second, of the states of all layers
-    noise: Mapping[str, float]  # standard deviations, names without "_noise"; force, moment, time
+    levels: Array  # (count, 2), of force_sd and moment_sd
     noise_over_speed: Mapping[str, float]  # of those that grow as 1/V, times V in m/s
-    hdop_table: tuple[tuple[float, float], ...]
-    satellites: float
-    gate: float | None
-    wary: int
-    members: int
-    levels: Array  # (count, 2), of force_sd, moment_sd
-    sudden: bool
-    robust: float
-    steer_rate: float
-    model_error: float
-    accel_time: float
-    shares: tuple[float, float]  # `force_share`, `moment_share`
-    times: Mapping[str, float]  # s, of biases
-    adapt: float
-    prior: Mapping[str, float]  # of all states
-    latency: Mapping[str, float | str]  # s, or "find", by channel; none that is punctual
-    allow_unstable: bool
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states of all layers."""
         return tuple(self.prior)
+
+    @property
+    def linear_part(self) -> "FilterConfig":
+        """Of several sensors the first, since they have no cycle; nominal tyres and scale."""
+        config = self
+        if len(self.sensors) > 1:
+            config = replace(self, sensors=dict(list(self.sensors.items())[:1]))
+        linear = [i for i, name in enumerate(self.states) if name not in NONLINEAR]
+        if len(linear) == len(self.states):
+            return config
+        layers = tuple(
+            replace(model, biases=tuple(name for name in model.biases if name not in NONLINEAR))
+            for model in self.models
+        )
+        prior = {name: self.prior[name] for name in self.states if name not in NONLINEAR}
+        return replace(
+            config, models=layers, Q=self.Q[np.ix_(linear, linear)], prior=prior, members=1
+        )

@@ -15,11 +15,11 @@ from scipy.linalg import solve_discrete_lyapunov
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
-from ..core.covariance import update_with_row
+from ..core.covariance import project_row, update_scalar
 from ..core.filter import reset_filters, run_tick
 from ..core.innovation import CLONE, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
 from ..core.record import FilterRecord, FilterRecords, GainTables
-from .dual_rate import compute_shares, write_shares
+from .dual_rate import SampledSystem
 from .kalman import compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
 
@@ -74,8 +74,8 @@ class Schedule:
 
 NO_SENSOR = Schedule(1, ())
 
-
 _GAIN_TOLERANCE = 1e-12  # relative change of a settled gain in a cycle
+_CHECK_TOLERANCE = 1e-6  # the same, of a filter that is only checked: it has gains of its own
 _MAX_RECURSION = 600.0  # s of driving after which the recursion ends in any case
 _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
 
@@ -83,9 +83,9 @@ _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is
 @jit
 def _iterate_gains(
     filters: FilterRecords,
-    s: int,
     lags: Vector,
     cycles: int,
+    tolerance: float,
     table: Matrix,
     before: Vector,
     gains: GainTables,
@@ -93,11 +93,11 @@ def _iterate_gains(
     """Run a covariance filter over its schedule until its gains settle; return the cycles used.
 
     Outputs: `table` (rows, columns), and `before` (total, total), the covariance before the last
-    frame. lags (pattern,): steps from capture to arrival. s: the slow sensor, -1 for none.
+    frame. lags (pattern,): steps from capture to arrival.
     """
     f = filters[0]
     reset_filters(filters, 0)
-    n, N, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
+    n, N, cycle, width, s = f.n, f.total, f.cycle, maximum(f.fasts, 1), f.first_slow
     for cycle_index in range(cycles):
         change = 0.0
         for step in range(cycle):
@@ -115,7 +115,7 @@ def _iterate_gains(
                 for i in range(N):
                     _copy_gain(f.P[i], before[i], N)
                 for i in range(f.rows[s]):
-                    update_with_row(f, s, i, first, f.r[s, i], 0.0)
+                    update_scalar(f, project_row(f, s, i, first) + f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
                     change = maximum(change, _copy_gain(f.gain, to, N))
             k = N
@@ -123,7 +123,7 @@ def _iterate_gains(
                 for j in range(i, n):
                     table[1 + step * width, k] = f.P[i, j]
                     k += 1
-        if change < _GAIN_TOLERANCE:
+        if change < tolerance:
             return cycle_index + 1
     return cycles
 
@@ -196,7 +196,8 @@ def design_gains(
         lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
         cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
         before = np.zeros((int(f.total), int(f.total)))
-        _iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
+        tolerance = _GAIN_TOLERANCE if f.periodic else _CHECK_TOLERANCE
+        _iterate_gains(filters, lags, cycles, tolerance, table, before, np.zeros((1, 1, 1)))
         if f.between == PSEUDO:
             C = build_measurement_rows(f, 0)
             R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
@@ -237,11 +238,12 @@ def _write_shares(
     """Write the weights of an innovation of the dual-rate rules behind the gains."""
     n, s, total = int(f.n), int(f.first_slow), int(f.total)
     q = int(f.rows[s])
-    F, C, Q, R = transition_matrix(f, G), f.C[s, :q, :n], f.Q[:n, :n], np.diag(f.r[s, :q])
+    F, C, R = transition_matrix(f, G), f.C[s, :q, :n], np.diag(f.r[s, :q])
+    system = SampledSystem(F, f.Q[:n, :n], C, R, schedule.period)
     poles = np.exp(np.array(config.poles) * float(f.step)) if config.poles else None
-    B = compute_shares(config.intersample, config.gains, poles, F, Q, C, R, schedule.period)
+    B = system.compute_shares(config.intersample, config.gains, poles)
     first = 1 + schedule.cycle + q * len(schedule.lags)
-    write_shares(F, Q, C, R, B, table, first, total)
+    system.write_shares(B, table, first, total)
 
 
 def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:

@@ -54,7 +54,7 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(directions)
 
 
-@lru_cache(maxsize=64)  # the same filter drives in many envs
+@lru_cache(maxsize=512)  # the same filter drives in many envs
 def _design_cached(key: bytes) -> tuple[Array, Array]:
     memory, schedule, speed, config = pickle.loads(key)
     f = np.frombuffer(memory, FILTER).view(np.recarray)[0]

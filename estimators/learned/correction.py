@@ -59,16 +59,10 @@ EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 
 def _make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
     """Make the net for a filter's states by name, all of the card's among them."""
-    network = correction.network
-    layers = zip(network.weights, network.biases, strict=True)
+    net, read = correction.network.packed, [states.index(name) for name in correction.card.states]
+    beta = states.index("beta")
     return CorrectionNet(
-        np.array([states.index(name) for name in correction.card.states], np.int64),
-        states.index("beta"),
-        np.array(network.mean),
-        np.array(network.scale),
-        float(network.clip or 0.0),
-        np.array([network.inputs, *(len(b) for b in network.biases)], np.int64),
-        np.concatenate([part for W, b in layers for part in (W.T.ravel(), b)]),
+        np.array(read), beta, net.mean, net.scale, net.clip, net.sizes, net.numbers
     )
 
 

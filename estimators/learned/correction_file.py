@@ -9,15 +9,7 @@ from safetensors.numpy import save
 
 from ...envs.io import from_json, write_atomic
 from ..filters import FILTERS
-from .network import (
-    SUFFIX,
-    Network,
-    build_network,
-    collect_tensors,
-    describe_network,
-    parse_json_object,
-    read_tensors,
-)
+from .network import SUFFIX, Network, build_network, parse_json_object, read_tensors
 
 FORMAT = "1"
 """Counts up where what a network reads (`correction`) or its card changes."""
@@ -102,9 +94,9 @@ def save_correction(path: str | Path, correction: Correction) -> None:
     """
     if Path(path).suffix != SUFFIX:
         raise ValueError(f"a correction's file is NAME{SUFFIX}, got {path}")
-    content = asdict(correction.card) | {"network": describe_network(correction.network)}
+    content = asdict(correction.card) | {"network": correction.network.description}
     metadata = {"format": FORMAT, "correction": json.dumps(content, allow_nan=False)}
-    write_atomic(path, save(collect_tensors(correction.network), metadata))
+    write_atomic(path, save(correction.network.tensors, metadata))
 
 
 def load_correction(path: str | Path) -> Correction:

@@ -43,18 +43,16 @@ class RecurrentCell:
     def __post_init__(self) -> None:
         if self.kind not in GATES:
             raise ValueError(f"unknown cell {self.kind!r}; known: {', '.join(GATES)}")
-        for name in CELL_WEIGHTS:
-            single = np.array(getattr(self, name), np.float32)
-            object.__setattr__(self, name, single.astype(np.float64))
-        size, inputs = self.weight_state.shape[-1], self.weight_in.shape[-1]
+        _round_arrays(self)
+        rows, inputs = GATES[self.kind] * self.size, self.weight_in.shape[-1]
         shapes = {name: getattr(self, name).shape for name in CELL_WEIGHTS}
-        if shapes != compute_cell_shapes(self.kind, size, inputs):
+        if [*shapes.values()] != [(rows, inputs), (rows, self.size), (rows,), (rows,)]:
             raise ValueError(f"the arrays of a {self.kind} cell do not fit together: {shapes}")
 
     @property
     def size(self) -> int:
         """Number of outputs."""
-        return len(self.weight_state[0])
+        return int(self.weight_state.shape[-1])
 
     @property
     def memory(self) -> int:
@@ -90,9 +88,7 @@ class MovingAverages:
     times: Sequence[float]  # of the means (steps)
 
     def __post_init__(self) -> None:
-        for name in self.parts:
-            single = np.array(getattr(self, name), np.float32)
-            object.__setattr__(self, name, single.astype(np.float64))
+        _round_arrays(self)
         object.__setattr__(self, "times", tuple(self.times))
         if self.weight_in.ndim != 2 or self.bias_in.shape != self.weight_in.shape[:1]:
             pair = self.weight_in.shape, self.bias_in.shape
@@ -127,23 +123,15 @@ class MovingAverages:
         return np.concatenate([shares, self.weight_in.T.ravel(), self.bias_in])
 
 
+def _round_arrays(layer: RecurrentCell | MovingAverages) -> None:
+    """Round a layer's arrays to single precision."""
+    for name in layer.parts:
+        single = np.array(getattr(layer, name), np.float32)
+        object.__setattr__(layer, name, single.astype(np.float64))
+
+
 MemoryLayer = RecurrentCell | MovingAverages
 """What a network has between its observation and its dense layers."""
-
-
-def compute_cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[int, ...]]:
-    """Compute the shape of each of `CELL_WEIGHTS`.
-
-    Args:
-        kind: Name of `GATES`.
-        size: Number of outputs.
-        inputs: Number of inputs.
-
-    Returns:
-        Shape by name.
-    """
-    rows = GATES[kind] * size
-    return dict(zip(CELL_WEIGHTS, ((rows, inputs), (rows, size), (rows,), (rows,)), strict=True))
 
 
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")

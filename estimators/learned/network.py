@@ -25,9 +25,10 @@ from .forward import (
     MovingAverages,
     PackedNetwork,
     RecurrentCell,
-    compute_cell_shapes,
     forward,
 )
+
+Tensors = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,41 +65,36 @@ class Network:
             raise ValueError(f"clip is above zero or None, got {self.clip!r}")
         if self.history < 1:
             raise ValueError(f"history is at least 1 frame, got {self.history}")
-        self._check_shapes()
-        self._check_numbers()
+        self._check_layers()
 
-    def _check_shapes(self) -> None:
+    def _check_layers(self) -> None:
+        """Check the shapes of all arrays, then that they are finite."""
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(
                 f"a network has a bias a layer, got {len(self.weights)} weights "
                 f"and {len(self.biases)} biases"
             )
-        stacked = self._first.shape[-1]
-        if stacked % self.history:
-            raise ValueError(f"{stacked} inputs are not {self.history} frames of one width")
+        width = self._first.shape[-1]
+        if width % self.history:
+            raise ValueError(f"{width} inputs are not {self.history} frames of one width")
         shape = self.mean.shape
-        if shape not in ((self.inputs,), (stacked,)) or self.scale.shape != shape:
+        if shape not in ((self.inputs,), (width,)) or self.scale.shape != shape:
             raise ValueError(
                 f"mean and scale are (inputs,) or (history inputs,) with {self.inputs} inputs, "
                 f"got {shape} and {self.scale.shape}"
             )
-        width = stacked
+        arrays = {"mean": self.mean, "scale": self.scale}
         for i, cell in enumerate(self.cells):
             if cell.weight_in.shape[1] != width:
                 raise ValueError(f"cell {i} takes {cell.weight_in.shape[1]} inputs, not {width}")
             width = cell.size
+            arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in cell.parts}
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             if W.shape != (*b.shape, width) or b.ndim != 1:
                 raise ValueError(
                     f"layer {i} takes {width} inputs, got weights {W.shape} and biases {b.shape}"
                 )
             width = len(b)
-
-    def _check_numbers(self) -> None:
-        arrays = {"mean": self.mean, "scale": self.scale}
-        for i, cell in enumerate(self.cells):
-            arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in cell.parts}
-        for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"the weights of layer {i}": W, f"the biases of layer {i}": b}
         for name, values in arrays.items():
             if not np.isfinite(values).all():
@@ -157,7 +153,7 @@ class Network:
         )
 
     @cached_property
-    def _network_arrays(self) -> PackedNetwork:
+    def packed(self) -> PackedNetwork:
         """The network as compiled code takes it."""
         layers = zip(self.weights, self.biases, strict=True)
         numbers = [cell.numbers for cell in self.cells]
@@ -176,24 +172,37 @@ class Network:
         )
 
     @property
+    def description(self) -> dict[str, object]:
+        """Sizes and kinds by name for its card, JSON types only; `build_network` reads them."""
+        cells = [
+            [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
+            if isinstance(cell, MovingAverages)
+            else [cell.kind, cell.size]
+            for cell in self.cells
+        ]
+        plain = {name: getattr(self, name) for name in ("activation", "output", "clip")}
+        sizes = {"action_width": self.width, "history": self.history}
+        return {"hidden": list(self.hidden), **plain, **sizes, "cells": cells}
+
+    @property
+    def tensors(self) -> Tensors:
+        """Tensors by name for its file."""
+        tensors: Tensors = {"mean": self.mean, "scale": self.scale}
+        for i, cell in enumerate(self.cells):
+            for part in cell.parts:
+                tensors[f"cell_{i}_{part}"] = np.ascontiguousarray(getattr(cell, part), np.float32)
+        for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            tensors[f"weight_{i}"] = np.ascontiguousarray(W, np.float32)
+            tensors[f"bias_{i}"] = np.ascontiguousarray(b, np.float32)
+        return tensors
+
+    @property
     def dense(self) -> "Network":
         """Dense layers behind cells as a network of what these give; without cells itself."""
         if not self.cells:
             return self
         mean = np.zeros(self.weights[0].shape[1])
         return replace(self, mean=mean, scale=mean + 1.0, clip=None, history=1, cells=())
-
-    def replace_dense(self, dense: "Network") -> "Network":
-        """Replace the dense layers.
-
-        Args:
-            dense: Network of what they read, with the new layers, activation and output.
-
-        Returns:
-            The new network.
-        """
-        names = ("weights", "biases", "activation", "output")
-        return replace(self, **{name: getattr(dense, name) for name in names})
 
     def compute_features(self, x: Array, state: Array) -> Array:
         """Compute what the first dense layer reads.
@@ -205,9 +214,8 @@ class Network:
         Returns:
             Features, shape (N, k).
         """
-        arrays = self._network_arrays
-        out = np.empty((len(x), int(arrays.sizes[0])))
-        forward(arrays._replace(sizes=arrays.sizes[:1]), x, state, out)
+        out = np.empty((len(x), int(self.packed.sizes[0])))
+        forward(self.packed._replace(sizes=self.packed.sizes[:1]), x, state, out)
         return out
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
@@ -223,7 +231,7 @@ class Network:
         """
         state = np.zeros((len(x), self.memory)) if state is None else state
         out = np.empty((len(x), self.width))
-        forward(self._network_arrays, x, state, out)
+        forward(self.packed, x, state, out)
         return out
 
 
@@ -233,7 +241,6 @@ SUFFIX = ".safetensors"
 NO_MEMORY: dict[str, Any] = {"history": 1, "cells": []}
 """What the card says of a network without memory."""
 _DENSE = ("hidden", "activation", "output", "clip", "action_width")
-Tensors = dict[str, npt.NDArray[Any]]
 
 
 def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
@@ -281,31 +288,11 @@ def parse_json_object(text: str) -> dict[str, Any]:
     return fields
 
 
-def describe_network(network: Network) -> dict[str, object]:
-    """Describe a network for its card.
-
-    Args:
-        network: Network of the file.
-
-    Returns:
-        Sizes and kinds by name, JSON types only.
-    """
-    cells: list[list[object]] = [
-        [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
-        if isinstance(cell, MovingAverages)
-        else [cell.kind, cell.size]
-        for cell in network.cells
-    ]
-    plain = {name: getattr(network, name) for name in ("activation", "output", "clip")}
-    sizes = {"action_width": network.width, "history": network.history}
-    return {"hidden": list(network.hidden), **plain, **sizes, "cells": cells}
-
-
 def build_network(fields: object, inputs: int, tensors: Tensors) -> Network:
     """Build the network that a card describes.
 
     Args:
-        fields: Description in the card, as `describe_network` makes it.
+        fields: Description in the card, as of `Network.description`.
         inputs: Number of entries of an observation.
         tensors: Tensors by name, of the shapes that the card has.
 
@@ -368,11 +355,10 @@ def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int
     width = inputs * history
     shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (width,)))
     for i, (kind, size, *traces) in enumerate(cells):
-        if traces:
-            part_shapes = dict(zip(MovingAverages.parts, ((size, width), (size,)), strict=True))
-        else:
-            part_shapes = compute_cell_shapes(kind, size, width)
-        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in part_shapes.items()}
+        rows = size if traces else GATES[kind] * size
+        parts = {"weight_in": (rows, width), "bias_in": (rows,)}
+        parts |= {} if traces else {"weight_state": (rows, size), "bias_state": (rows,)}
+        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in parts.items()}
         width = size * (1 + len(traces[1])) if traces else size
     for i, size in enumerate(sizes):
         shapes |= {f"weight_{i}": ((size, width),), f"bias_{i}": ((size,),)}
@@ -393,22 +379,3 @@ def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
                 f"tensor {name} has shape {tensor.shape} of {tensor.dtype}, "
                 f"the card has {' or '.join(map(str, dict.fromkeys(allowed)))} of {kind}"
             )
-
-
-def collect_tensors(network: Network) -> Tensors:
-    """Collect the tensors of a network for its file.
-
-    Args:
-        network: Network of the file.
-
-    Returns:
-        Tensors by name.
-    """
-    tensors: Tensors = {"mean": network.mean, "scale": network.scale}
-    for i, cell in enumerate(network.cells):
-        for part in cell.parts:
-            tensors[f"cell_{i}_{part}"] = np.ascontiguousarray(getattr(cell, part), np.float32)
-    for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        tensors[f"weight_{i}"] = np.ascontiguousarray(W, np.float32)
-        tensors[f"bias_{i}"] = np.ascontiguousarray(b, np.float32)
-    return tensors

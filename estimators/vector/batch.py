@@ -15,12 +15,12 @@ from ..core.record import FILTER, SkipCounters
 from ..estimator import Estimator
 from ..protocol import Estimates
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
-from ..wrappers.outputs import write_outputs
+from ..wrappers.outputs import Observed, StepRecord, write_outputs
 from .lane_ticks import FilterBank
 from .lanes import compile_observe_batch, make_blocks, make_empty_outputs
 from .records import IntArray
 
-Build = Callable[[EstimatorSpec], AnyEstimator]
+Build = Callable[..., AnyEstimator]
 Sensors = Mapping[str, SlowSensor]
 
 
@@ -40,7 +40,7 @@ class _GainPool:
         """Return the estimator for a spec, built unless it is at hand."""
         design = spec.design
         if design not in self._estimators:
-            estimator = self._build(spec)
+            estimator = self._build(**spec._asdict())
             if not isinstance(estimator, Estimator):
                 raise TypeError(
                     f"a batch is of filters of ours or of none, got {estimator!r} as well"
@@ -185,14 +185,14 @@ class BatchEstimator:
         _check_shape("packets", packets, N, PACKET_WIDTH)
         rows = _parse_counts("rows", rows, N, fast.shape[1])
         counts = _parse_counts("counts", counts, N, packets.shape[1])
-        self.take(None, fast, rows, packets, counts, *self._empty_outputs)
+        self.take(None, StepRecord(fast, rows, packets, counts), self._empty_outputs)
 
     @property
     def _bank(self) -> FilterBank:
         return FilterBank(self.filters, self._designs.pool, self._places)
 
     @functools.cached_property
-    def _empty_outputs(self) -> tuple[Any, ...]:
+    def _empty_outputs(self) -> Observed:
         return make_empty_outputs(len(self))
 
     def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
@@ -212,28 +212,19 @@ class BatchEstimator:
         return [self[i].run(source) for i, source in enumerate(sources)]
 
     def take(
-        self,
-        mask: npt.NDArray[np.bool_] | None,
-        fast: Array,
-        rows: IntArray,
-        packets: Array,
-        counts: IntArray,
-        *observed: Any,
+        self, mask: npt.NDArray[np.bool_] | None, record: StepRecord, observed: Observed
     ) -> None:
-        """Process rows and packets as `step` does, without any checks of C-contiguous arrays.
+        """Process rows and packets of some filters and write their outputs.
 
         Args:
             mask: Filters at work, bool, shape (N,); None for all.
-            fast: Fast rows, shape (N, k, FAST_WIDTH).
-            rows: Number of fast rows of each filter, shape (N,).
-            packets: Packets, shape (N, capacity, PACKET_WIDTH).
-            counts: Number of packets of each filter, shape (N,).
-            *observed: Arguments of `wrappers.kernel.observe` from `obs` on, of N filters.
+            record: Records of N cars.
+            observed: Observations and outputs of N cars.
         """
-        done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
-        arguments = done, self._lanes, (fast, rows, packets, counts), observed
+        done = np.full(len(self), -1) if mask is None else np.where(mask, -1, record.rows)
+        arguments = done, self._lanes, record, observed
         while compile_observe_batch()(self._bank, *arguments) > 0:
-            missing = np.flatnonzero(done < rows)  # without gains; each design is made once
+            missing = np.flatnonzero(done < record.rows)  # without gains; each design is made once
             keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
             for i in dict(zip(keys, missing.tolist(), strict=True)).values():
                 self[i].design_missing()
@@ -309,7 +300,10 @@ class ForeignBatch(BatchEstimator):
     ) -> None:
         self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
         self._build = build
-        self._estimators: list[AnyEstimator] = [first, *(build(spec) for spec in specs[1:])]
+        self._estimators: list[AnyEstimator] = [
+            first,
+            *(build(**spec._asdict()) for spec in specs[1:]),
+        ]
         self._design_keys = [spec.design for spec in specs]
         self.configure(range(len(specs)), specs)
 
@@ -328,23 +322,35 @@ class ForeignBatch(BatchEstimator):
         """
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._design_keys[i]:
-                self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
+                self._estimators[i], self._design_keys[i] = (
+                    self._build(**spec._asdict()),
+                    spec.design,
+                )
             self._check_states(i, self[i].names)
             self[i].sensors = dict(spec.sensors)
 
-    def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
+    def take(
+        self, mask: npt.NDArray[np.bool_] | None, record: StepRecord, observed: Observed
+    ) -> None:
         """Process rows and packets as `BatchEstimator.take` does.
 
         Args:
             mask: Estimators at work, bool, shape (N,); None for all.
-            *arguments: Its other arguments.
+            record: Records of N cars.
+            observed: Observations and outputs of N cars.
         """
-        fast, rows, packets, counts, obs, inner, plan, limits, *row_arrays = arguments
-        chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
-        for i in chosen.tolist():
-            estimator, (beta, gamma, out, summary) = self[i], (array[i] for array in row_arrays)
-            estimator.step(fast[i, : rows[i]], packets[i, : counts[i]])
-            write_outputs(estimator, obs[i], inner, plan, limits, beta, gamma, out, summary)
+        chosen = (np.arange(len(self)) if mask is None else np.flatnonzero(mask)).tolist()
+        obs, table, beta, gamma, out, summary = observed
+        for i in self._step_rows(chosen, record):
+            row = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
+            write_outputs(self[i], row)
+
+    def _step_rows(self, rows: Sequence[int], record: StepRecord) -> Iterator[int]:
+        """Step the estimators of some rows, and yield each row when it is done."""
+        for i in rows:
+            fast, n_rows, packets, count = (array[i] for array in record)
+            self[i].step(fast[:n_rows], packets[:count])
+            yield i
 
     def get_state(self) -> Any:
         """Return deep copies of the users' objects."""

@@ -1,47 +1,22 @@
 """EstimateObservation for vector environments: all rows' estimators in one compiled call."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.error import ResetNeeded
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
-from gymnasium.vector.utils import batch_space
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
-from ...envs.task import ObservationEntry, make_space
+from ...envs.task import ObservationEntry
 from ...envs.vehicle.parameters import VehicleSource
-from ..wrappers.estimate import (
-    Arguments,
-    EstimatorSource,
-    EstimatorSpec,
-    find_base_env,
-    make_spec,
-)
+from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, STD, make_outputs
+from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
 from ..wrappers.truth import choose_vehicle, set_stiffness
 from .make import build_batch
-from .records import BatchedEnv, IntArray, get_env_state, get_true_vehicles, make_vector_spec
+from .records import BatchedEnv, Mask, Observations, VectorObservation
 
-_Observations = npt.NDArray[np.float32]
-_Mask = npt.NDArray[np.bool_]
-_Step = tuple[_Observations, Any, Any, Any, dict[str, Any]]
-
-
-class _RecordBatch(NamedTuple):
-    """The records of N cars' newest step."""
-
-    fast: Array  # (N, k, FAST_WIDTH)
-    rows: IntArray  # (N,), how many of them are there
-    packets: Array  # (N, capacity, PACKET_WIDTH)
-    counts: IntArray  # (N,)
-
-
-_MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `_RecordBatch` in the env
+_MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
 
 
 class _BatchedRecords:
@@ -52,19 +27,19 @@ class _BatchedRecords:
         self.layout: tuple[ObservationEntry, ...] = env.layout
         self.dt: float = env.dt
 
-    def read(self, prefix: str, rows: Iterable[int]) -> _RecordBatch:
+    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
         """Return the newest step's records, or with "final_" those of episodes that just ended."""
         arrays = (getattr(self._env, prefix + name) for name in _MEMBERS)
         types = (np.float64, np.int64) * 2
         records: Any = map(np.ascontiguousarray, arrays, types)  # copied where they are not
-        return _RecordBatch(*records)
+        return StepRecord(*records)
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         env = self._env
         return [EstimatorSpec(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
-    def annotate(self, label: str, beta: Array, std: Array, rows: _Mask) -> None:
+    def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
         """Pass estimates (rad) of some rows to an env that draws, beside the truth."""
         if hasattr(self._env, "annotate"):
             self._env.annotate(label, beta, std, rows)
@@ -84,52 +59,49 @@ class _SyncRecords:
         N = len(bases)
         fast = np.zeros((N, max(len(base.rows) for base in bases), FAST_WIDTH))
         packets = np.zeros((N, max(len(base.packets) for base in bases), PACKET_WIDTH))
-        self._records = _RecordBatch(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
+        self._records = StepRecord(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
 
-    def read(self, prefix: str, rows: Iterable[int]) -> _RecordBatch:
+    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
         """Copy the records of some environments, those before a reset with "final_"."""
         records = self._records
         for i in rows:
             ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in _MEMBERS)
             records.fast[i, :n], records.packets[i, :m] = ticks[:n], arrived[:m]
-            records.rows[i], records.counts[i] = n, m
+            records.rows[i], records.count[i] = n, m
         return records
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         return [make_spec(self._bases[i]) for i in rows]
 
-    def annotate(self, label: str, beta: Array, std: Array, rows: _Mask) -> None:
+    def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
         """Pass estimates (rad) of some rows to the envs that draw."""
         for i in np.flatnonzero(rows):
             self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
 
-class EstimateObservation(
-    VectorWrapper[_Observations, Any, _Observations, Any, Any], RecordConstructorArgs
-):
+class EstimateObservation(VectorObservation):
     """Runs an estimator on each car's record and appends its states to the observations.
 
-    `sideslip.estimators.EstimateObservation` of all rows, with the same arguments: every row gets
-    the bits that the single wrapper would give it. It must be the innermost wrapper; others of its
-    class may be stacked, each with its own `name`. It works on `SyncVectorEnv` and on a vector env
-    that offers what `records.BatchedEnv` lists.
+    `sideslip.estimators.EstimateObservation` of all rows: every row gets the bits that the single
+    wrapper would give it. It must be the innermost wrapper; others of its class may be stacked,
+    each with its own `name`. It works on `SyncVectorEnv` and on a vector env that offers what
+    `records.BatchedEnv` lists.
 
-    A row whose episode ended starts a new one with a fresh filter: in the next step, or within
-    the step that ended it, where the old filter first takes the last record into `final_obs`. As
-    the environments do, `infos` has arrays (N,) of `beta_hat`, `beta_std` and `nees` with masks.
+    A row whose episode ended starts a new one with a fresh filter; where that is within the step
+    that ended it, the old filter first takes the last record into `final_obs`. As the environments
+    do, `infos` has arrays (N,) of `beta_hat`, `beta_std` and `nees` with masks.
 
-    `layout` describes a row; `estimator` is the `BatchEstimator` at work. `spec` names the single
-    wrapper: `gym.make_vec(spec)` builds environments that are wrapped one by one.
+    `layout` describes a row; `estimator` is the `BatchEstimator` at work.
 
     Args:
         env: Vector environment of N rows.
-        estimator: Name, entry point or factory. A factory is called once for each row, and again
-            where a row's car changes. None for `choose_estimator` of the env's sensors.
+        estimator: As of the single wrapper, but for an object. A factory is called once for each
+            row, and again where a row's car changes.
         outputs: States to append, each as `<state>_hat`.
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
-        vehicle: Vehicle as estimators believe it to be; None: each row's nominal, "truth": its own.
+        vehicle: Vehicle as the estimator believes it to be; "truth" is each row's own.
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
@@ -147,127 +119,40 @@ class EstimateObservation(
         std: bool = True,
         replace: bool = False,
         vehicle: VehicleSource | None = None,
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
         name: str | None = None,
-        **misplaced: Any,
+        **misplaced: object,
     ) -> None:
         self._records = _find_records(env)
         clocks = self._records.make_specs([0])[0].sensors
-        self._arguments = arguments = Arguments(
-            estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
-        )
-        if arguments.object is not None:
+        values = estimator, outputs, std, replace, vehicle, options, name
+        self._arguments = Arguments.read(clocks, *values, **misplaced)
+        if self._arguments.is_object:
             raise TypeError(
-                f"one {arguments.label} cannot estimate {env.num_envs} rows: pass its class, "
+                f"one {self._arguments.label} cannot estimate {env.num_envs} rows: pass its class, "
                 "another factory or a name"
             )
-        RecordConstructorArgs.__init__(self, **arguments.recorded)
-        VectorWrapper.__init__(self, env)
+        super().__init__(env, Single, self._arguments.recorded)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
-        self._same_step = mode == AutoresetMode.SAME_STEP
         specs = self._make_specs(range(env.num_envs))
-        self._first_vehicle = specs[0].vehicle
-        dt = self._records.dt
-        self.estimator = build_batch(arguments.source, specs, dt, arguments.options)
-        inner = () if replace else getattr(env, "layout", self._records.layout)
-        states, label = self.estimator.names, arguments.label
-        self._outputs = make_outputs(label, states, outputs, std, name, inner)
-        self._title = label if name is None else f"{label} ({name})"
-        self.layout: tuple[ObservationEntry, ...] = self._outputs.layout
-        self.single_observation_space = make_space(self.layout)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._first_vehicle, source = specs[0].vehicle, self._arguments.estimator
+        self.estimator = build_batch(source, specs, self._records.dt, self._arguments.options)
+        inner = getattr(env, "layout", self._records.layout)
+        self._outputs = self._arguments.make_outputs(self.estimator.names, inner)
+        self._set_layout(self._outputs.layout)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
-        # rows that the next step resets; None: all are to be reset
-        self._ended: _Mask | None = None
 
-    @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
-        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
-        return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
-
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[_Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0.
-
-        Args:
-            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
-            options: Options of the env.
-
-        Returns:
-            Observations and infos.
-
-        Raises:
-            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
-        """
-        mask = None if options is None else options.get("reset_mask")
-        rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
-        ended_before, self._ended = self._ended, None
-        if ended_before is None and not rows.all():
-            raise ResetNeeded(
-                "reset all rows first: no step succeeded since then, or none was made"
-            )
-        try:
-            obs, infos = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError):
-            self._restore_ended(ended_before)
-            raise
-        self._ended = (
-            np.zeros(self.num_envs, np.bool_) if ended_before is None else ended_before & ~rows
-        )
-        self._reset_rows(rows)
-        records = self._records.read("", range(self.num_envs))
-        self._observe(records, obs, infos, rows, self._out)
-        return self._out.copy(), infos
-
-    def step(self, actions: Any) -> _Step:
-        """Step all rows; the estimators take their records before observations are made.
-
-        Args:
-            actions: Actions of all rows.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos.
-
-        Raises:
-            ResetNeeded: It is called before `reset`, or after a step that failed.
-        """
-        ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
-        if ended_before is None:
-            raise ResetNeeded(
-                "call reset() first: before the first step, and after one that failed"
-            )
-        try:
-            obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        except ValueError:
-            self._restore_ended(ended_before)
-            raise
-        ended = np.logical_or(terminated, truncated)
-        if not self._same_step:
-            self._reset_rows(ended_before)
-        elif ended.any():
-            self._finish(infos, ended)
-            self._reset_rows(ended)
-        records, all_rows = self._records.read("", range(self.num_envs)), np.ones_like(ended)
-        self._observe(records, obs, infos, all_rows, self._out)
-        self._ended = ended
-        return self._out.copy(), rewards, terminated, truncated, infos
-
-    def _restore_ended(self, ended_before: _Mask | None) -> None:
-        """Restore the flags after an error: a `BatchedEnv` raises it before it moves any row."""
-        if isinstance(self._records, _BatchedRecords):
+    def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
+        # a `BatchedEnv` raises these before it moves any row
+        if isinstance(self._records, _BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
     def get_state(self) -> dict[str, Any]:
         """Return a snapshot of env and estimators; TypeError where the vector env makes none."""
-        return {
-            "env": get_env_state(self.env),
-            "estimator": self.estimator.get_state(),
-            "out": self._out.copy(),
-            "ended": None if self._ended is None else self._ended.copy(),
-        }
+        memory = {"estimator": self.estimator.get_state(), "out": self._out.copy()}
+        return super().get_state() | memory
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -275,18 +160,16 @@ class EstimateObservation(
         Args:
             snapshot: Result of `get_state`.
         """
-        env: Any = self.env
-        env.set_state(snapshot["env"])
+        super().set_state(snapshot)
         self._update_cars(range(self.num_envs))
         self.estimator.set_state(snapshot["estimator"])
-        self._out[:], ended = snapshot["out"], snapshot["ended"]
-        self._ended = None if ended is None else ended.copy()
+        self._out[:] = snapshot["out"]
 
     def _make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         specs = self._records.make_specs(rows)
-        if self._arguments.truth:
-            cars = get_true_vehicles(self.unwrapped, rows)
+        if self._arguments.is_told_truth:
+            cars = self._get_true_vehicles(rows)
             return [spec._replace(vehicle=car) for spec, car in zip(specs, cars, strict=True)]
         if self._arguments.vehicle is None:
             return specs
@@ -295,7 +178,7 @@ class EstimateObservation(
     def _update_cars(self, rows: Sequence[int]) -> None:
         """Fit the estimators of some rows to the cars of their present episodes."""
         specs = self._make_specs(rows)
-        if not self._arguments.truth:
+        if not self._arguments.is_told_truth:
             self.estimator.configure(rows, specs)
             return
         first = self.estimator[0]
@@ -305,16 +188,18 @@ class EstimateObservation(
         for i, spec in zip(rows, specs, strict=True):
             set_stiffness(self.estimator[i], spec.vehicle)
 
-    def _reset_rows(self, mask: _Mask) -> None:
-        """Reset the estimators of some rows with the clocks of their new episodes."""
+    def _begin(self, mask: Mask) -> None:
         rows = np.flatnonzero(mask).tolist()
         if rows:
             self._update_cars(rows)
             self.estimator.reset(mask)
 
-    def _finish(self, infos: dict[str, Any], ended: _Mask) -> None:
-        """Process the last record of rows that ended into their `final_obs` and `final_info`."""
-        inner, out = self._outputs.inner, np.zeros_like(self._out)
+    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+        self._observe(self._records.read("", range(self.num_envs)), obs, infos, mask, self._out)
+        return self._out.copy()
+
+    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+        inner, out = self._outputs.table.inner, np.zeros_like(self._out)
         obs = np.zeros((self.num_envs, inner), np.float32)
         if inner > 0:
             obs[ended] = np.stack(infos["final_obs"][ended])
@@ -325,22 +210,17 @@ class EstimateObservation(
             infos["final_obs"][i] = out[i].copy()
 
     def _observe(
-        self,
-        records: _RecordBatch,
-        obs: _Observations,
-        infos: dict[str, Any],
-        mask: _Mask,
-        out: _Observations,
-    ) -> None:
+        self, records: StepRecord, obs: Observations, infos: dict[str, Any], mask: Mask,
+        out: Observations,
+    ) -> None:  # fmt: skip
         """Process the records of some rows; write their observations and their part of `infos`."""
-        outputs, N = self._outputs, self.num_envs
-        beta, gamma = infos.get("beta"), infos.get("gamma")
+        N, beta, gamma = self.num_envs, infos.get("beta"), infos.get("gamma")
         has_truth = beta is not None and gamma is not None
-        truth = (beta, gamma) if has_truth else (np.zeros(N), np.zeros(N))
+        truth: Any = (beta, gamma) if has_truth else (np.zeros(N), np.zeros(N))
         summary, inner = np.zeros((N, 3)), np.ascontiguousarray(obs, np.float32)
-        observe_args = inner, outputs.inner, outputs.plan, outputs.limits, *truth, out, summary
-        self.estimator.take(mask, *records, *observe_args)
-        for key, index in outputs.keys:
+        observed = Observed(inner, self._outputs.table, truth[0], truth[1], out, summary)
+        self.estimator.take(mask, records, observed)
+        for key, index in self._outputs.keys:
             if index == NEES and not has_truth:
                 continue
             values, present = summary[:, index].copy(), mask.copy()
@@ -349,7 +229,7 @@ class EstimateObservation(
                 values[~present] = 0.0
             infos[key], infos[f"_{key}"] = values, present
             if index == BETA:
-                self._records.annotate(self._title, values, summary[:, STD], mask)
+                self._records.annotate(self._outputs.title, values, summary[:, STD], mask)
 
 
 def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:

@@ -17,17 +17,16 @@ from ...envs.record import FAST, FAST_WIDTH, PACKET, Array
 from ..core.covariance import correct_scalar, project
 from ..core.filter import run_tick
 from ..core.innovation import store_due_captures
-from ..core.model import (
-    CURVATURE,
-    LATERAL,
-    compute_road_turn,
-    find_next_cell,
-    is_finite,
-    is_speed_changed,
-    smooth_speed,
-)
+from ..core.model import CURVATURE, LATERAL, is_finite
 from ..core.packets import process_packet
-from ..core.predict import compute_residual, compute_signal, propagate, read_fast_row
+from ..core.predict import (
+    compute_residual,
+    compute_signal,
+    find_next_cell,
+    is_speed_changed,
+    propagate,
+    read_fast_row,
+)
 from ..core.record import N_SLOW, WINDOW, X_OFFSET, FilterRecord, FilterRecords, GainTables
 
 LaneBlock = Any
@@ -205,7 +204,7 @@ def _read_signals(b: LaneBlock) -> Any:
         wheel_speed = 0.5 * (
             load_element(b.row, FAST.wheel_left) + load_element(b.row, FAST.wheel_right)
         )
-        speed = smooth_speed(speed, wheel_speed, load_element(b.smoothing))
+        speed = speed + load_element(b.smoothing) * (wheel_speed - speed)
         is_outlier = (
             is_outlier
             | (is_finite(wheel_speed) ^ True)
@@ -272,9 +271,7 @@ def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> No
     for k in range(b.inputs):
         store_element(b.u, load_element(b.u_new, k), k)
     if b.kind == LATERAL and b.inputs > CURVATURE:
-        turn = compute_road_turn(
-            load_element(b.model_speed), load_element(b.u, CURVATURE), load_element(b.step)
-        )
+        turn = load_element(b.model_speed) * load_element(b.u, CURVATURE) * load_element(b.step)
         store_element(b.road_turn, load_element(b.road_turn) + turn)
     propagate(b, b.u)
     for lane in range(count_lanes()):

@@ -33,7 +33,7 @@ from ..core.record import (
 )
 from ..core.update import NONE
 from ..estimator import compile_call
-from ..wrappers.kernel import observe
+from ..wrappers.outputs import Observed, OutputTable, StepRecord, observe
 from .lane_ticks import FilterBank, LaneBlock, advance_block, get_gains
 
 _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
@@ -187,14 +187,13 @@ def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows:
 
 @jit_nrt
 def _observe_batch(
-    bank: FilterBank, done: Vector, lanes: Vector, record: Any, observed: Any
+    bank: FilterBank, done: Vector, lanes: Vector, record: StepRecord, observed: Observed
 ) -> int:
     """Call `observe` for every filter that has rows to do; return how many still have."""
-    # record, observed: arguments of `observe` with N filters as first axis, but for inner, plan and
-    # limits; done: rows done, -1 where a filter has not started, updated; filters of one shape go
-    # in lanes
+    # record, observed: of N cars; done: rows done, -1 where a filter has not started, updated;
+    # filters of one shape go in lanes
     fast, rows, packets, counts = record
-    obs, inner, plan, limits, beta, gamma, out, summary = observed
+    obs, table, beta, gamma, out, summary = observed
     filters, n_waiting = bank.filters, 0
     for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
         b = lanes[first // LANES]
@@ -206,34 +205,33 @@ def _observe_batch(
             if done[i] < rows[i]:
                 f, gains = filters[i], get_gains(bank, i)
                 start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
-                outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+                outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
                 if n_done == 0 and i + 1 < len(filters):
                     for layer in range(len(f)):
                         _fetch(filters[i + 1, layer], f[layer])
-                done[i] = observe(
-                    f, gains, fast[i], rows[i], packets[i], counts[i], start, *outputs
-                )
+                row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
+                done[i] = observe(f, gains, row_record, start, outputs)
                 n_waiting += 1 if done[i] < rows[i] else 0
     return n_waiting
 
 
-def make_empty_outputs(count: int) -> tuple[Any, ...]:
-    """Make the arguments of `observe` from `obs` on, for N filters whose outputs are not read.
+def make_empty_outputs(count: int) -> Observed:
+    """Make the last argument of `observe` for N filters whose outputs are not read.
 
     Args:
         count: Number of filters N.
 
     Returns:
-        The arguments in their order.
+        Outputs without entries.
     """
-    empty, plan = np.zeros((count, 0), np.float32), np.zeros((0, 3), np.int64)
-    truth = np.zeros(count)
-    return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
+    empty, truth = np.zeros((count, 0), np.float32), np.zeros(count)
+    table = OutputTable(0, np.zeros((0, 3), np.int64), np.zeros(0))
+    return Observed(empty, table, truth, truth, empty, np.zeros((count, 3)))
 
 
 _INTEGERS, _CUBE = np.zeros(1, np.int64), np.zeros((1, 1, 1))
 EXAMPLE_BANK = FilterBank(np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64))
-EXAMPLE_RECORD = _CUBE, _INTEGERS, _CUBE, _INTEGERS
+EXAMPLE_RECORD = StepRecord(_CUBE, _INTEGERS, _CUBE, _INTEGERS)
 """For `compile_call`: all banks and records have these types."""
 
 

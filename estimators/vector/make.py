@@ -15,9 +15,10 @@ from ...envs.vehicle.parameters import COMS, Vehicle, VehicleSource, make_vehicl
 from ..estimator import compile_call
 from ..filters import FILTERS
 from ..learned.correction import EXAMPLE, MASS, LearnedEstimator
+from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
-from ..wrappers.estimate import EstimatorSpec, build_estimator
-from ..wrappers.kernel import observe_corrected
+from ..wrappers.estimate import EstimatorSpec
+from ..wrappers.outputs import Observed, StepRecord, observe_corrected
 from .batch import BatchEstimator, Build, ForeignBatch, Sensors
 from .lane_ticks import FilterBank, get_gains
 from .lanes import EXAMPLE_BANK, EXAMPLE_RECORD, make_empty_outputs
@@ -25,23 +26,23 @@ from .lanes import EXAMPLE_BANK, EXAMPLE_RECORD, make_empty_outputs
 
 @jit_nrt
 def _correct_batch(
-    bank: FilterBank, chosen: Vector, record: Any, observed: Any, corrections: Any
+    bank: FilterBank, chosen: Vector, record: StepRecord, observed: Observed, corrections: Any
 ) -> None:
     """Call `observe_corrected` for the filters of the indices `chosen`."""
     fast, rows, packets, counts = record
-    obs, inner, plan, limits, beta, gamma, out, summary = observed
+    obs, table, beta, gamma, out, summary = observed
     memory, net = corrections
     for k in range(len(chosen)):
         i = chosen[k]
-        row_record = fast[i], rows[i], packets[i], counts[i]
-        outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+        row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
+        outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
         layers = bank.filters[i], get_gains(bank, i)
         observe_corrected(*layers, row_record, memory[i], net, outputs)
 
 
-def _build_base(build: Build, spec: EstimatorSpec) -> Any:
+def _build_base(build: Build, **spec: Any) -> Any:
     """Build the filter inside of a learned estimator, by a name that pickle finds."""
-    return build(spec).inner.base  # type: ignore[union-attr]
+    return build(**spec).inner.base  # type: ignore[union-attr]
 
 
 class _LearnedBatch(BatchEstimator):
@@ -65,11 +66,11 @@ class _LearnedBatch(BatchEstimator):
         super().configure(rows, specs)
         self.memory[rows, MASS] = [spec.vehicle.mass for spec in specs]
 
-    def take(self, mask: Any, *arguments: Any) -> None:
+    def take(self, mask: Any, record: StepRecord, observed: Observed) -> None:
         """Process rows and packets as `BatchEstimator.take` does."""
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         correction = self.memory, self.first.net
-        _compile_correct_batch()(self._bank, chosen, arguments[:4], arguments[4:], correction)
+        _compile_correct_batch()(self._bank, chosen, record, observed, correction)
 
     def get_state(self) -> Any:
         """Return copies of the filters and of their corrections."""
@@ -108,9 +109,9 @@ def build_batch(
     Returns:
         The batch.
     """
-    build_one = functools.partial(build_estimator, source, dict(options), dt)
+    build_one = functools.partial(make_estimator, source, dt=dt, **options)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
-        first = build_one(specs[0])
+        first = build_one(**specs[0]._asdict())
         if isinstance(first, ForeignEstimator):
             is_learned = isinstance(first.inner, LearnedEstimator)
             kind = _LearnedBatch if is_learned else getattr(first.inner, "batch", ForeignBatch)

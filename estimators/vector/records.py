@@ -1,4 +1,4 @@
-"""Vector envs as the wrappers use them: attributes, cars, snapshot and spec."""
+"""Vector envs as the wrappers use them, and the base of the wrappers."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -8,14 +8,19 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
-from ...envs.task import ObservationEntry
+from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import Vehicle
 
 IntArray = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+Observations = npt.NDArray[np.float32]
 
 
 class BatchedEnv(Protocol):
@@ -40,74 +45,165 @@ class BatchedEnv(Protocol):
     dt: float  # tick (s)
 
 
-def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
-    """Return the true vehicles of some cars in this episode.
+class VectorObservation(
+    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
+):
+    """A wrapper that appends entries of its own to the observations of all rows.
+
+    A row whose episode ended begins anew in the next step or, where the env resets it within the
+    step that ends it, in that one. `spec` names the single wrapper: `gym.make_vec(spec)` builds
+    environments that are wrapped one by one.
 
     Args:
-        base: Vector environment without wrappers.
-        rows: Indices of the cars.
-
-    Returns:
-        Vehicle of each of these cars.
-
-    Raises:
-        TypeError: The vehicles are out of reach.
-    """
-    if isinstance(base, SyncVectorEnv):
-        return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
-    if not hasattr(base, "vehicle"):
-        raise TypeError(f"{type(base).__name__} does not offer which vehicles its rows drive")
-    return [base.vehicle[i] for i in rows]
-
-
-def get_env_state(env: Any) -> Any:
-    """Return the snapshot of a vector env.
-
-    Args:
-        env: Vector environment, wrapped or not.
-
-    Returns:
-        The snapshot.
-
-    Raises:
-        TypeError: The vector env makes none.
-    """
-    if not hasattr(env, "get_state"):
-        raise TypeError(
-            f"{type(env).__name__} makes no snapshots; the vector env that gym.make_vec builds "
-            "without a vectorization_mode does"
-        )
-    return env.get_state()
-
-
-def make_vector_spec(
-    spec: EnvSpec | None, single: type[gym.Wrapper[Any, Any, Any, Any]], kwargs: Mapping[str, Any]
-) -> EnvSpec | None:
-    """Make the spec of a vector env whose cars have the wrapper `single(**kwargs)`.
-
-    `gym.make_vec` puts no wrappers around an env that is a vector by itself. With this spec it
-    makes single environments and wraps each of them.
-
-    Args:
-        spec: Spec of the vector env, or None.
+        env: Vector environment of N rows.
         single: Class of the single wrapper.
-        kwargs: Keyword arguments of the wrapper.
-
-    Returns:
-        A JSON-able spec; None without one.
+        recorded: Its arguments, for the spec.
     """
-    if spec is None:
-        return None
-    spec = copy.deepcopy(spec)
-    entry = f"{single.__module__}:{single.__name__}"
-    wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
-    spec.additional_wrappers += (wrapper,)
-    if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
-        spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
-        spec.kwargs.pop("info", None)
-        if "autoreset_mode" in spec.kwargs:
-            spec.kwargs["vector_kwargs"] = {"autoreset_mode": spec.kwargs.pop("autoreset_mode")}
-    vector_kwargs = spec.kwargs.get("vector_kwargs", {})
-    if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
-        vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
-    return spec
+
+    layout: tuple[ObservationEntry, ...]
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], single: type[gym.Wrapper], recorded: Mapping[str, Any]
+    ) -> None:
+        RecordConstructorArgs.__init__(self, **recorded)
+        VectorWrapper.__init__(self, env)
+        self._single = single
+        self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
+        # rows that the next step resets; None: all are to be reset
+        self._ended: Mask | None = None
+
+    def _set_layout(self, layout: tuple[ObservationEntry, ...]) -> None:
+        """Set the entries of a row's observation."""
+        self.layout, self.single_observation_space = layout, make_space(layout)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def _begin(self, mask: Mask) -> None:
+        """Begin the new episodes of some rows."""
+        raise NotImplementedError
+
+    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+        """Make the observations of all rows, of which some got a new one, and their `infos`."""
+        raise NotImplementedError
+
+    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+        """Make `final_obs` and `final_info` of rows that ended within the step."""
+        raise NotImplementedError
+
+    def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
+        """Restore the flags after an error of the env, unless it may have moved some rows."""
+        self._ended = ended_before
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
+        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
+        if self.env.spec is None:
+            return None
+        # `gym.make_vec` puts no wrappers around an env that is a vector by itself: it is told to
+        # make single environments
+        spec, single = copy.deepcopy(self.env.spec), self._single
+        entry = f"{single.__module__}:{single.__name__}"
+        wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(self._saved_kwargs)))
+        spec.additional_wrappers += (wrapper,)
+        if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
+            spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
+            spec.kwargs.pop("info", None)
+            if "autoreset_mode" in spec.kwargs:
+                spec.kwargs["vector_kwargs"] = {"autoreset_mode": spec.kwargs.pop("autoreset_mode")}
+        vector_kwargs = spec.kwargs.get("vector_kwargs", {})
+        if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
+            vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
+        return spec
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Reset the rows, or those of options["reset_mask"].
+
+        Args:
+            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
+            options: Options of the env.
+
+        Returns:
+            Observations and infos.
+
+        Raises:
+            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
+        """
+        mask = None if options is None else options.get("reset_mask")
+        rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
+        ended_before, self._ended = self._ended, None
+        if ended_before is None and not rows.all():
+            raise ResetNeeded(
+                "reset all rows first: no step succeeded since then, or none was made"
+            )
+        try:
+            obs, infos = self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            self._restore_ended(ended_before, error)
+            raise
+        none = np.zeros(self.num_envs, np.bool_)
+        self._ended = none if ended_before is None else ended_before & ~rows
+        self._begin(rows)
+        return self._append(obs, infos, rows), infos
+
+    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
+        """Step all rows.
+
+        Args:
+            actions: Actions of all rows.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos.
+
+        Raises:
+            ResetNeeded: It is called before `reset`, or after a step that failed.
+        """
+        ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
+        if ended_before is None:
+            raise ResetNeeded(
+                "call reset() first: before the first step, and after one that failed"
+            )
+        try:
+            obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        except Exception as error:
+            self._restore_ended(ended_before, error)
+            raise
+        ended = np.logical_or(terminated, truncated)
+        if not self._same_step:
+            self._begin(ended_before)
+        elif ended.any():
+            self._finish(infos, ended)
+            self._begin(ended)
+        obs = self._append(obs, infos, np.ones_like(ended))
+        self._ended = ended
+        return obs, rewards, terminated, truncated, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a snapshot for `set_state`; TypeError where the env makes none."""
+        env: Any = self.env
+        if not hasattr(env, "get_state"):
+            raise TypeError(
+                f"{type(env).__name__} makes no snapshots; the vector env that gym.make_vec builds "
+                "without a vectorization_mode does"
+            )
+        ended = None if self._ended is None else self._ended.copy()
+        return {"env": env.get_state(), "ended": ended}
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
+        env: Any = self.env
+        env.set_state(snapshot["env"])
+        self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
+
+    def _get_true_vehicles(self, rows: Sequence[int]) -> list[Vehicle]:
+        """Return the true vehicles of some rows; TypeError where they are out of reach."""
+        base: Any = self.unwrapped
+        if isinstance(base, SyncVectorEnv):
+            return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
+        if not hasattr(base, "vehicle"):
+            raise TypeError(f"{type(base).__name__} does not offer which vehicles its rows drive")
+        return [base.vehicle[i] for i in rows]

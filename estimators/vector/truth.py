@@ -4,29 +4,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from ...envs.task import make_space
 from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_states
 from ..wrappers.truth import TruthObservation as Single
-from .records import get_env_state, get_true_vehicles, make_vector_spec
-
-_Observations = npt.NDArray[np.float32]
+from .records import Mask, Observations, VectorObservation
 
 
-class TruthObservation(
-    VectorWrapper[_Observations, Any, _Observations, Any, Any], RecordConstructorArgs
-):
+class TruthObservation(VectorObservation):
     """`sideslip.estimators.wrappers.truth.TruthObservation` of all rows, with the same bits.
 
     It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row has the parameters
     of its new car from the first observation of an episode on; `final_obs` holds the old one's.
-    `spec` names the single wrapper: `gym.make_vec(spec)` builds environments that are wrapped one
-    by one.
 
     Args:
         env: Vector environment of N rows with a `layout`.
@@ -44,48 +33,30 @@ class TruthObservation(
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
-        RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
-        VectorWrapper.__init__(self, env)
+        recorded = {"parameters": list(parameters), "states": list(states)}
+        super().__init__(env, Single, recorded)
         if not hasattr(env, "layout"):
             raise TypeError(
                 f"{type(env).__name__} has no layout; wrap it in "
                 "sideslip.estimators.vector.EstimateObservation first"
             )
         self._parameters, self._states = tuple(parameters), tuple(states)
-        self.layout = make_truth_entries(self._parameters, self._states, env.layout)
-        self.single_observation_space = make_space(self.layout)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
+        self._set_layout(make_truth_entries(self._parameters, self._states, env.layout))
         if self._same_step and states:
             raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
         self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
 
-    @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
-        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
-        return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
+    def _begin(self, mask: Mask) -> None:
+        rows = np.flatnonzero(mask)
+        for i, car in zip(rows, self._get_true_vehicles(rows.tolist()), strict=True):
+            self._values[i] = [getattr(car, name) for name in self._parameters]
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[_Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and read their cars.
+    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+        for i in np.flatnonzero(ended):
+            infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
 
-        Args:
-            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
-            options: Options of the env.
-
-        Returns:
-            Observations and infos.
-        """
-        mask = None if options is None else options.get("reset_mask")
-        rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
-        obs, infos = self.env.reset(seed=seed, options=options)
-        self._read_cars(rows)
-        self._ended &= ~rows
-        return self._append_truth(obs), infos
-
-    def _append_truth(self, obs: _Observations) -> _Observations:
+    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
         parts = [obs, self._values]
         if self._states:
             base: Any = self.unwrapped
@@ -98,28 +69,9 @@ class TruthObservation(
             parts.append(read_states(true_states, self._states))
         return np.hstack(parts)
 
-    def step(self, actions: Any) -> tuple[_Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows; `final_obs` gets the parameters of the old cars.
-
-        Args:
-            actions: Actions of all rows.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos.
-        """
-        obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        ended = np.logical_or(terminated, truncated)
-        if self._same_step:
-            for i in np.flatnonzero(ended):
-                infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
-        self._read_cars(ended if self._same_step else self._ended)
-        self._ended = ended
-        return self._append_truth(obs), rewards, terminated, truncated, infos
-
     def get_state(self) -> dict[str, Any]:
         """Return a snapshot for `set_state`; TypeError where the env makes none."""
-        arrays = {"values": self._values.copy(), "ended": self._ended.copy()}
-        return arrays | {"env": get_env_state(self.env)}
+        return super().get_state() | {"values": self._values.copy()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -127,12 +79,5 @@ class TruthObservation(
         Args:
             snapshot: Result of `get_state`.
         """
-        env: Any = self.env
-        env.set_state(snapshot["env"])
-        self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()
-
-    def _read_cars(self, mask: npt.NDArray[np.bool_]) -> None:
-        rows = np.flatnonzero(mask)
-        cars = get_true_vehicles(self.unwrapped, rows.tolist())
-        for i, car in zip(rows, cars, strict=True):
-            self._values[i] = [getattr(car, name) for name in self._parameters]
+        super().set_state(snapshot)
+        self._values = snapshot["values"].copy()

@@ -15,20 +15,31 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
+from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..learned.correction import LearnedEstimator
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
 from ..registry import find_entry_point
-from .kernel import compile_observe
-from .outputs import BETA, STD, Outputs, make_outputs, write_outputs
+from .outputs import (
+    BETA,
+    NEES,
+    STD,
+    Observed,
+    Outputs,
+    OutputTable,
+    StepRecord,
+    compile_observe,
+    write_outputs,
+)  # fmt: skip
 from .truth import TRUTH, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 _Floats = npt.NDArray[np.float32]
 AnyEstimator = Estimator | ForeignEstimator
-_PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
+_TRUTHS = {"beta": 1, "gamma": 2}  # code of each state whose truth `observe` gets; 0: none
+_WRAPPED = ("psi", "psi_late")  # angles that are wrapped to +-pi
 _ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
 # stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
 # and is known by name: this module loads nothing of theirs.
@@ -65,85 +76,123 @@ def make_spec(base: Any) -> EstimatorSpec:
     return EstimatorSpec(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
 
 
-def build_estimator(
-    source: str | EstimatorFactory, options: Mapping[str, object], dt: float, spec: EstimatorSpec
-) -> AnyEstimator:
-    """Build an estimator for a spec by `make_estimator`.
-
-    Args:
-        source: Name or factory.
-        options: Options of the estimator.
-        dt: Tick (s).
-        spec: Vehicle, sensors and speed.
-
-    Returns:
-        The estimator.
-    """
-    vehicle, sensors, speed = spec
-    return make_estimator(source, vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options)
-
-
+@dataclasses.dataclass
 class Arguments:
-    """The checked arguments of a wrapper, and the estimator they stand for.
+    """The arguments of `EstimateObservation` beside its env, which documents them."""
 
-    Args:
-        estimator: Name, factory or object; None for `choose_estimator` of the sensors.
-        outputs: States to append.
-        std: Whether standard deviations are appended.
-        replace: Whether the inner observation is left out.
-        vehicle: Vehicle for the estimator, "truth" for the true one, None for the nominal one.
-        options: Options of the estimator.
-        name: Prefix of all names, or None.
-        slow_sensors: Slow sensors of the env by name.
-        misplaced: Keyword arguments that the wrapper does not have.
+    estimator: Any = None  # name, factory or object; None: that of `choose_estimator`
+    outputs: Sequence[str] = ("beta", "gamma")
+    std: bool = True
+    replace: bool = False
+    vehicle: Any = None
+    options: Any = None
+    name: str | None = None
+    recorded: dict[str, Any] = dataclasses.field(init=False, default_factory=dict)  # for a spec
 
-    Attributes:
-        source: Name or factory; None where `object` is the one estimator to use.
-        recorded: Arguments for the env's spec.
+    @classmethod
+    def read(
+        cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any
+    ) -> "Arguments":
+        """Read and check arguments, choose an estimator where there is none, make the vehicle.
 
-    Raises:
-        TypeError: An argument is misplaced; the message has the nearest name.
-        ValueError: An object has a vehicle or options, which would not reach it.
-    """
+        Args:
+            slow_sensors: Slow sensors of the env by name.
+            *values: Arguments of the wrapper.
+            **named: Arguments by name.
 
-    def __init__(
-        self,
-        estimator: EstimatorSource | None,
-        outputs: Sequence[str],
-        std: bool,
-        replace: bool,
-        vehicle: VehicleSource | None,
-        options: Mapping[str, object] | None,
-        name: str | None,
-        slow_sensors: Mapping[str, SlowSensor],
-        misplaced: Mapping[str, object],
-    ) -> None:
-        source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
+        Returns:
+            The arguments.
+
+        Raises:
+            TypeError: An argument is misplaced; the message has the nearest name.
+            ValueError: An object has a vehicle or options, which would not reach it.
+        """
+        names = [field.name for field in dataclasses.fields(cls)][:-1]
+        misplaced = {name: named.pop(name) for name in list(named) if name not in names}
+        self = cls(*values, **named)
+        if self.estimator is None:
+            self.estimator = choose_estimator(slow_sensors)
         if misplaced:
-            wrong = describe_unknown("argument of EstimateObservation", misplaced, _PARAMETERS)
-            if isinstance(source, str) and "did you mean" not in wrong:
+            wrong = describe_unknown("argument of EstimateObservation", misplaced, names)
+            if isinstance(self.estimator, str) and "did you mean" not in wrong:
                 # this names the nearest option
-                make_estimator(source, sensors=slow_sensors, **misplaced)
+                make_estimator(self.estimator, sensors=slow_sensors, **misplaced)
                 passed = short_repr(dict(misplaced))
                 wrong = f"options of an estimator are passed as options={passed}"
             raise TypeError(wrong)
-        self.options = dict(options or {})
-        self.truth = isinstance(vehicle, str) and vehicle == TRUTH
-        self.vehicle = None if vehicle is None or self.truth else make_vehicle(vehicle)
-        self.source, self.object, self.label = source, None, get_label(source)
-        recorded = source
-        if _is_object(source):
-            if vehicle is not None or self.options:
+        self.options = dict(self.options or {})
+        recorded, car = self.estimator, self.vehicle
+        if car is not None and not self.is_told_truth:
+            self.vehicle = make_vehicle(car)
+        if self.is_object:
+            if car is not None or self.options:
                 text = "is built already: a vehicle and options go to a name or a factory"
                 raise ValueError(f"{self.label} {text}")
-            self.source, self.object = None, source
             recorded = functools.partial(_refuse_rebuild, self.label)
-        elif not isinstance(source, str):
-            recorded = find_entry_point(source) or source
-        car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
+        elif not isinstance(recorded, str):
+            recorded = find_entry_point(recorded) or recorded
+        car = car.to_dict() if isinstance(car, Vehicle) else car
+        values = recorded, list(self.outputs), bool(self.std), bool(self.replace)
         car = dict(car) if isinstance(car, Mapping) else car
-        values = recorded, list(outputs), bool(std), bool(replace), car, self.options, name
-        self.recorded = dict(zip(_PARAMETERS, values, strict=True))
+        self.recorded = dict(zip(names, (*values, car, self.options, self.name), strict=True))
+        return self
+
+    @property
+    def label(self) -> str:
+        """Name of the estimator for messages."""
+        return get_label(self.estimator)
+
+    @property
+    def is_object(self) -> bool:
+        """Whether the estimator is one, well made or not, rather than what builds one."""
+        source = self.estimator
+        if isinstance(source, str | type):
+            return False
+        return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
+
+    @property
+    def is_told_truth(self) -> bool:
+        """Whether the vehicle is the true one."""
+        return isinstance(self.vehicle, str) and self.vehicle == TRUTH
+
+    def make_outputs(self, states: tuple[str, ...], inner: tuple[ObservationEntry, ...]) -> Outputs:
+        """Make the outputs of an estimator behind the entries of an inner observation.
+
+        Args:
+            states: Names of the estimator's states.
+            inner: Entries of the inner observation, which `replace` leaves out.
+
+        Returns:
+            The entries, and how `observe` writes them.
+
+        Raises:
+            ValueError: An output is no state, or names would stand twice.
+        """
+        for output in self.outputs:
+            if output not in states:
+                known = ", ".join(states)
+                raise ValueError(f"{self.label} has no state {output!r}; it has: {known}")
+        prefix = "" if self.name is None else f"{self.name}_"
+        kinds = [STATES.get(s, FOREIGN_STATE) for s in self.outputs]
+        n_inner, layout = (0, []) if self.replace else (len(inner), list(inner))
+        for ending, low in (("hat", -1.0), ("std", 0.0)) if self.std else (("hat", -1.0),):
+            for s, (unit, _, bound) in zip(self.outputs, kinds, strict=True):
+                layout.append(ObservationEntry(f"{prefix}{s}_{ending}", unit, low * bound, bound))
+        names = [entry.name for entry in layout]
+        if duplicates := sorted({entry for entry in names if names.count(entry) > 1}):
+            text = "would stand twice; give this wrapper a name=..."
+            raise ValueError(f"{', '.join(duplicates)} {text}")
+        truths = [_TRUTHS.get(s, 0) for s in self.outputs]
+        columns = [states.index(s) for s in self.outputs], [s in _WRAPPED for s in self.outputs]
+        keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
+        keys += [("nees", NEES)] if any(truths) else []
+        table = OutputTable(
+            n_inner,
+            np.array([*columns, truths], np.int64).T.copy(),
+            np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
+        )
+        title = self.label if self.name is None else f"{self.label} ({self.name})"
+        return Outputs(title, tuple(layout), table, tuple((prefix + k, place) for k, place in keys))
 
 
 def _refuse_rebuild(label: str, **_: object) -> NoReturn:
@@ -164,13 +213,6 @@ def choose_estimator(slow_sensors: Iterable[str]) -> str:
         "dakf" where there is a GPS, else "exact-kf".
     """
     return "dakf" if "gps" in slow_sensors else "exact-kf"
-
-
-def _is_object(source: object) -> bool:
-    """Return whether this is an estimator, well made or not, rather than what builds one."""
-    if isinstance(source, str | type):
-        return False
-    return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
 
 
 class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstructorArgs):
@@ -226,50 +268,46 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         **misplaced: object,
     ) -> None:
         self._base = find_base_env(env)
-        clocks = self._base.slow_sensors
-        self._arguments = Arguments(
-            estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
-        )
+        values = estimator, outputs, std, replace, vehicle, options, name
+        self._arguments = Arguments.read(self._base.slow_sensors, *values, **misplaced)
         RecordConstructorArgs.__init__(self, **self._arguments.recorded)
         gym.Wrapper.__init__(self, env)
         self._estimator_spec: EstimatorSpec | None = None
         self.estimator: AnyEstimator = self._update_estimator()
-        inner: tuple[ObservationEntry, ...] = () if replace else env.get_wrapper_attr("layout")
-        states, label = self.estimator.names, self._arguments.label
-        self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
-        self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
+        inner = env.get_wrapper_attr("layout")
+        self.outputs = self._arguments.make_outputs(self.estimator.names, inner)
+        self.layout = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._title, self._summary = label if name is None else f"{label} ({name})", np.zeros(3)
+        self._summary = np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
         """Return the estimator for the env's present spec; that at hand where nothing changed."""
         base, arguments, previous = self._base, self._arguments, self._estimator_spec
-        spec = make_spec(base)
-        if arguments.vehicle is not None:
-            spec = spec._replace(vehicle=arguments.vehicle)
-        elif arguments.truth:
+        spec, car = make_spec(base), arguments.vehicle
+        if arguments.is_told_truth:
             car = base.vehicle
             if previous is not None:
-                car = choose_vehicle(self.estimator, previous.vehicle, car)
-            spec = spec._replace(vehicle=car)
+                car = choose_vehicle(self.estimator, previous.vehicle, base.vehicle)
+        spec = spec if car is None else spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
             self.estimator, self._estimator_spec = self._build_estimator(spec), spec
-            self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
-        if arguments.truth:
+        if arguments.is_told_truth:
             set_stiffness(self.estimator, base.vehicle)
         return self.estimator
 
     def _build_estimator(self, spec: EstimatorSpec) -> AnyEstimator:
         """Build an estimator for a spec; where one object is used, return that one."""
-        arguments, dt = self._arguments, self._base.dt
-        if arguments.object is None:
-            return build_estimator(arguments.source, arguments.options, dt, spec)
-        if not isinstance(arguments.object, AnyEstimator):
-            arguments.object = ForeignEstimator(arguments.object, arguments.label, dt, spec.sensors)
-        elif abs(arguments.object.dt - dt) > 1e-9:
-            built = f"{arguments.label} was built for ticks of {arguments.object.dt:g} s"
+        arguments, dt, label = self._arguments, self._base.dt, self._arguments.label
+        if not arguments.is_object:
+            named = spec._asdict() | {"dt": dt}
+            made: AnyEstimator = make_estimator(arguments.estimator, **named, **arguments.options)
+            return made
+        if not isinstance(arguments.estimator, AnyEstimator):
+            arguments.estimator = ForeignEstimator(arguments.estimator, label, dt, spec.sensors)
+        elif abs(arguments.estimator.dt - dt) > 1e-9:
+            built = f"{label} was built for ticks of {arguments.estimator.dt:g} s"
             raise ValueError(f"{built}, the env has {dt:g} s")
-        estimator: AnyEstimator = arguments.object
+        estimator: AnyEstimator = arguments.estimator
         return estimator
 
     def reset(
@@ -316,30 +354,28 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
 
     def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""
-        base, outputs, summary = self._base, self.outputs, self._summary
-        estimator: Any = self.estimator
-        inner = None if self._is_native else getattr(estimator, "inner", None)
-        out, rows, done = np.empty(len(self.layout), np.float32), base.ticks_done, 0
-        record = base.rows, rows, base.packets, base.delivered
-        layout_args = outputs.inner, outputs.plan, outputs.limits
-        observe_args = obs, *layout_args, info["beta"], info["gamma"], out, summary
-        if isinstance(inner, LearnedEstimator):
+        base, estimator, out = self._base, self.estimator, np.empty(len(self.layout), np.float32)
+        record = StepRecord(base.rows, base.ticks_done, base.packets, base.delivered)
+        truth = info["beta"], info["gamma"]  # for the NEES in info; the filter never reads it
+        observed, done = Observed(obs, self.outputs.table, *truth, out, self._summary), 0
+        if isinstance(estimator, Estimator) and estimator.compiled:
+            while True:
+                memory = estimator.filters, estimator.gains
+                done = compile_observe()(*memory, record, done, observed)
+                if done == record.rows:  # 0 after a bad action that failed
+                    break  # else a table of gains is missing
+                estimator.design_missing()
+        elif isinstance(inner := getattr(estimator, "inner", None), LearnedEstimator):
             memory = inner.base.filters, inner.base.gains
-            compile_observe(corrected=True)(*memory, record, inner.memory, inner.net, observe_args)
-        elif not self._is_native:
-            estimator.step(base.rows[:rows], base.packets[: base.delivered])
-            write_outputs(estimator, *observe_args)
-        while self._is_native:
-            memory = estimator.filters, estimator.gains
-            done = compile_observe()(*memory, *record, done, *observe_args)
-            if done == rows:  # which a refused action leaves at none
-                break
-            estimator.design_missing()
-        values = summary.tolist()
-        for key, index in outputs.keys:
+            compile_observe(corrected=True)(*memory, record, inner.memory, inner.net, observed)
+        else:
+            estimator.step(record.fast[: record.rows], record.packets[: record.count])
+            write_outputs(estimator, observed)
+        values = self._summary.tolist()
+        for key, index in self.outputs.keys:
             info[key] = values[index]
             if index == BETA:
-                base.annotate(self._title, values[BETA], values[STD])
+                base.annotate(self.outputs.title, values[BETA], values[STD])
         return out
 
 

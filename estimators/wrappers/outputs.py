@@ -1,115 +1,84 @@
-"""States of an estimator as entries of an observation: names, units, bounds, and their values."""
+"""States of an estimator as entries of an observation: names, units, bounds, and their values.
 
-from collections.abc import Sequence
+One compiled call runs a filter and writes them; those of a user's own are written by NumPy.
+"""
+
 from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.numerics.functions import wrap
-from ...envs.numerics.jit import as_python
-from ...envs.numerics.primitives import ARRAYS
-from ...envs.record import Array
+from ...envs.numerics.jit import as_python, jit, noinline
+from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum, minimum
 from ...envs.task import ObservationEntry
-from ..design.models import FOREIGN_STATE, STATES
+from ..core.filter import advance, compute_deviation, read_covariance
+from ..core.record import FILTER, FilterRecord, GainTables
+from ..estimator import compile_call
+from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 from ..protocol import EstimatorLike, compute_std
 
-TRUTHS = {"beta": 1, "gamma": 2}  # code of each state whose truth `observe` gets; 0: none
 BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
-_WRAPPED = ("psi", "psi_late")  # angles that are wrapped to +-pi
 _wrap = as_python(wrap, ARRAYS)
+
+
+class StepRecord(NamedTuple):
+    """The record of an env's newest step; of N cars, each field has them as its first axis."""
+
+    fast: Matrix  # fast rows, shape (k, FAST_WIDTH)
+    rows: Scalar  # number of fast rows that are there (an env's `rows` are the rows themselves)
+    packets: Matrix  # shape (capacity, PACKET_WIDTH)
+    count: Scalar  # how many of them there are
+
+
+class OutputTable(NamedTuple):
+    """What `observe` writes behind an observation."""
+
+    inner: int  # entries of the env's observation to copy
+    # a row for each output, shape (m, 3): its state's index over all layers; 1 if it is an angle to
+    # wrap; whose truth the NEES takes (1 beta, 2 gamma, 0 none)
+    plan: Matrix
+    limits: Vector  # bounds of the outputs in their units, shape (m,)
+
+
+class Observed(NamedTuple):
+    """What an observation is made of, and where it is written.
+
+    Of N cars, all but `table` have them as the first axis.
+    """
+
+    obs: Vector  # observation of the env, float32, shape (at least inner,)
+    table: OutputTable
+    beta: Scalar  # true sideslip angle (rad)
+    gamma: Scalar  # true yaw rate (rad/s)
+    out: Vector  # float32, filled, shape (inner + m,), or (inner + 2 m,) with standard deviations
+    # filled, shape (3,): beta (the first state where there is no beta), its standard deviation, and
+    # the normalised estimation error squared of the outputs beta and gamma per state,
+    # e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular
+    summary: Vector
 
 
 @dataclass(frozen=True)
 class Outputs:
     """The entries of a wrapped observation."""
 
-    layout: tuple[ObservationEntry, ...]  # the first `inner` are the inner observation's
-    inner: int
-    # of each output the state's index, 1 to wrap an angle, the code in `TRUTHS`; (m, 3)
-    plan: npt.NDArray[np.int64]
-    limits: npt.NDArray[np.float64]  # bounds of the outputs in their units, (m,)
+    title: str  # of the estimator, for pictures
+    layout: tuple[ObservationEntry, ...]
+    table: OutputTable
     keys: tuple[tuple[str, int], ...]  # keys of `info`, with their places in the summary
 
 
-def make_outputs(
-    estimator: str,
-    states: tuple[str, ...],
-    outputs: Sequence[str],
-    std: bool,
-    name: str | None,
-    inner: tuple[ObservationEntry, ...],
-) -> Outputs:
-    """Make the outputs of an estimator behind the entries of an inner observation.
-
-    Args:
-        estimator: Name of the estimator for messages.
-        states: Names of its states.
-        outputs: States to append.
-        std: Whether standard deviations are appended.
-        name: Prefix of all names, or None.
-        inner: Entries of the inner observation.
-
-    Returns:
-        The entries, and how `observe` writes them.
-
-    Raises:
-        ValueError: An output is no state, or names would stand twice.
-    """
-    for output in outputs:
-        if output not in states:
-            raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
-    prefix = "" if name is None else f"{name}_"
-    kinds = [STATES.get(s, FOREIGN_STATE) for s in outputs]
-    layout = list(inner)
-    for ending, low in (("hat", -1.0), ("std", 0.0)) if std else (("hat", -1.0),):
-        for s, (unit, _, bound) in zip(outputs, kinds, strict=True):
-            layout.append(ObservationEntry(f"{prefix}{s}_{ending}", unit, low * bound, bound))
-    names = [entry.name for entry in layout]
-    duplicates = sorted({entry for entry in names if names.count(entry) > 1})
-    if duplicates:
-        raise ValueError(f"{', '.join(duplicates)} would stand twice; give this wrapper a name=...")
-    truths = [TRUTHS.get(s, 0) for s in outputs]
-    columns = [states.index(s) for s in outputs], [s in _WRAPPED for s in outputs], truths
-    keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
-    keys += [("nees", NEES)] if any(truths) else []
-    return Outputs(
-        tuple(layout),
-        len(inner),
-        np.array(columns, np.int64).T.copy(),
-        np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
-        tuple((prefix + key, place) for key, place in keys),
-    )
-
-
-def write_outputs(
-    estimator: EstimatorLike,
-    obs: npt.NDArray[np.float32],
-    inner: int,
-    plan: npt.NDArray[np.int64],
-    limits: Array,
-    beta: float,
-    gamma: float,
-    out: npt.NDArray[np.float32],
-    summary: Array,
-) -> None:
-    """Write a user's estimates as `kernel.observe` writes those of a compiled filter.
+def write_outputs(estimator: EstimatorLike, observed: Observed) -> None:
+    """Write a user's estimates as `observe` writes those of a compiled filter.
 
     Raises what `ForeignEstimator.x` raises.
 
     Args:
         estimator: The user's estimator.
-        obs: Observation of the env, shape (at least inner,).
-        inner: Number of entries of `obs` to copy.
-        plan: Of each output the state's index, 1 to wrap an angle, its code in `TRUTHS`; (m, 3).
-        limits: Bounds of the outputs in their units, shape (m,).
-        beta: True sideslip angle (rad).
-        gamma: True yaw rate (rad/s).
-        out: Output, shape (inner + m,), or (inner + 2 m,) with standard deviations.
-        summary: Output, shape (3,): beta (the first state where there is no beta), its standard
-            deviation, and the normalised estimation error squared of the outputs beta and gamma
-            per state, e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular.
+        observed: Observation and outputs.
     """
+    obs, (inner, plan, limits), beta, gamma, out, summary = observed
     x, P = np.asarray(estimator.x), np.asarray(estimator.P)
     std, states, m = compute_std(P), plan[:, 0], len(plan)
     out[:inner] = obs[:inner]
@@ -124,3 +93,118 @@ def write_outputs(
     P_e = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
     nees = e @ np.linalg.solve(P_e, e) / len(e) if len(e) and np.linalg.det(P_e) > 0.0 else 0.0
     summary[:] = x[first], std[first], nees
+
+
+@jit
+def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
+    """Clip the value to +-limit; NaN stays, so that a filter that failed is seen."""
+    return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
+
+
+@jit
+def _compute_nees(
+    f: FilterRecord, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
+) -> Scalar:
+    """Compute e' P_e^-1 e / len(e), the NEES per state; 0 without states or for a singular P_e.
+
+    e is the error of the states i and j, estimates of the true beta and gamma; -1: there is none.
+    """
+    if i >= 0 and j >= 0:
+        a, b = f.x[i] - beta, f.x[j] - gamma
+        p, q = read_covariance(f, gains, i, i), read_covariance(f, gains, j, j)
+        r = read_covariance(f, gains, i, j)
+        det = p * q - r * r
+        return 0.5 * (a * a * q - 2.0 * a * b * r + b * b * p) / det if det > 0.0 else 0.0
+    k = maximum(i, j)
+    if k < 0:
+        return 0.0
+    a = f.x[k] - (beta if i >= 0 else gamma)
+    p = read_covariance(f, gains, k, k)
+    return a * a / p if p > 0.0 else 0.0
+
+
+@noinline
+def observe(
+    filters: Vector, gains: Matrix, record: StepRecord, start: int, observed: Observed
+) -> int:
+    """Advance the filter, then write the observation and the outputs.
+
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        record: Record to process.
+        start: Number of fast rows that are done already.
+        observed: Observation and outputs.
+
+    Returns:
+        Number of fast rows done, as `advance` returns it.
+    """
+    fast, rows, packets, count = record
+    obs, (inner, plan, limits), beta, gamma, out, summary = observed
+    no_states, no_nis = fast[:0], summary[:0]  # empty: `advance` writes no records
+    done = advance(filters, gains, fast, rows, packets, count, start, no_states, no_states, no_nis)
+    if done < rows:
+        return done
+    for i in range(inner):
+        out[i] = obs[i]
+    m, beta_at, gamma_at = len(plan), -1, -1
+    for i in range(m):
+        layer, state = 0, plan[i, 0]
+        while state >= filters[layer].n:
+            state -= filters[layer].n
+            layer += 1
+        f = filters[layer]
+        value = f.x[state]
+        if plan[i, 1] == 1:
+            value = wrap(value)
+        out[inner + i] = _clip_symmetric(value, limits[i])
+        if len(out) > inner + m:
+            out[inner + m + i] = _clip_symmetric(compute_deviation(f, gains, state), limits[i])
+        if plan[i, 2] == 1:
+            beta_at = state
+        elif plan[i, 2] == 2:
+            gamma_at = state
+    f = filters[0]
+    summary[0], summary[1] = f.x[0], compute_deviation(f, gains, 0)
+    summary[2] = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
+    return done
+
+
+@jit
+def observe_corrected(
+    filters: Vector, gains: Matrix, record: StepRecord, m: Vector, net: Any, observed: Observed
+) -> None:
+    """Call `filter_and_correct`, and write the sums as `observe` does.
+
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        record: Record to process.
+        m: Memory of the correction, shape (memory_size,).
+        net: Network, as `learned.correction` packs it.
+        observed: Observation and outputs.
+    """
+    fast, rows, packets, count = record
+    filter_and_correct(filters, gains, fast, rows, packets, count, m, net)
+    apply_correction(filters[0], m, net)
+    observe(filters, gains, StepRecord(fast, 0, packets, 0), 0, observed)
+    remove_correction(filters[0], m, net)
+
+
+@cache
+def compile_observe(corrected: bool = False) -> Any:
+    """Return `observe`, or `observe_corrected`, as a plain call.
+
+    Args:
+        corrected: Whether it is `observe_corrected`.
+
+    Returns:
+        A callable with the same positional arguments.
+    """
+    small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
+    memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), StepRecord(matrix, 0, matrix, 0)
+    table = OutputTable(0, np.zeros((1, 3), np.int64), wide)
+    observed = Observed(small, table, 0.0, 0.0, small, wide)
+    if corrected:
+        return compile_call(observe_corrected, *memory, record, wide, EXAMPLE, observed)
+    return compile_call(observe, *memory, record, 0, observed)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from sideslip.agents import AGENTS, Agent, Controller, make_agent, register_agent
 from sideslip.agents.rollout import evaluate_costs, rollout
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.control.entries import ControlEntry, make_cars
+from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.estimators import register_estimator
 from sideslip.estimators.make import ESTIMATORS
@@ -81,9 +81,7 @@ def test_a_matrix_cell_of_foreign_parts() -> None:
     register_agent("yaw-damper", YAW_DAMPER)
     register_estimator("constant", CONSTANT)
     for estimator, controller in (("constant", "yaw-damper"), (CONSTANT, YAW_DAMPER)):
-        env, agent = make_cars(
-            ControlEntry(ControlTask(scenario="step-steer"), estimator, controller), 2
-        )
+        env, agent = Entry(controller, estimator).make(ControlTask(scenario="step-steer"), 2)
         obs, _ = env.reset(seed=1)
         actions, _ = agent.predict(obs)
         damper = getattr(agent, "agent", agent)  # a file's or an entry point's is checked

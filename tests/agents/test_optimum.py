@@ -68,7 +68,7 @@ def test_the_linear_plant_is_the_envs_step_and_its_cost(n: int) -> None:
     env = gym.make(IDS[0], scenario=LINEAR | still | {"hold": 1e-3 * n}, control_period=n)
     base: Any = env.unwrapped
     model = _make_linear_plant(env).model
-    names, rng = model.design_spec.states, np.random.default_rng(0)
+    names, rng = model.states, np.random.default_rng(0)
     env.reset(seed=0, options={"state": {"v_y": 0.2, "gamma": 0.1}})
     for _ in range(20):
         x = np.zeros(len(names))

@@ -11,15 +11,14 @@ import pytest
 pytest.importorskip("torch")
 from sideslip.agents.learned.policy import Policy, save_policy
 from sideslip.agents.training.config import TrainingTask
-from sideslip.benchmarks.control.entries import ADAPTIVE, ControlEntry, make_cars
+from sideslip.benchmarks.control.entries import ADAPTIVE, ControlCase, Entry
 from sideslip.benchmarks.control.tasks import list_scored_tasks, vary_scenario
 from sideslip.benchmarks.studies import policies
 from sideslip.benchmarks.studies.policies import (
     FILTERS,
     VARIED,
-    list_tasks,
-    make_card,
-    make_lessons,
+    Lessons,
+    _list_tasks,
     prepare_start,
 )
 from sideslip.envs.vehicle.parameters import VEHICLES
@@ -30,9 +29,9 @@ from tests.benchmarks.conftest import Run
 def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
     """So one network serves them all."""
     for estimator in FILTERS:
-        lessons = make_lessons("coms-zero-slip", "oracle-state-lqr", estimator, 2)
-        assert len(lessons) == len(list_tasks("coms-zero-slip")) == 7
-        card = make_card("coms-zero-slip", estimator)
+        lessons = Lessons("coms-zero-slip", estimator, "oracle-state-lqr", 2).make_tasks()
+        assert len(lessons) == len(_list_tasks("coms-zero-slip")) == 7
+        card = Lessons("coms-zero-slip", estimator).make_card()
         for each in lessons:
             assert tuple((e.name, e.unit) for e in each.cars.layout) == card.observation
             assert each.teacher.width == 1
@@ -42,26 +41,26 @@ def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contes
     tmp_path: Path,
 ) -> None:
     seen: dict[str, Any] = {"with_map": True, "fast": "all"}
-    card = make_card("coms-zero-slip", "", observation_options=seen)
-    lesson = make_lessons("coms-zero-slip", "none", "", 2, observation_options=seen)[0]
+    lessons = Lessons("coms-zero-slip", "", "none", 2, observation_options=seen)
+    card, lesson = lessons.make_card(), lessons.make_tasks()[0]
     assert tuple((e.name, e.unit) for e in lesson.cars.layout) == card.observation
     assert ("curvature", "1/m") in card.observation and ("gyro_9", "rad/s") in card.observation
     assert "curvature" not in [entry.name for entry in lesson.teachers.layout]
     k = len(card.observation)
     network = Network(np.zeros(k), np.ones(k), [np.full((1, k), 0.1)], [np.zeros(1)])
     save_policy(tmp_path / "sees.safetensors", network, card)
-    contest = list_tasks("coms-zero-slip")[1]
-    cell = ControlEntry(contest, "", str(tmp_path / "sees.safetensors"))
-    env, agent = make_cars(cell, 2)
+    contest = _list_tasks("coms-zero-slip")[1]
+    own = ControlCase(contest, Entry(str(tmp_path / "sees.safetensors")))
+    env, agent = own.entry.make(contest, 2)
     assert "curvature" in agent.needs and agent.predict(env.reset(seed=0)[0])[0].shape == (2, 1)
-    assert cell.env_options["scenario"] == contest.scenario
-    assert not set(seen) & ControlEntry(contest, "", "distill-coms-yaw").env_options.keys()
+    assert own.env_options["scenario"] == contest.scenario
+    assert not set(seen) & ControlCase(contest, Entry("distill-coms-yaw")).env_options.keys()
 
 
 @pytest.mark.parametrize("teacher", ADAPTIVE.values())
 def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
     """To the bit, or it would learn to guess what its teacher's filter says."""
-    cars, twins, agent = make_lessons("coms-zero-slip", teacher, "joint", 2)[0]
+    cars, twins, agent = Lessons("coms-zero-slip", "joint", teacher, 2).make_tasks()[0]
     seen = [env.reset(seed=[3, 4])[0] for env in (cars, twins)]
     for _ in range(60):
         seen = [env.step(np.full((2, 1), 0.2, np.float32))[0] for env in (cars, twins)]
@@ -74,15 +73,16 @@ def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
 
 def test_a_policy_teaches_on_the_filter_of_its_card() -> None:
     """So that one without a filter learns from one that has it, which costs little to ask."""
-    cars, twins, agent = make_lessons("coms-zero-slip", "distill-coms-yaw", "", 2)[0]
+    cars, twins, agent = Lessons("coms-zero-slip", "", "distill-coms-yaw", 2).make_tasks()[0]
     there = [{entry.name for entry in env.layout} for env in (cars, twins)]
     assert set(agent.needs) <= there[1] and "beta_hat" in there[1] - there[0]
 
 
+@pytest.mark.long
 def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
     """Tyres, mass, camera and GPS are others; not the observation, nor the teacher's cars."""
-    lessons = make_lessons("coms-zero-slip", "none", "", 32, varied=1)
-    assert len(lessons) == 2 * len(list_tasks("coms-zero-slip"))
+    lessons = Lessons("coms-zero-slip", "", "none", 32, varied=1).make_tasks()
+    assert len(lessons) == 2 * len(_list_tasks("coms-zero-slip"))
     masses, late = set(), set()
     for plain, varied in zip(lessons[::2], lessons[1::2], strict=True):
         assert plain.cars.layout == varied.cars.layout
@@ -102,7 +102,7 @@ def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
 
 def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
     """One of them, and each in some lesson."""
-    lessons = make_lessons("coms-zero-slip", "none", "", 4, 4)
+    lessons = Lessons("coms-zero-slip", "", "none", 4, 4).make_tasks()
     assert [lesson.cars.num_envs for lesson in lessons[:5]] == [4, 1, 1, 1, 1]
     names = [entry.name for entry in lessons[0].cars.layout]
     columns = [names.index(f"{sensor}_age") for sensor in ("gps", "camera")]
@@ -118,7 +118,7 @@ def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
 
 
 def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
-    contest = list_tasks("coms-zero-slip")[0]
+    contest = _list_tasks("coms-zero-slip")[0]
     _, drawn = policies._draw_changes(1, np.random.default_rng(0))
     change = {key: value for key, value in drawn.items() if not key.endswith("_outage")}
     change |= {"mirror": False}  # which would turn every other wind round by itself
@@ -139,16 +139,16 @@ def test_who_cannot_drive_a_contest_is_no_number_of_a_card(monkeypatch: pytest.M
     monkeypatch.setattr(policies, "load_policy", Mock())
     monkeypatch.setattr(policies, "make_salted_seeds", lambda *_: [0])
     monkeypatch.setattr(policies, "run_chunk", lambda _: Mock(error="no camera"))
-    contest = list_tasks("coms-model")[0]
+    contest = _list_tasks("coms-model")[0]
     with pytest.raises(ValueError, match=f"policy cannot drive {contest.name}: no camera"):
         policies._evaluate_task(Path("mine"), contest, 1)
 
 
 def test_every_contest_is_in_one_class() -> None:
     kinds = dict.fromkeys(each.kind for each in list_scored_tasks())
-    assert sum(len(list_tasks(kind)) for kind in kinds) == len(list_scored_tasks())
+    assert sum(len(_list_tasks(kind)) for kind in kinds) == len(list_scored_tasks())
     for kind in kinds:
-        assert len({(each.env_id, each.vehicle) for each in list_tasks(kind)}) == 1
+        assert len({(each.env_id, each.vehicle) for each in _list_tasks(kind)}) == 1
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
     """All of its class, but on tensors those of one kind of plant."""
     policy, task = prepare_start(Path("raw-car-yaw"))
     assert isinstance(policy, Policy)
-    names = [each.scenario for each in list_tasks("car-yaw")]
+    names = [each.scenario for each in _list_tasks("car-yaw")]
     driven = task(algo="gradient").scenarios
     assert len(driven) == 8 and set(names) - set(driven) == {
         "car-iso-3888-1",
@@ -190,7 +190,7 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
 def test_where_it_is_said_contests_are_varied_too() -> None:
     """Each so often, by the training's seed, and not as a distillation's lessons are."""
     _, task = prepare_start(Path("raw-coms-yaw"), 2)
-    names = [each.scenario for each in list_tasks("coms-zero-slip")]
+    names = [each.scenario for each in _list_tasks("coms-zero-slip")]
     found = task().scenarios
     varied = [each for each in found if not isinstance(each, str)]
     assert [each for each in found if isinstance(each, str)] == names

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
+from sideslip.benchmarks.report import study
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import traffic
 from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
 
@@ -37,7 +39,7 @@ def test_an_episode_is_that_of_the_environment() -> None:
 @pytest.mark.parametrize("who", traffic.CONTROLLERS)
 def test_every_contestant_drives(who: str) -> None:
     numbers = traffic._simulate_swerve((who, (1,)))
-    assert numbers.shape == (1, 3) and np.isfinite(numbers).all()
+    assert np.shape(numbers) == (1, 3) and np.isfinite(numbers).all()
 
 
 def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
@@ -45,7 +47,7 @@ def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
     swerves["none"] = made(SPIN, SPIN, COLLISION, DEPARTURE)
     swerves["lqr"], swerves[traffic.ORACLE] = made(COLLISION), made()
     lanes = {name: np.full((2, 5), 0.1 * (1 + i)) for i, name in enumerate(traffic.READERS)}
-    text = traffic._compose_verdict(swerves, lanes)
+    text = traffic.STUDY.compose_verdict((swerves, lanes))
     lines = text.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert "lqr 90 % [" in lines[1] and "none 60 % [" in lines[1]
@@ -54,7 +56,7 @@ def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
 
 
 def test_without_highway_env_the_suite_has_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(traffic, "find_spec", lambda name: None)
-    suite = traffic.run(1, 1, 1)
+    monkeypatch.setattr(study, "find_spec", lambda name: None)
+    suite = traffic.STUDY.run(Request())
     assert not suite.rows and "sideslip[highway]" in suite.verdict
     assert importlib.util.find_spec("highway_env") is not None

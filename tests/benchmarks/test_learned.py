@@ -1,5 +1,6 @@
 """`sideslip bench learned`: conditions that change the car alone, and what the shares are of."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.learned.policy import load_policy
-from sideslip.benchmarks.control.entries import LEARNED, ControlEntry, make_estimate_options
+from sideslip.benchmarks.control.entries import LEARNED, ControlCase
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import (
     NOMINAL,
@@ -35,11 +36,11 @@ def test_a_condition_changes_the_drive_and_no_filter_hears_of_it(kind: str, cond
         scenario = vary_scenario(contest, CONDITIONS[condition])
         same = make_scenario(scenario) == make_scenario(contest.scenario)
         assert same == (condition == TRAINED)
-        for estimator, who in learned.list_entries(kind):
-            if estimator:
+        changed = replace(contest, changes={"scenario": scenario})
+        for entry in learned.list_entries(kind):
+            if entry.estimator:
                 plain, now = (
-                    make_estimate_options(ControlEntry(contest, estimator, who, options))
-                    for options in ({}, {"scenario": scenario})
+                    ControlCase(each, entry).estimate_options for each in (contest, changed)
                 )
                 assert plain == now
 
@@ -69,11 +70,12 @@ def test_what_training_met_is_what_varied_lessons_vary() -> None:
     lately = {"camera_outage", "wind_force", "wind_start", "wind_length"}
     assert {key for name in LATELY_MET for key in CONDITIONS[name]} == lately
     for policies in LEARNED.values():
-        for estimator, name in policies:
+        for entry in policies:
+            name = entry.agent
             met = str(load_policy(name).card.algorithm_options.get("scenarios"))
             new = name in ("raw-coms-steering", "raw-coms-yaw")
             assert new == ("camera_outage" in met) == ("wind_force" in met)
-            assert not (new and (estimator, name) == policies[0])  # of whom the verdict speaks
+            assert not (new and entry == policies[0])  # of whom the verdict speaks
     rng = np.random.default_rng(0)
     varied = {key for change in _draw_changes(20, rng) for key in change}
     for name in NEVER_MET:
@@ -96,38 +98,36 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
     mine["fails"] = driven(0.25 * nominal, rng.random(400) < 0.1)
     small = mine | {PARAMETERS: driven(0.95 * nominal)}
     found = TransferResult("car-yaw", {TRAINED: [mine], "a quarter heavier": [small]})
-    assert np.isnan(found.score_condition("half", "a quarter heavier").value)
+    assert np.isnan(found._score("half", "a quarter heavier").value)
     expected = {NOMINAL: 0.0, PARAMETERS: 1.0, "half": 0.5, "dearer": -0.5}
     for name, share in expected.items():
-        assert found.score_condition(name, TRAINED).value == pytest.approx(share, abs=2e-3)
-    assert found.score_condition("fails", TRAINED).high < 0.9
+        assert found._score(name, TRAINED).value == pytest.approx(share, abs=2e-3)
+    assert found._score("fails", TRAINED).high < 0.9
     gone = {name: driven(nominal, 1.0) for name in mine}
-    assert TransferResult("car-yaw", {TRAINED: [mine, gone]}).score_condition(
+    assert TransferResult("car-yaw", {TRAINED: [mine, gone]})._score(
         "half", TRAINED
-    ) == found.score_condition("half", TRAINED)
-    assert np.isnan(
-        TransferResult("car-yaw", {TRAINED: [gone]}).score_condition("half", TRAINED).value
-    )
+    ) == found._score("half", TRAINED)
+    assert np.isnan(TransferResult("car-yaw", {TRAINED: [gone]})._score("half", TRAINED).value)
     found.drives.pop("a quarter heavier")
     assert (found.select("failure", "fails") != 0.0).mean() == pytest.approx(0.1, abs=0.05)
-    ratios = found.ratios("fails")
+    ratios = found._compute_ratios("fails")
     assert np.isinf(ratios).mean() == (found.select("failure", "fails") != 0.0).mean()
     assert ratios[np.isfinite(ratios)] == pytest.approx(0.25, abs=1e-3)
 
 
 def test_the_verdict_tells_what_training_met_from_what_it_never_did() -> None:
     nominal = np.random.default_rng(0).uniform(1.0, 2.0, 400)
-    (_, policy), *_ = LEARNED["car-yaw"]
+    policy = LEARNED["car-yaw"][0].agent
     costs = {TRAINED: 0.25, "a quarter heavier": 0.5, "no camera from 2 to 7 s": 2.0}
     found = TransferResult("car-yaw")
     for condition, factor in costs.items():
         cases = {NOMINAL: 1.0, PARAMETERS: 0.25, policy: factor, learned.RIVALS[0]: 0.3}
         found.drives[condition] = [{who: driven(each * nominal) for who, each in cases.items()}]
-    said = learned.compose_verdict([found])
+    said = learned.STUDY.compose_verdict([found])
     assert f"{policy} closes 1.00 of the gap; at worst 0.50 where it trained, -0.50 where" in said
     assert "beats adaptive-lqr in 33 %" in said
     found.drives.pop("no camera from 2 to 7 s")
-    assert "at worst 0.50 where it trained, - where never" in learned.compose_verdict([found])
+    assert "at worst 0.50 where it trained, - where never" in learned.STUDY.compose_verdict([found])
 
 
 @pytest.mark.parametrize("kind", LEARNED)

@@ -11,22 +11,16 @@ import pytest
 import sideslip
 from sideslip.agents import make_agent
 from sideslip.agents.learned.policy import Card, list_shipped, load_policy, save_policy
-from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control import tasks
+from sideslip.benchmarks.control import tables, tasks
 from sideslip.benchmarks.control.entries import (
     LEARNED,
-    ControlEntry,
-    make_cars,
-    make_estimate_options,
+    ControlCase,
+    Entry,
 )
-from sideslip.benchmarks.control.run import CachedDrive, Chunk
+from sideslip.benchmarks.control.run import Chunk, make_storage, run_chunk
 from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
-from sideslip.benchmarks.studies.policies import (
-    evaluate_policy,
-    make_suite,
-    record_evaluation,
-    summarise_evaluation,
-)
+from sideslip.benchmarks.report.study import StoredFunction
+from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation
 from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
@@ -73,7 +67,7 @@ def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path
     found = record_evaluation(path, 5)
     after = load_policy(path)
     assert after.salt == before.salt
-    assert after.card == replace(before.card, evaluation=summarise_evaluation(found))
+    assert after.card == replace(before.card, evaluation=found.summarise())
     told = after.card.evaluation
     assert told["episodes"] == 5 and told["salt"] == before.salt
     for name, costs in told["cost"].items():
@@ -85,7 +79,7 @@ def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
     found = evaluate_policy(
         str(a_file(tmp_path)), 4, env_id="sideslip/YawFusion-v0", scenario="gust"
     )
-    suite = make_suite(found)
+    suite = found.make_suite()
     (table,) = suite.tables
     assert [line[0] for line in table.cells] == ["damper", "lqr on exact-kf", "none"]
     assert all(len(line) == len(table.header) for line in table.cells)
@@ -107,7 +101,7 @@ def test_without_the_classical_line_the_rest_is_told(
     monkeypatch.setattr("sideslip.benchmarks.studies.policies.FILTER", "nobody-kf")
     found = evaluate_policy(str(a_file(tmp_path)), 2)
     assert list(found.drives) == ["damper", "none"]
-    assert "lqr on nobody-kf was not driven" in make_suite(found).tables[0].note
+    assert "lqr on nobody-kf was not driven" in found.make_suite().tables[0].note
 
 
 @pytest.mark.parametrize("name", list_shipped())
@@ -124,18 +118,18 @@ def test_what_a_shipped_card_says_is_so(name: str) -> None:
 
 
 def test_a_policy_of_the_matrix_is_shipped_and_its_training_noted() -> None:
-    policies = [policy for pairs in LEARNED.values() for _, policy in pairs]
+    policies = [entry.agent for entries in LEARNED.values() for entry in entries]
     assert policies and {*policies} <= {*list_shipped()}
-    for policy, note in zip(policies, control._describe_policies(), strict=True):
+    for policy, note in zip(policies, tables._describe_policies(), strict=True):
         assert load_policy(policy).card.env_id in note and "reference" in note
 
 
 def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) -> None:
     path = a_file(tmp_path, "multirate-kf", outputs=["beta"], std=True)
-    cell = ControlEntry(ControlTask(scenario="gust"), "multirate-kf", str(path))
-    assert make_estimate_options(cell) == {"outputs": ["beta"], "std": True}
-    env, agent = make_cars(cell, 2)
-    assert [entry.name for entry in env.layout[-2:]] == ["beta_hat", "beta_std"]  # type: ignore[attr-defined]
+    task, entry = ControlTask(scenario="gust"), Entry(str(path), "multirate-kf")
+    assert ControlCase(task, entry).estimate_options == {"outputs": ["beta"], "std": True}
+    env, agent = entry.make(task, 2)
+    assert [item.name for item in env.layout[-2:]] == ["beta_hat", "beta_std"]
     assert agent.needs == ("gyro",)
 
 
@@ -143,14 +137,15 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = a_file(tmp_path)
-    cell = ControlEntry(ControlTask(scenario="gust"), "", str(path), {"scenario": SHORT})
-    cached = CachedDrive(tmp_path / "cached")
-    first = cached(Chunk(cell, (1, 2)))
-    assert np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
+    task = ControlTask(scenario="gust", changes={"scenario": SHORT})
+    chunk = Chunk(task, Entry(str(path)), (1, 2))
+    cached = StoredFunction(run_chunk, tmp_path / "cached", make_storage())
+    first = cached(chunk)
+    assert np.array_equal(cached(chunk).numbers, first.numbers)
     policy = load_policy(path)
     other = replace(policy.network, biases=[np.ones(1)])
     save_policy(path, other, policy.card)
-    assert not np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
+    assert not np.array_equal(cached(chunk).numbers, first.numbers)
     salt = make_salt()
     monkeypatch.setattr(tasks, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
     assert make_salt() != salt

@@ -9,7 +9,7 @@ import pytest
 
 from sideslip import __version__
 from sideslip.benchmarks import readme
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, Results, run_chunk
 from sideslip.benchmarks.control.score import compute_log_ratios
 from sideslip.benchmarks.control.tasks import (
@@ -79,8 +79,7 @@ def test_a_policy_that_came_later_drives_the_seeds_of_the_rows(
     assert {(row.n, row.salt, row.scenario) for row in new} == {(3, "5a17", "tier 1")}
     seeds = tuple(make_task_seeds("5a17", 3)(contest))
     nominal, own = (
-        run_chunk(Chunk(ControlEntry(contest, "", who), seeds))
-        for who in (NOMINAL, "raw-coms-steering")
+        run_chunk(Chunk(contest, Entry(who), seeds)) for who in (NOMINAL, "raw-coms-steering")
     )
     cost = next(row.value for row in new if row.metric == "cost_vs_nominal")
     assert cost == pytest.approx(np.exp(-compute_log_ratios(nominal.costs, own).mean()))
@@ -99,12 +98,12 @@ def test_it_is_in_every_tier_of_its_class_on_what_it_reads(
 ) -> None:
     """By the command, with drives that are made up."""
 
-    def measured(asked: list[ControlEntry], seeds: Any, **_: Any) -> Results:
+    def measured(asked: list[ControlCase], seeds: Any, **_: Any) -> Results:
         rng = np.random.default_rng(0)
-        drives = [rng.uniform(0.5, 1.0, (len(seeds(cell.task)), len(NUMBERS))) for cell in asked]
+        drives = [rng.uniform(0.5, 1.0, (len(seeds(task)), len(NUMBERS))) for task, _ in asked]
         for numbers in drives:
             numbers[:, NUMBERS.index("failure")] = 0.0
-        return Results({c: DriveResult(each, 0.0) for c, each in zip(asked, drives, strict=True)})
+        return {c: DriveResult(each, 0.0) for c, each in zip(asked, drives, strict=True)}
 
     monkeypatch.setattr(readme, "measure", measured)
     monkeypatch.chdir(tmp_path)
@@ -127,6 +126,6 @@ def test_rows_that_nobody_can_be_added_to_are_refused(monkeypatch: pytest.Monkey
         with pytest.raises(ValueError, match=message):
             readme._add_policy(rows, "raw-coms-yaw")
     wrong = DriveResult(np.zeros((0, len(NUMBERS))), 0.0, error="no action")
-    monkeypatch.setattr(readme, "measure", lambda x, *_, **__: Results(dict.fromkeys(x, wrong)))
+    monkeypatch.setattr(readme, "measure", lambda x, *_, **__: dict.fromkeys(x, wrong))
     with pytest.raises(ValueError, match=r"in .*: no action"):
         readme._add_policy([STATE_ROW], "raw-coms-yaw")

@@ -9,6 +9,7 @@ import pytest
 
 from sideslip.benchmarks.picture import write_picture
 from sideslip.benchmarks.report.html import write_report
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.studies.recovery_region import (
     CARS,
@@ -91,10 +92,9 @@ def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recovery_region, "QUICK_POINTS", (3, 3))
-    monkeypatch.setattr(recovery_region, "QUICK_SEEDS", 4)
+    monkeypatch.setattr(recovery_region, "POINTS", ((3, 3), (3, 3)))
     monkeypatch.setattr(recovery_region, "CONTROLLERS", ("none", "lqr"))
-    suite = recovery_region.run(quick=True, jobs=1)
+    suite = recovery_region.STUDY.run(Request(quick=True, jobs=1))
     assert [table.title for table in suite.tables] == list(CARS)
     shares = {(row.scenario, row.controller): row for row in suite.rows}
     names = ("none", "lqr", CLAIRVOYANT)
@@ -119,8 +119,8 @@ def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_without_plotly_the_tables_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plotly", None)
     monkeypatch.delitem(sys.modules, "sideslip.benchmarks.report.figures", raising=False)
-    monkeypatch.setattr(recovery_region, "QUICK_POINTS", (1, 1))
-    monkeypatch.setattr(recovery_region, "QUICK_SEEDS", 1)
+    monkeypatch.setattr(recovery_region, "POINTS", ((1, 1), (1, 1)))
+    monkeypatch.setattr(recovery_region, "SEEDS", (1, 1))
     monkeypatch.setattr(recovery_region, "CONTROLLERS", ("none",))
-    suite = recovery_region.run(quick=True, jobs=1)
+    suite = recovery_region.STUDY.run(Request(quick=True, jobs=1))
     assert suite.figures == [] and len(suite.tables) == len(suite.maps) == 2

@@ -22,7 +22,7 @@ from gymnasium.vector import AutoresetMode
 
 import sideslip
 from sideslip.envs import SCENARIOS
-from sideslip.envs.scenarios.tiers import TIERS
+from sideslip.envs.scenarios.manoeuvres import TIERS
 from sideslip.estimators import FILTERS, EstimateObservation, make_estimator
 from sideslip.estimators.vector import EstimateObservation as VectorEstimate
 

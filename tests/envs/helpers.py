@@ -42,6 +42,19 @@ LINEAR: dict[str, Any] = {
 }
 """The papers' plant: nothing drawn, nothing disturbed, sensors without noise."""
 
+BAD_ACTIONS: list[tuple[Any, str]] = [
+    (0.5, r"shape \(\)"),
+    (np.zeros(2, np.float32), r"shape \(2,\)"),
+    (np.zeros((1, 1), np.float32), r"shape \(1, 1\)"),
+    (np.zeros(0, np.float32), r"shape \(0,\)"),
+    (["left"], r"\['left'\]: could not convert"),
+    ([[0.0], [0.0, 0.0]], r"\[\[0.0\], \[0.0, 0.0\]\]: .*inhomog"),
+    (None, r"shape \(\)"),
+    ({}, r"\{\}: .* 'dict'; nothing was stepped"),
+    ([10**400], ".*too large"),
+]
+"""What is no action of one number, and what is said of it."""
+
 FULL: dict[str, Any] = LINEAR | {"small_angle": False, "tyres": "fiala"}
 """The same with the full equations and Fiala tyres."""
 

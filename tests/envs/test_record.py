@@ -21,7 +21,7 @@ from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
-from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
+from sideslip.envs.vehicle.tyres import PlantVariant, TyreInputs, compute_tyre_load
 
 from .helpers import IDS, LINEAR, bits, play, unwrapped
 
@@ -80,6 +80,7 @@ def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
     env = StabilityEnv(scenario=LINEAR | SWERVING | wind, control_period=10)
     env.reset(seed=3)
     car, road = make_car(COMS), RoadParams(0.0, 20.0, 20.0)
+    plant = PlantVariant(1, LINEAR_TYRES)
     state = Motion(25.0 / 3.6, *[0.0] * 8)
     for moment in play(env, np.random.default_rng(1).uniform(-1.0, 1.0, 30)):
         for tick, row in zip(moment.record.ticks, moment.record.fast.tolist(), strict=True):
@@ -87,7 +88,7 @@ def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
             load = compute_tyre_load(inputs, car, 1)
             blows = 100 < tick <= 250  # it acts from tick 100 to tick 250
             push = DisturbanceForces(200.0, 0.2 * 200.0) if blows else DisturbanceForces(0.0, 0.0)
-            state = kutta3(state, (load, load, load), push, car, road, TICK, 1, LINEAR_TYRES)
+            state = kutta3(state, (load, load, load), push, car, road, TICK, plant)
         assert (state.gamma, state.psi) == (moment.info["gamma"], moment.info["psi"])
     truth = env.get_state()["state"][[*Z.motion]]
     assert bits(np.array(state)) == bits(truth)

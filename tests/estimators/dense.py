@@ -41,8 +41,10 @@ def continuous(behind: Any, V: float, rolls: bool) -> Any:
             rows[to, j] = push
         elif name == "bank":
             rows[0, j] = -9.81 / V
-        elif name not in ("bias", "accel_bias"):
+        elif name in PUSHED:
             rows[PUSHED[name], j] = 1.0
+        elif name == "steer_offset":  # what acts is the measured angle less it
+            rows[:4, j] = -model.B[:, 0]
     S = COMS.sprung_mass * COMS.roll_arm
     phi, phi_rate = np.eye(rows.shape[1])[4:6]
     bank = np.array([*np.zeros(at), *(name == "bank" for name in behind)])
@@ -160,8 +162,12 @@ class Posterior:
                     sd *= factor(packet[PACKET.value + 4]) / V[k]
                 at = [names.index(state) for state in states]
                 M.append(self.T[k, at].sum(0)[None] / sd)
-                known = self.mean[k, at].sum() + (road[k] if name == "gps" else 0.0)
-                b.append(np.array([(packet[PACKET.value + i] - known) / sd]))
+                due = self.mean[k, at].sum() + (road[k] if name == "gps" else 0.0)
+                if name == "camera" and "camera_yaw" in names:
+                    reach, yaw = (1.0, COMS.preview)[i], names.index("camera_yaw")
+                    M[-1] += reach * self.T[k, yaw][None] / sd
+                    due += reach * self.mean[k, yaw]
+                b.append(np.array([(packet[PACKET.value + i] - due) / sd]))
         A = np.column_stack([np.concatenate(M), np.concatenate(b)])
         R: Any = np.linalg.qr(A, mode="r")
         self.R = R[:-1, :-1]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +12,13 @@ from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.parameters import Vehicle
 from sideslip.estimators.design.kalman import joseph_form, kalman_gain
-from sideslip.estimators.design.options import DISTURBANCE, NOISE
+from sideslip.estimators.design.options import NOISE, OPTIONS
 from tests.estimators.dense import MEASURED
 
 Array = npt.NDArray[np.float64]
+DISTURBANCE: dict[str, Any] = {
+    key: OPTIONS[key].default for key in ("force_sd", "moment_sd", "disturbance_time")
+}
 NOISES = {"camera": ("psi_noise", "y_l_noise"), "gps": ("course_noise",)}
 
 

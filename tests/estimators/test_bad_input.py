@@ -9,6 +9,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Re
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import COUNTERS
+from sideslip.estimators.design.options import OPTIONS
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -83,6 +84,23 @@ def test_constructor_errors_name_the_thing(
 ) -> None:
     with pytest.raises(error, match=message):
         make_estimator(name, **({"sensors": BOTH} | options))
+
+
+NUMBERS = [key for key, x in OPTIONS.items() if type(x.default) in {int, float}]
+NEEDED = {"assumed_delay": {"delay": "constant"}}
+for name in ("force_sd", "moment_sd", "disturbance_time"):
+    NEEDED[name] = {"disturbances": "forces"}
+
+
+@pytest.mark.parametrize("key", ["gate", *NUMBERS])
+def test_every_number_but_one_has_a_limit(key: str) -> None:
+    """No option below zero means anything, but a number of satellites that a fix needs."""
+    options: dict[str, Any] = NEEDED.get(key, {}) | {key: -1.0}
+    if key == "satellites":
+        make_estimator("exact-kf", sensors=BOTH, speed=7.0, **options)
+        return
+    with pytest.raises(ValueError, match=f"exact-kf: {key} .*, got -1.0"):
+        make_estimator("exact-kf", sensors=BOTH, speed=7.0, **options)
 
 
 @pytest.mark.parametrize(

@@ -1,25 +1,13 @@
 """The camera: what it measures as numbers, and a lane finder on pictures in its place.
 
-`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `images`
-renders the road, `lane_finder` finds the lane in a picture, `calibration` finds tilt, height and
-intrinsics, `films` reads files, `detector` has the measured noise of the lane finder. Only
-`analytic` is loaded with the package; what works on pictures needs the extra of OpenCV.
+`analytic` is the compiled sample of the engine, and has the measured noise of the lane finder.
+`pinhole` is the camera's geometry, `images` renders the road, `lane_finder` finds the lane in a
+picture, `pictures` reads files, draws on them, and finds tilt, height and intrinsics from them.
+Only `analytic` is loaded with the package; what works on pictures needs the extra of OpenCV.
 """
 
-from .analytic import (
-    CAMERA_KIND,
-    FieldOfView,
-    compute_lane_offset,
-    compute_lane_quality,
-    compute_preview_offset,
-    sample_camera,
-)
-
-__all__ = [
-    "CAMERA_KIND",
-    "FieldOfView",
-    "compute_lane_offset",
-    "compute_lane_quality",
-    "compute_preview_offset",
-    "sample_camera",
-]
+from .analytic import CAMERA_KIND as CAMERA_KIND
+from .analytic import FieldOfView as FieldOfView
+from .analytic import compute_lane_quality as compute_lane_quality
+from .analytic import compute_preview_offset as compute_preview_offset
+from .analytic import sample_camera as sample_camera

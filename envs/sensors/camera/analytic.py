@@ -1,11 +1,21 @@
-"""The analytic camera: heading relative to the road, and lateral offset at the preview point."""
+"""The analytic camera: heading relative to the road, and lateral offset at the preview point.
 
-from typing import NamedTuple
+The measured times and errors of the lane finder, in `detector.json`, make it one.
+"""
+
+import functools
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from ...numerics.functions import CHANNELS, PI, wrap
 from ...numerics.jit import inline, jit
 from ...numerics.primitives import Scalar, Vector, absolute, select
+from ...ticks import TICK
 from ...vehicle.dynamics import Motion, RoadParams, compute_curvature
+from ..errors import SensorErrors, compute_seen_lane
 from ..inertial import Noise
 from ..link import Blocks, PacketValue, SlowKind
 
@@ -56,25 +66,8 @@ def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar)
 
 
 @jit
-def compute_lane_offset(motion: Motion, road: RoadParams, l_pre: Scalar) -> Scalar:
-    """Compute the lateral offset at the preview point of a car on a road.
-
-    Args:
-        motion: `Motion` of the car.
-        road: `RoadParams`.
-        l_pre: Preview distance (m).
-
-    Returns:
-        y_l (m), left positive.
-    """
-    return compute_preview_offset(
-        motion.y, motion.psi - motion.theta, compute_curvature(road, motion.s), l_pre
-    )
-
-
-@jit
 def sample_camera(
-    motion: Motion, road: RoadParams, l_pre: Scalar, noise: Noise, n: Vector
+    motion: Motion, road: RoadParams, l_pre: Scalar, noise: Noise, n: Vector, errors: SensorErrors
 ) -> tuple[Scalar, Scalar]:
     """Sample the camera's heading relative to the road and its lateral offset, with noise.
 
@@ -84,9 +77,64 @@ def sample_camera(
         l_pre: Preview distance (m).
         noise: `Noise`.
         n: Standard normal numbers, at least two.
+        errors: `SensorErrors`.
 
     Returns:
         psi (rad) and y_l (m).
     """
-    psi, y_l = motion.psi - motion.theta, compute_lane_offset(motion, road, l_pre)
+    kappa = compute_curvature(road, motion.s)
+    psi, y, kappa = compute_seen_lane(motion.psi - motion.theta, motion.y, kappa, l_pre, errors)
+    y_l = compute_preview_offset(y, psi, kappa, l_pre)
     return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]
+
+
+_FILE = Path(__file__).with_name("detector.json")
+VISIONS = ("analytic", "image")
+DELAYS = ("fitted", "measured", "link")
+MAX_DELAY = 0.1  # s: a measured delay counts as no more
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Time of the lane finder, shift + exp(normal), and standard deviations of its results."""
+
+    shift: float  # s
+    log_mean: float
+    log_sd: float
+    range: tuple[float, float]  # s, limits of what is drawn
+    noise: dict[str, float]  # by the names of `Noise`
+
+    def compute_delay(self, share: float) -> float:
+        """Compute the delay at a quantile of its distribution.
+
+        Args:
+            share: Quantile, in (0, 1).
+
+        Returns:
+            Delay (s), within `range`.
+        """
+        from statistics import NormalDist  # 2 ms, which `import sideslip` does not need
+
+        drawn = self.shift + math.exp(NormalDist(self.log_mean, self.log_sd).inv_cdf(share))
+        return min(max(drawn, self.range[0]), self.range[1])
+
+
+def count_delay_ticks(seconds: float) -> int:
+    """Count the whole ticks after which a result arrives.
+
+    Args:
+        seconds: Time that it takes (s).
+
+    Returns:
+        Ticks, at least one.
+    """
+    return max(math.ceil(seconds / TICK - 1e-9), 1)
+
+
+@functools.cache
+def load_detector() -> Detector:
+    """Load the detector on file."""
+    values: dict[str, Any] = json.loads(_FILE.read_text())
+    times, errors = values["seconds"], values["errors"]
+    noise = {"camera_psi": errors["psi_rad"], "camera_y": errors["y_l_m"]}
+    return Detector(**times | {"range": tuple(times["range"])}, noise=noise)

@@ -203,6 +203,15 @@ class Lane(NamedTuple):
     quality: float = 0.0  # 0: lost, 1: both markings are clear
     y: float = 0.0  # m, of the car left of the lane's middle
 
+    def describe(self) -> str:
+        """Describe the lane in one line."""
+        if self.quality == 0.0:
+            return "no lane"
+        return (
+            f"psi {np.degrees(self.psi):+.2f} deg, offset {self.y:+.2f} m, "
+            f"curvature {self.curvature:+.4f} 1/m, quality {self.quality:.2f}"
+        )
+
 
 class LaneFinder:
     """Finds the lane in a camera's pictures.

@@ -17,6 +17,7 @@ ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
+from sideslip.agents.clairvoyant.linearisation import _advance  # noqa: E402
 from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     _simulate_run,
     _solve_ilqr,
@@ -24,7 +25,6 @@ from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     record_actions,
 )
 from sideslip.agents.clairvoyant.preview import PlanState, PreviewStep, make_forecast  # noqa: E402
-from sideslip.agents.clairvoyant.sweep import _advance  # noqa: E402
 from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__
@@ -54,6 +54,10 @@ ACTING: dict[str, dict[str, Any]] = {
     "split friction": {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
     "driver": {"base": "double-lane-change", "onset": 0.05},
     "Dugoff tyres": {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
+    "tyres that relax": {
+        **{"base": "random-steering", "friction": 0.3, "tyres": "magic-formula"},
+        "vehicle": {"relaxation": 0.3},
+    },
     "motor power, load transfer": {
         **{"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4}
     },
@@ -163,17 +167,18 @@ def test_steering_too() -> None:
     assert beyond.mean() < 0.1  # hardly any action asks for more than the rate gives
 
 
+@pytest.mark.long
 def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(clairvoyant, "MAX_ITERATIONS", 1)
-    env = make("sine", 1.0)
-    found = compute_clairvoyant(env, 0, {"other": np.full((100, 1), 0.1)})
+    env = make("sine", 0.4, small_angle=True, tyres="linear", roll=False)
+    found = compute_clairvoyant(env, 0, {"other": np.full((40, 1), 0.1)})
     assert found.statuses == {"other": "stopped"}
     assert found.cost == min(found.costs.values()) == found.costs[found.winner]
     monkeypatch.setattr(clairvoyant, "STEP_LENGTHS", (0.0,))  # steps that go nowhere
     stuck, status = _solve_ilqr(env, 0)
-    assert status == "stuck" and stuck.cost == _simulate_run(env, 0, np.zeros((100, 1))).cost
+    assert status == "stuck" and stuck.cost == _simulate_run(env, 0, np.zeros((40, 1))).cost
 
 
 def test_bad_input() -> None:

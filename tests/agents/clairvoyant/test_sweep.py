@@ -6,12 +6,8 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 pytest.importorskip("casadi")
-from sideslip.agents.clairvoyant.sweep import (
-    Limits,
-    Linearisation,
-    _solve_input_qp,
-    run_backward_pass,
-)
+from sideslip.agents.clairvoyant.linearisation import Linearisation
+from sideslip.agents.clairvoyant.plan import Limits, _run_backward_pass, _solve_input_qp
 
 
 def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:
@@ -46,7 +42,7 @@ def test_the_gains_are_the_regulators() -> None:
     K, zero = 400, np.zeros(400)
     limits = Limits(np.full((K, 2), -9.0), np.full((K, 2), 9.0), zero, zero, 0, 0.0)
     d, G = np.empty((K, 2)), np.empty((K, 2, 3))
-    run_backward_pass(slopes, limits, np.zeros((K, 2)), K, 0.0, d, G)
+    _run_backward_pass(slopes, limits, np.zeros((K, 2)), K, 0.0, d, G)
     P = solve_discrete_are(A, B, Q, R)
     gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     np.testing.assert_allclose(G[0], -gain, rtol=1e-9)
@@ -62,7 +58,7 @@ def test_limits_hold_and_steering_at_the_end_of_its_rate_follows_its_past() -> N
     inputs = np.full((K, 2), 0.1)
     d, G = np.empty((K, 2)), np.empty((K, 2, 3))
     limits = Limits(low, high, rate_low, rate_high, 2, 0.4)
-    run_backward_pass(slopes, limits, inputs, 300, 1e-3, d, G)
+    _run_backward_pass(slopes, limits, inputs, 300, 1e-3, d, G)
     steering = inputs[:300, 1] + d[:300, 1]
     assert np.all((steering >= -0.2 - 1e-12) & (steering <= 0.3 + 1e-12))
     assert np.all(np.abs(inputs[:300, 0] + d[:300, 0]) <= 1.0 + 1e-12)

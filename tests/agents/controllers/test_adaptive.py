@@ -10,7 +10,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.baselines import make_noise_options
 from sideslip.agents.controllers.lqr import IN, make_design_state
 from sideslip.agents.controllers.nmpc import INVERSE_FRICTION, TYRES
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import Chunk, run_chunk
 from sideslip.benchmarks.control.tasks import STEERING, ControlTask
 from sideslip.envs import make_scenario
@@ -44,7 +44,7 @@ def changed(env: Any, obs: Any, **values: float) -> Any:
 @pytest.mark.parametrize("front, rear", [(0.7, 1.2), (1.0, 1.0)])
 def test_the_gains_are_those_of_the_stiffness_estimated(front: float, rear: float) -> None:
     env = env_of(friction=0.0)
-    agent: Any = make_agent("adaptive-lqr", env, grip=None)
+    agent: Any = make_agent("adaptive-lqr", env, grip=None, knots=5)
     obs, _ = env.reset(seed=0)
     small = {"beta_hat": 1e-4, "gamma_hat": 2e-4, "F_d_hat": 0.0, "N_d_hat": 0.0}
     obs = changed(env, obs, **small, **dict(zip(TYRES, (front, rear), strict=True)))
@@ -61,7 +61,7 @@ def test_the_gains_are_those_of_the_stiffness_estimated(front: float, rear: floa
 
 def test_the_grip_follows_the_friction_estimated() -> None:
     env = env_of()
-    agent: Any = make_agent("adaptive-lqr", env, grip=0.5)
+    agent: Any = make_agent("adaptive-lqr", env, grip=0.5, knots=2)
     obs, _ = env.reset(seed=0)
     pushes = [
         abs(agent.predict(changed(env, obs, beta_hat=0.5, **{INVERSE_FRICTION: w}))[0][0])
@@ -74,7 +74,7 @@ def test_the_grip_follows_the_friction_estimated() -> None:
 @pytest.mark.parametrize("name", ["adaptive-lqr", "adaptive-nmpc"])
 def test_one_car_and_many_decide_alike(name: str) -> None:
     many, one = env_of(2), env_of()
-    agents = make_agent(name, many), make_agent(name, one)
+    agents = make_agent(name, many, knots=2), make_agent(name, one, knots=2)
     obs, _ = many.reset(seed=[3, 4])
     single, _ = one.reset(seed=4)
     state: list[Any] = [None, None]
@@ -86,10 +86,11 @@ def test_one_car_and_many_decide_alike(name: str) -> None:
         single = one.step(alone)[0]
 
 
+@pytest.mark.long
 def test_knowing_its_tyres_is_worth_a_third_of_the_cost() -> None:
-    seeds = tuple(range(700, 712))
+    seeds = tuple(range(700, 705))
     costs = [
-        run_chunk(Chunk(ControlEntry(STEERED, estimator, who), seeds)).costs
+        run_chunk(Chunk(STEERED, Entry(who, estimator), seeds)).costs
         for estimator, who in (("", "nominal"), ("joint", "adaptive-lqr"))
     ]
     assert np.mean(np.log(costs[0] / costs[1])) > 0.4

@@ -11,7 +11,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.estimators.vector import EstimateObservation
 
-CARS = 12
+CARS = 6
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 CONTESTS = (
     ("coms", "model", "coms-slalom"),
@@ -47,6 +47,7 @@ def uncontrolled(env_id: str, contest: tuple[str, str, str]) -> np.ndarray:
     return costs(env_id, "none", contest)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("contest", CONTESTS, ids=[contest[2] for contest in CONTESTS])
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_no_controller_is_dearer_than_none(name: str, contest: tuple[str, str, str]) -> None:

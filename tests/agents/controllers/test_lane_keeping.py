@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, _make_lane_model
-from sideslip.agents.design.sampled_model import SPEEDS, solve_lqr
+from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 from tests.agents.helpers import observe
@@ -48,20 +48,18 @@ def drive(env: Any, agent: Any, seed: int) -> tuple[np.ndarray, int]:
 def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> None:
     d = len(MOVED)
     for speed in SPEEDS[::6]:
-        G, H, Q, R, N = _make_lane_model(COMS, speed, 10, LIMIT, HASTE)
-        B = H[:, inputs]
-        K, _ = solve_lqr(G, B, Q, R[inputs, inputs], N[:, inputs], d)
-        wanted = control.dlqr(G[:d, :d], B[:d], Q[:d, :d], R[inputs, inputs], N[:d, inputs])[0]
-        assert K[:, :d] == pytest.approx(np.asarray(wanted), rel=1e-9)
-        assert np.abs(np.linalg.eigvals(G[:d, :d] - B[:d] @ K[:, :d])).max() < 1.0
+        model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, inputs)
+        G, B, K = model.G[:d, :d], model.H[:d], model.solve()[0][:, :d]
+        wanted = control.dlqr(G, B, model.Q[:d, :d], model.R, model.N[:d])[0]
+        assert pytest.approx(np.asarray(wanted), rel=1e-9) == K
+        assert np.abs(np.linalg.eigvals(G - B @ K)).max() < 1.0
 
 
 def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
     """The integral leaves no offset; the car turns with the road."""
     d, speed, kappa = len(MOVED), 7.0, 0.02
-    G, H, Q, R, N = _make_lane_model(COMS, speed, 10, LIMIT, HASTE)
-    K, _ = solve_lqr(G, H, Q, R, N, d)
-    closed = G - H @ K
+    model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, slice(0, 2))
+    closed = model.G - model.H @ model.solve()[0]
     rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d + 1] * kappa)
     assert rest[3] == pytest.approx(0.0, abs=1e-9)
     assert rest[1] == pytest.approx(speed * kappa)

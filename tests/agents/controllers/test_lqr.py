@@ -13,8 +13,6 @@ from sideslip.agents.design.sampled_model import (
     DYNAMIC,
     SPEEDS,
     DesignSpec,
-    _compute_input_cost,
-    compute_cost_to_go,
     make_design_model,
 )
 from sideslip.envs import COMS, PASSENGER_CAR
@@ -92,15 +90,13 @@ def test_gains_are_python_controls_for_all_states_at_once(
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()
-    assert compute_cost_to_go(model)[0] / scale == pytest.approx(
-        np.asarray(wanted) / scale, abs=1e-6
-    )
+    assert model.solve()[0] / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
 
 
 def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
     agent = agent_of(steered)
     for speed in (SPEEDS[3], SPEEDS[20]):
-        wanted = compute_cost_to_go(make_design_model(COMS, speed, agent.design_spec))[0]
+        wanted = make_design_model(COMS, speed, agent.design_spec).solve()[0]
         assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
     assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
     assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
@@ -111,7 +107,7 @@ def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
 def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
     """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
     purpose = DesignSpec(10, car.yaw_moment_limit, steers, MODEL)
-    gains = [compute_cost_to_go(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
+    gains = [make_design_model(car, speed, purpose).solve()[0] for speed in SPEEDS[::4]]
     for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
         for share in (0.0, 0.5):
             K = (1.0 - share) * gains[i] + share * gains[i + 1]
@@ -124,7 +120,7 @@ def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> No
 def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
     """With both inputs free of limits, beta and gamma reach the model's steady state."""
     model = make_design_model(COMS, 7.0, agent_of(steered).design_spec)
-    K, d = compute_cost_to_go(model)[0], len(DYNAMIC)
+    K, d = model.solve()[0], len(DYNAMIC)
     refs = compute_reference(0.01, 7.0, make_reference_params(COMS), MODEL)
     held = np.array([0.01, *refs])
     closed = model.G - model.H @ K
@@ -208,7 +204,7 @@ def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit()
     env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
     agent, speed = Lqr(env), float(SPEEDS[8])
     model = make_design_model(agent.vehicle, speed, agent.design_spec)
-    S = _compute_input_cost(model, compute_cost_to_go(model)[1])
+    S = model.R + model.H.T @ model.solve()[1] @ model.H
     per = np.diag([1.0, agent.authority])
     assert agent.curvature(speed) == pytest.approx(per @ S @ per, rel=1e-9)
     obs = np.array([each.low if each.name == "steer_command" else 0.0 for each in
@@ -232,7 +228,7 @@ def test_nothing_within_the_limits_costs_less(seed: int) -> None:
     root = rng.normal(size=(2, 2))
     S = root @ root.T + 0.01 * np.eye(2)
     free, (low, high) = rng.normal(size=2) * 3.0, np.sort(rng.normal(size=2))
-    u, w = _solve_box_qp(S[0, 0], S[0, 1], S[1, 1], free[0], free[1], 1.0, low, high)
+    u, w = _solve_box_qp(S, 0, free[0], free[1], 1.0, low, high)
     assert abs(u) <= 1.0 and low <= w <= high
     grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 201), np.linspace(low, high, 201)), -1)
     off = grid - free
@@ -242,4 +238,7 @@ def test_nothing_within_the_limits_costs_less(seed: int) -> None:
 
 
 def test_what_is_within_the_limits_stays() -> None:
-    assert _solve_box_qp(1.0, 0.9, 1.0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)
+    assert _solve_box_qp(np.array([[1.0, 0.9], [0.9, 1.0]]), 0, 0.3, -0.2, 1.0, -0.5, 0.5) == (
+        0.3,
+        -0.2,
+    )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.model_following import ModelFollowing, compute_feedback_gains
+from sideslip.agents.controllers.yaw_stability import ModelFollowing, compute_feedback_gains
 from sideslip.envs import COMS, critical_speed
 from sideslip.envs.task import MODEL, compute_reference, make_reference_params
 from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model

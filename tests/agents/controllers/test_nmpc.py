@@ -10,7 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
-from sideslip.agents.controllers.nmpc import _prepare_prediction, _shift_plan
+from sideslip.agents.controllers.nmpc import _make_blocks, _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
     _DIFFERENCE,
     LIMIT,
@@ -20,7 +20,7 @@ from sideslip.agents.design.gauss_newton import (
     _solve_damped_step,
     update_plan,
 )
-from sideslip.agents.design.prediction import make_blocks, simulate_plans
+from sideslip.agents.design.prediction import PlanBatch, simulate_plans
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from sideslip.estimators.wrappers.truth import TruthObservation
@@ -35,19 +35,20 @@ SLIDES: list[dict[str, float]] = [
     {"beta_hat": -0.05, "gamma_hat": 0.6, "true_friction": 0.35, "steer_command": 0.05},
     {"beta_hat": 0.02, "gamma_hat": 0.1, "true_friction": 0.3, "F_d_hat": 800.0, "speed": 12.0},
 ]
+QUICK: Any = {"controller": {"knots": 3}}  # of the stiffnesses, whose designs take seconds
 CAR = {"vehicle": "passenger-car", "reference": "limited"}
 
 
-def made(env_id: str, **env: Any) -> tuple[Any, Nmpc]:
+def made(env_id: str, horizon: float = 0.5, **env: Any) -> tuple[Any, Nmpc]:
     """(env, agent) of the true state."""
     wrapped = TruthObservation(gym.make(env_id, **env), ["friction"], STATES)
-    agent = make_agent("nmpc", wrapped, disturbance_time=0.3, grip=0.9)
+    agent = make_agent("nmpc", wrapped, horizon=horizon, disturbance_time=0.3, grip=0.9)
     assert isinstance(agent, Nmpc)
     return wrapped, agent
 
 
 def problem(agent: Nmpc, obs: np.ndarray) -> Any:
-    """(start, K, T) of an observation."""
+    """The `PredictionTask` of an observation."""
     x = obs[agent._columns].astype(np.float64)
     friction, roll = x[agent.needs.index("true_friction")], x[-3:-1]
     return _prepare_prediction(
@@ -56,11 +57,9 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
 
 
 def cost_of(agent: Nmpc, found: Any, plan: np.ndarray) -> float:
-    start, K, T = found
-    blocks = agent.design.blocks
-    all = _make_plan_batch(len(plan), blocks, 1)
+    all = _make_plan_batch(len(plan), found.blocks, 1)
     all.plans[:, 0] = plan
-    _simulate_batch(agent.design.model, start, K, T, blocks, all)
+    _simulate_batch(found, all)
     return float((all.residuals**2).sum())
 
 
@@ -76,25 +75,16 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
     plan = ca.SX.sym("plan", agent.width * len(blocks))
     residuals: dict[int, Any] = {}
     pokes = np.zeros(plan.numel())
-    start, K, T = found
-    to_casadi(simulate_plans)(
-        agent.design.model, start, K, T, blocks, plan, pokes, residuals, {}, {}
-    )
+    to_casadi(simulate_plans)(found, PlanBatch(plan, pokes, {}, residuals, {}))
     objective = ca.sumsqr(ca.vertcat(*residuals.values()))
     options = {"ipopt.print_level": 0, "print_time": False, "ipopt.max_iter": 200}
     solver = ca.nlpsol("plan", "ipopt", {"x": plan, "f": objective}, options)
     return float(solver(x0=0.0, lbx=-LIMIT, ubx=LIMIT)["f"])
 
 
-@pytest.mark.parametrize(
-    ("slide", "env_id"),
-    [
-        (0, YAW),
-        (1, AFS),
-        *(pytest.param(*each, marks=pytest.mark.long) for each in ((2, YAW), (3, AFS))),
-        *(pytest.param(i, (AFS, YAW)[i % 2], marks=pytest.mark.long) for i in range(len(SLIDES))),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("slide", range(len(SLIDES)))
+@pytest.mark.parametrize("env_id", (YAW, AFS))
 def test_ipopt_finds_nothing_much_cheaper(
     slide: int, env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,13 +92,12 @@ def test_ipopt_finds_nothing_much_cheaper(
 
     Saturated tyres and inputs make kinks and several local optima: neither always finds the best.
     """
-    env, agent = made(env_id, **CAR)
+    env, agent = made(env_id, 0.2, **CAR)
     found = problem(agent, observe(env, **({"speed": 20.0} | SLIDES[slide])))
     least = solved_by_ipopt(agent, found, monkeypatch)
     plan = np.zeros(agent.width * len(agent.design.blocks))
     zeros = cost_of(agent, found, plan)
-    start, K, T = found
-    J, _, _ = update_plan(agent.design.model, start, K, T, agent.design.blocks, plan, 8)
+    J, _, _ = update_plan(found, plan, 8)
     assert pytest.approx(cost_of(agent, found, plan), rel=1e-9) == J
     assert 1.05 * least >= J
     assert zeros >= J
@@ -137,9 +126,8 @@ def test_what_it_foresees_is_what_comes() -> None:
     obs, _ = env.reset(seed=0, options={"state": {"v_y": 0.6, "gamma": -0.3}})
     blocks = agent.design.blocks
     for _ in range(5):
-        start, K, T = problem(agent, obs)
         all = _make_plan_batch(len(blocks), blocks, 1)
-        _simulate_batch(agent.design.model, start, K, T, blocks, all)
+        _simulate_batch(problem(agent, obs), all)
         obs, _, _, _, info = env.step(all.first[:1, 0].astype(np.float32))
         foreseen = all.residuals[:2, 0] / np.sqrt(0.01) * [0.02, 0.1]
         came = [info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]]
@@ -172,9 +160,10 @@ def test_predict_reads_its_memory_alone() -> None:
     assert (once[0] == again[0]).all() and (once[1] == again[1]).all()
 
 
+@pytest.mark.long
 def test_at_the_limit_it_is_better_than_lqr() -> None:
     """Paired episodes at low friction, both knowing state and car: three standard errors."""
-    told: dict[str, Any] = {"scenario": "limit-slalom", **CAR}
+    told: dict[str, Any] = {"scenario": "limit-slalom", "options": QUICK, **CAR}
     pairs = [make_oracle(f"oracle-state-{who}", YAW, 24, **told) for who in ("lqr", "nmpc")]
     found = [evaluate_costs(*pair, range(24)) for pair in pairs]
     gap = np.log(found[0] / found[1])
@@ -183,7 +172,7 @@ def test_at_the_limit_it_is_better_than_lqr() -> None:
 
 @pytest.mark.parametrize(("steps", "count"), [(50, 15), (50, 7), (3, 15), (1, 7)])
 def test_blocks_fill_the_horizon_and_grow(steps: int, count: int) -> None:
-    blocks = make_blocks(steps, count)
+    blocks = _make_blocks(steps, count)
     assert blocks.sum() == steps and 1 <= len(blocks) <= count and (np.diff(blocks) >= -1).all()
 
 
@@ -222,8 +211,7 @@ def test_no_plan_is_dearer_than_the_regulators_own() -> None:
     plan = LIMIT * (-1.0) ** np.arange(len(blocks))
     zeros = cost_of(agent, found, np.zeros(len(blocks)))
     assert cost_of(agent, found, plan) > 2.0 * zeros
-    start, K, T = found
-    J, _, _ = update_plan(agent.design.model, start, K, T, blocks, plan, 1)
+    J, _, _ = update_plan(found, plan, 1)
     assert zeros >= J
 
 
@@ -248,9 +236,8 @@ def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
     for _ in range(250):
         obs, *_ = env.step(np.zeros(1, np.float32))
     x, motion = obs[agent._columns].astype(np.float64), env.unwrapped.motion
-    start, _, _ = _prepare_prediction(
-        agent.design, x, 0.9, np.full(2, np.nan), 0.0, agent._compute_max_moment(x[None])[0]
-    )
+    max_moment = agent._compute_max_moment(x[None])[0]
+    start = _prepare_prediction(agent.design, x, 0.9, np.full(2, np.nan), 0.0, max_moment).start
     assert abs(motion.phi) > 1e-3
     assert (start.motion.phi, start.motion.phi_dot) == pytest.approx((motion.phi, 0.0), rel=0.02)
 

@@ -1,5 +1,6 @@
 """tie-vision's controller: the published formula, the poles where they were placed, the claims."""
 
+import functools
 from typing import Any
 
 import control
@@ -10,13 +11,13 @@ import pytest
 import sideslip
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.two_dof import _compute_static_gain
-from sideslip.agents.design.pi import POLE, design_pi, make_nominal_car, sample_pi
+from sideslip.agents.design.pi import POLE, design_pi, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.vehicle.linear import make_bicycle_model
+from sideslip.envs.vehicle.linear import Bicycle, make_bicycle_model
 from sideslip.estimators import EstimateObservation
 from tests.agents.helpers import observe
 
-KMH, CAR = 1 / 3.6, make_nominal_car(COMS)
+KMH, CAR = 1 / 3.6, Bicycle(*COMS.lateral)
 
 
 @pytest.mark.smoke
@@ -40,7 +41,7 @@ def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
     m, l_f, l_r = PASSENGER_CAR.mass, PASSENGER_CAR.front_arm, PASSENGER_CAR.rear_arm
     C_f, C_r = PASSENGER_CAR.front_stiffness, PASSENGER_CAR.rear_stiffness
     speed = np.sqrt(2 * (l_r * C_r - l_f * C_f) / m)
-    assert np.isfinite(_compute_static_gain(make_nominal_car(PASSENGER_CAR), float(speed)))
+    assert np.isfinite(_compute_static_gain(Bicycle(*PASSENGER_CAR.lateral), float(speed)))
 
 
 @pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
@@ -113,6 +114,7 @@ def test_sampling_fast_gives_the_continuous_design() -> None:
         assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
 
 
+@functools.cache
 def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> Any:
     env: gym.Env[Any, Any] = gym.make("sideslip/YawVision-v0", scenario=scenario, control_period=1)
     if estimator:
@@ -120,6 +122,7 @@ def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> A
     return sideslip.rollout(env, make_agent(agent, env, **options), seed=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scenario", "limit"), [("tie-vision-fig8", 0.40), ("tie-vision-fig8-stiff", 0.55)]
 )

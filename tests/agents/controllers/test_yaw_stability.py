@@ -8,11 +8,11 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.yaw_stability import (
+    BicyclePlant,
     SlidingMode,
     _compute_surface_slope,
     _compute_yaw_gains,
 )
-from sideslip.agents.design.pi import BicyclePlant
 from sideslip.envs import COMS, PASSENGER_CAR, critical_speed
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation

@@ -159,10 +159,7 @@ BAD: dict[str, tuple[Edit, str]] = {
     "missing tensor": (lambda t, m, c: t.pop("weight_1"), r"missing tensors: \['weight_1'\]"),
     "extra tensor": (lambda t, m, c: t.update(more=t["mean"]), r"unexpected ones: \['more'\]"),
     "wrong shape": (lambda t, m, c: t.update(weight_0=np.zeros((8, 4), np.float32)), SHAPE),
-    "wrong type": (
-        lambda t, m, c: t.update(bias_0=np.zeros(8)),
-        TYPE,
-    ),
+    "wrong type": (lambda t, m, c: t.update(bias_0=np.zeros(8)), TYPE),
     "NaN": (lambda t, m, c: t["weight_1"].put(0, np.nan), "weights of layer 1: 1 are not finite"),
     "infinite bias": (lambda t, m, c: t["bias_2"].fill(np.inf), "biases of layer 2: 1 are not"),
     "NaN mean": (lambda t, m, c: t["mean"].fill(np.nan), "mean: 3 are not finite"),
@@ -188,10 +185,7 @@ BAD_NETWORKS: dict[str, tuple[dict[str, Any], str]] = {
     "cells": ({"cells": [["rnn", 3]]}, "pairs of gru, lstm and"),
     "cell of no size": ({"cells": [["gru", -3]]}, "pairs of gru"),
     "cell of text": ({"cells": "gru"}, "pairs of gru"),
-    "no times": (
-        {"cells": [["traces", 5, 2]]},
-        NO_TIMES,
-    ),
+    "no times": ({"cells": [["traces", 5, 2]]}, NO_TIMES),
     "times of text": ({"cells": [["traces", 5, 2, ["3"]]]}, "or traces with units"),
     "no traces": ({"cells": [["traces", 5, 2, [3, 10.0]]]}, MISSING_TRACES),
     "no cell": ({"cells": [["gru", 3]]}, r"missing tensors: \['cell_0_bias_in'"),

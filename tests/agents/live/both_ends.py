@@ -15,9 +15,9 @@ from sideslip.agents.live.messages import (
     TICK_US,
     Arrival,
     DatagramKind,
+    Message,
     StreamSynchroniser,
     Tick,
-    encode,
 )
 from sideslip.agents.live.simulate import _WireAgent, simulate
 from sideslip.agents.rollout import Rollout
@@ -56,6 +56,10 @@ def drive(
         thread.join(20.0)
         assert not thread.is_alive() and loop.ended == "the drive is over"
     return found, wires, loop
+
+
+def encode(kind: int, sequence: int, stamp: int, values: Any, names: Any = ()) -> bytes:
+    return Message(kind, sequence, stamp, values, names).encode()
 
 
 def inertial(number: int, sequence: int | None = None, gyro: float = 0.0) -> Arrival:

@@ -14,9 +14,7 @@ from sideslip.agents.live.controller import (
     _ITEM,
     OnboardController,
     Recorder,
-    read_blocks,
-    read_setup,
-    replay,
+    Session,
 )
 from sideslip.agents.live.messages import PATIENCE
 from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
@@ -50,8 +48,8 @@ def driven(request: Any, tmp_path_factory: Any) -> tuple[Path, Any, int | None]:
 
 def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> None:
     path, estimates, patience = driven
-    found = replay(path, onboard(), patience)
-    assert found.same and read_setup(path) == SETUP
+    found = Session(path).replay(onboard(), patience)
+    assert found.same and Session(path).setup == SETUP
     assert np.array_equal(np.hstack([found.x, found.std]), estimates)
     assert len(set(found.ticks.tolist())) == len(estimates) >= 500
 
@@ -61,20 +59,20 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
 ) -> None:
     path, estimates, patience = driven
     data, cut = path.read_bytes(), tmp_path / "cut.session"
-    blocks, car, lengths = list(read_blocks(path)), onboard(), set()
+    blocks, car, lengths = list(Session(path).blocks), onboard(), set()
     assert len(blocks) >= 5
     beginning = data.index(b"BLOK")
     for size in [*range(beginning, len(data), len(data) // 23), len(data) - 1]:
         cut.write_bytes(data[:size])
-        found = replay(cut, car, patience)
+        found = Session(cut).replay(car, patience)
         assert found.same and len(found.ticks) < len(estimates)
         assert np.array_equal(np.hstack([found.x, found.std]), estimates[: len(found.ticks)])
-        lengths.add(len(list(read_blocks(cut))))
+        lengths.add(len(list(Session(cut).blocks)))
     assert lengths <= set(range(len(blocks))) and len(lengths) > 3
     for size in range(beginning):
         cut.write_bytes(data[:size])
         with pytest.raises(ValueError, match="no session"):
-            read_setup(cut)
+            assert Session(cut).setup
 
 
 def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
@@ -85,9 +83,9 @@ def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
     data[len(data) // 2] ^= 1
     damaged = tmp_path / "damaged.session"
     damaged.write_bytes(data)
-    assert 0 < len(replay(damaged, onboard(), patience).ticks) < len(estimates)
+    assert 0 < len(Session(damaged).replay(onboard(), patience).ticks) < len(estimates)
     other = OnboardController(*contestant(STEERING, "exact-kf", "lqr"), SEED)
-    assert not replay(path, other, patience).same
+    assert not Session(path).replay(other, patience).same
 
 
 @pytest.mark.parametrize("items", [_ITEM.pack(7, 1) + b"a", _ITEM.pack(0, 9) + b"a", b"abc"])
@@ -97,7 +95,7 @@ def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: by
     Recorder(path, {}).close()
     with path.open("ab") as file:
         file.write(_BLOCK.pack(_BLOCK_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
-    assert list(read_blocks(path)) == []
+    assert list(Session(path).blocks) == []
 
 
 @pytest.mark.parametrize(
@@ -108,7 +106,7 @@ def test_what_a_setup_lacks_is_named(tmp_path: Path, change: Any, what: str) -> 
     setup = SETUP | change if change else {k: v for k, v in SETUP.items() if k != "seed"}
     Recorder(path, setup).close()
     with pytest.raises(ValueError, match=f"its setup lacks {what}, or has it of another type"):
-        read_setup(path)
+        assert Session(path).setup
 
 
 def test_a_session_is_never_overwritten(tmp_path: Path) -> None:
@@ -125,7 +123,7 @@ def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
     recorder = Recorder(path, SETUP)
     for i in range(3 * controller.MAX_BATCHES + 7):
         recorder.take([bytes([i % 256])])
-    batches = [batch for block in read_blocks(path) for batch in block.batches]
+    batches = [batch for block in Session(path).blocks for batch in block.batches]
     assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]
     recorder.close()
-    assert sum(len(block.batches) for block in read_blocks(path)) == 307
+    assert sum(len(block.batches) for block in Session(path).blocks) == 307

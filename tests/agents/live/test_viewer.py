@@ -18,8 +18,9 @@ from rich.console import Console
 pytest.importorskip("aiohttp")
 
 from sideslip.agents.live.loop import LOOPBACK, Port
-from sideslip.agents.live.messages import DatagramKind, LoopStatus, encode
+from sideslip.agents.live.messages import DatagramKind, LoopStatus
 from sideslip.agents.live.viewer import Viewer, _make_event, _make_table, _ViewerProtocol
+from tests.agents.live.both_ends import encode
 
 NAMES = ("beta", "gamma", "F_d")
 STATUS = LoopStatus(ticks=1000.0, misses=3.0, held=2.0, bad=5.0, lost=1.0, deadlines=998.0)
@@ -33,7 +34,7 @@ def send(port: Port, to: Any, samples: int = 50) -> None:
     port.send(to, DatagramKind.STATUS, 0, STATUS)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
     with Viewer("<b>mine</b>", (LOOPBACK, 0), screen=False) as found, Port() as port:
         send(port, found.address)

@@ -8,9 +8,9 @@ import pytest
 @pytest.fixture(autouse=True, scope="module")
 def small() -> Iterator[None]:
     torch = pytest.importorskip("torch")
-    callbacks = pytest.importorskip("sideslip.agents.training.callbacks", exc_type=ImportError)
+    trainer = pytest.importorskip("sideslip.agents.training.trainer", exc_type=ImportError)
     threads = torch.get_num_threads()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callbacks, "_SCALING_ENVS", 8)
+        patch.setattr(trainer, "_SCALING_ENVS", 8)
         yield
     torch.set_num_threads(threads)

@@ -30,7 +30,6 @@ from sideslip.agents.training.config import (
     TrainingTask,
     _check_settings,
     get_algorithm,
-    make_model_options,
     read_settings,
 )
 
@@ -39,15 +38,16 @@ ROLLOUT, VISION = 128, "sideslip/YawVision-v0"
 EACH = RunOptions(eval_freq=ROLLOUT)
 
 
-def tiny(algo: str, **more: Any) -> TrainingTask:
-    """Eight environments, rollouts of 128 steps or fewer that divide them, small buffers."""
-    settings = read_settings(algo, VISION)
+def tiny(algo: str) -> TrainingTask:
+    """Rollouts of 128 steps or fewer that divide them, of few environments, and small buffers."""
+    settings, n_envs = read_settings(algo, VISION), 8
     settings |= {name: value for name, value in SMALL.items() if name in settings}
     settings |= {"train_freq": 16, "gradient_steps": 4} if "train_freq" in settings else {}
     scenario: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
     if "compile" in settings:  # on tensors a tick costs a thousand small operations
-        settings["compile"], scenario["control_period"] = False, 2
-    return TrainingTask(VISION, algo, "", scenario, 3, 8, settings=settings | more, n_eval_envs=4)
+        settings |= {"compile": False, "n_steps": 4}
+        scenario["control_period"], n_envs = 2, 32
+    return TrainingTask(VISION, algo, "", scenario, 3, n_envs, settings=settings, n_eval_envs=4)
 
 
 def tensors(model: Any) -> dict[str, Any]:
@@ -66,20 +66,22 @@ def tensors(model: Any) -> dict[str, Any]:
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """(task, folder, result) of two rollouts."""
     task, folder = tiny(request.param), tmp_path_factory.mktemp(request.param)
-    return task, folder, trainer.train(task, 2 * ROLLOUT, folder, run_options=EACH)
+    return task, folder, trainer.Trainer(task, 2 * ROLLOUT, folder, run_options=EACH).train()
 
 
 def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
     """Weights, the optimiser's moments, the step size, the count, the evaluations."""
     task, folder, first = trained
-    again = trainer.train(task, 2 * ROLLOUT, folder, resume=True)  # there is nothing to do
+    again = trainer.Trainer(
+        task, 2 * ROLLOUT, folder, resume=True
+    ).train()  # there is nothing to do
     assert again.evaluations == first.evaluations
     one, other = tensors(first.model), tensors(again.model)
     assert one.keys() == other.keys() and len(one) > 30
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert any("log_ent_coef" in name for name in one) == (task.algo in ("sac", "tqc"))
     before = {name: value.clone() for name, value in other.items()}
-    more = trainer.train(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH)
+    more = trainer.Trainer(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH).train()
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4]
     assert more.evaluations[:3] == first.evaluations
     assert more.model.num_timesteps == 4 * ROLLOUT
@@ -116,7 +118,7 @@ def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
 
 def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
     task, _, first = trained
-    here = trainer.train(task, 2 * ROLLOUT, tmp_path, run_options=EACH)
+    here = trainer.Trainer(task, 2 * ROLLOUT, tmp_path, run_options=EACH).train()
     assert [each.cost for each in here.evaluations] == [each.cost for each in first.evaluations]
     one, other = tensors(first.model), tensors(here.model)
     assert all(torch.equal(one[name], other[name]) for name in one)
@@ -125,21 +127,21 @@ def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the step; the checkpoint is that of the last evaluation."""
-    models, real = list[Any](), trainer.EvalCallback.build
+    built, real = list[Any](), trainer.Trainer.build
 
-    def built(*arguments: Any) -> Any:
-        models.append(real(*arguments))
-        return models[0]
+    def build(self: Any) -> Any:
+        built.append(real(self))
+        return built[0]
 
     def spoil(now: Progress) -> None:
         if now.steps == 2 * ROLLOUT:
             with torch.no_grad():
-                next(models[0].policy.parameters()).fill_(float("nan"))
+                next(built[0].model.policy.parameters()).fill_(float("nan"))
 
-    monkeypatch.setattr(trainer.EvalCallback, "build", built)
+    monkeypatch.setattr(trainer.Trainer, "build", build)
     means = RunOptions(eval_freq=ROLLOUT, report=spoil)
     with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
-        trainer.train(tiny(algo), 4 * ROLLOUT, tmp_path, run_options=means)
+        trainer.Trainer(tiny(algo), 3 * ROLLOUT, tmp_path, run_options=means).train()
     assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT
 
 
@@ -195,13 +197,15 @@ def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: 
 
 def test_a_batch_divides_a_rollout_where_there_is_one() -> None:
     """n_steps of sac and tqc is that of returns, and a batch is drawn from the buffer."""
-    ppo = make_model_options("ppo", {"n_steps": 3, "batch_size": 256}, 0.01, 64)
-    assert ppo["batch_size"] == 192
-    replayed = {"n_steps": 3, "batch_size": 256}
-    assert make_model_options("sac", replayed, 0.01, 64)["batch_size"] == 256
+    settings = TrainingTask().settings | {"n_steps": 3, "batch_size": 256}
+    task = TrainingTask(num_envs=64, settings=settings)
+    assert task.make_model_options(0.01)["batch_size"] == 192
+    replayed = TrainingTask(algo="sac").settings | {"n_steps": 3, "batch_size": 256}
+    task = TrainingTask(algo="sac", num_envs=64, settings=replayed)
+    assert task.make_model_options(0.01)["batch_size"] == 256
     settings = TrainingTask().settings
     for num_envs in (1, 7, 100, 256, 1000):
-        told = make_model_options("ppo", settings, 0.02, num_envs)
+        told = TrainingTask(num_envs=num_envs).make_model_options(0.02)
         assert num_envs * told["n_steps"] % told["batch_size"] == 0
         assert told["batch_size"] <= settings["batch_size"]
         assert told["gamma"] == pytest.approx(settings["gamma"] ** 2, rel=1e-12)  # longer period

@@ -30,10 +30,11 @@ STIFF = {"base": "coms-slalom", "duration": 2.5, "rear_stiffness": 0.6, "front_s
 DRIVE: tuple[str, dict[str, Any]] = ("sideslip/YawFusion-v0", {"scenario": STIFF})
 
 
+@pytest.mark.long
 def test_it_learns_what_the_filter_lacks_and_says_how_well() -> None:
     """Of tyres that never vary and a filter that is told others: most of its error, on seeds that
     it has not seen, with intervals that hold what they promise."""
-    found = train_correction(CARD, [DRIVE], episodes=16, epochs=150)
+    found = train_correction(CARD, [DRIVE], episodes=12, epochs=60)
     quality = _compute_quality(found, _collect_samples(found, [DRIVE], _FIRST_ROUND[:1], 7, 32))
     assert quality["rmse"] < 0.7 * quality["filter_rmse"]
     assert 0.85 < quality["coverage"] <= 1.0

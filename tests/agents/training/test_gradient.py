@@ -10,7 +10,6 @@ pytest.importorskip("stable_baselines3")
 import torch
 
 from sideslip.agents.learned.policy import PolicyController, load_policy
-from sideslip.agents.training.callbacks import EvalCallback, RunOptions
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.gradient import (
     AnalyticPolicyGradient,
@@ -19,11 +18,12 @@ from sideslip.agents.training.gradient import (
     _unroll_window,
 )
 from sideslip.agents.training.normalise import RewardScale
+from sideslip.agents.training.trainer import Trainer
 from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import make_device_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
-SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.03}, "control_period": 2}
+SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.016}, "control_period": 2}
 
 
 def cars_of(count: int, **options: Any) -> Any:
@@ -70,12 +70,12 @@ def test_the_slope_is_that_of_the_cost() -> None:
     """Along random directions of all weights, by central differences, over episodes' ends."""
     cars, weights = cars_of(3), torch.tensor([1e3, 2e3, 500.0], dtype=torch.float64)
     policy = policy_of(cars)
-    steps = 20  # an episode has 15
+    steps = 10  # an episode has 8
     parts = list(policy.parameters())
     paid_by(policy, cars, weights, steps)[0].backward()
     slopes = [each.grad.clone() for each in parts]
     generator = torch.Generator().manual_seed(1)
-    for _ in range(3):
+    for _ in range(2):
         way = [torch.randn(each.shape, generator=generator).double() for each in parts]
         costs = []
         for size in (1e-5, -1e-5):
@@ -102,8 +102,8 @@ def test_a_car_of_weight_zero_teaches_nothing() -> None:
 def test_where_an_episode_ends_the_memory_does_too() -> None:
     cars = cars_of(1)
     policy, ones = policy_of(cars), torch.ones(1, dtype=torch.float64)
-    assert paid_by(policy, cars, ones, 14)[2].abs().min() > 0.0
-    assert (paid_by(policy, cars, ones, 15)[2] == 0.0).all()
+    assert paid_by(policy, cars, ones, 7)[2].abs().min() > 0.0
+    assert (paid_by(policy, cars, ones, 8)[2] == 0.0).all()
 
 
 CAR = {"vehicle": "passenger-car", "nominal": "passenger-car", "reference": "lagged"}
@@ -125,14 +125,14 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
         obs, _ = cars.reset(seed=[0])
         start = policy._begin(1).double()
         paid, *_ = _unroll_window(
-            policy, cars, obs, start, RewardScale([rates]), 20
-        )  # an episode has 15
+            policy, cars, obs, start, RewardScale([rates]), 10
+        )  # an episode has 8
         parts.append(paid.item())
     assert min(parts) > 0.0 and parts[2] == pytest.approx(parts[0] + parts[1], rel=1e-6)
 
 
 def begun(task: TrainingTask, folder: Path) -> Any:
-    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build()
+    return Trainer(task, 1, folder, trained_agent=load_policy("raw-car-yaw")).build().model
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:

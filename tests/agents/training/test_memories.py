@@ -20,7 +20,7 @@ from sideslip.agents.training.recurrent import (
     _MemoryAgent,
     train_memory,
 )
-from sideslip.agents.training.student import DistillConfig, normalise_inputs
+from sideslip.agents.training.student import DistillConfig, Scaling
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90
 CAMERA = {"period": 0.04, "delays": [0.03], "loss": 0.3}
@@ -75,7 +75,7 @@ def test_windows_and_single_steps_are_the_whole(name: str) -> None:
 
 def test_an_episode_begins_without_the_last_ones_memory(name: str) -> None:
     model, z = made(name)
-    agent, x = _MemoryAgent(model, np.zeros(INPUTS), np.ones(INPUTS)), z.numpy()
+    agent, x = _MemoryAgent(model, Scaling(np.zeros(INPUTS), np.ones(INPUTS))), z.numpy()
     state = None
     for t in range(20):
         _, state = agent.predict(x[:, t], state, np.zeros(2, bool))
@@ -109,8 +109,8 @@ def test_inputs_are_whitened() -> None:
     seen = [_collect_demonstrations(mine, None, range(CARS), 0.3)]
     inputs = len(mine.cars.layout)
     model = MEMORIES["mlp"](inputs, inputs - 1, 0)
-    mean, scale, _ = model.fit_scaling(seen, mine.cars.layout, mine.teacher.needs)
-    z = normalise_inputs(seen[0].obs, mean, scale).reshape(-1, inputs) @ model.mix.numpy()
+    scaling = model.fit_scaling(seen, mine.cars.layout, mine.teacher.needs)
+    z = scaling.mix_inputs(seen[0].obs).reshape(-1, inputs) @ model.mix.numpy()
     spread = np.linalg.eigvalsh(np.cov(z.T))
     assert spread.max() == pytest.approx(1.0, abs=1e-3)
     assert np.sum(spread > 0.99) == inputs - 2  # both torques, and both angles, are one
@@ -148,7 +148,7 @@ def test_a_memory_comes_nearer_to_the_filter() -> None:
     assert [each.steps for each in rounds] == [CARS * 100, 2 * CARS * 100]
     ours, idle = (
         np.square(_collect_demonstrations(lesson(), each, range(CARS), 0.0).labels).sum()
-        for each in (agent, _MemoryAgent(_still(agent.model), agent.mean, agent.scale))
+        for each in (agent, _MemoryAgent(_still(agent.model), agent.scaling))
     )
     assert ours < 0.7 * idle  # what remains to be done about the car
 

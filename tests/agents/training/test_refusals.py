@@ -12,15 +12,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.learned.policy import Card, load_policy
-from sideslip.agents.training import trainer
-from sideslip.agents.training.callbacks import EvalCallback, RunOptions
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.corrections import train_correction
 from sideslip.agents.training.distill import DistillTask, distill
 from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.normalise import measure_scaling
 from sideslip.agents.training.recurrent import train_memory
 from sideslip.agents.training.student import DistillConfig
+from sideslip.agents.training.trainer import CHECKPOINT, Trainer, _measure_scaling
 from sideslip.agents.training.warm_start import make_finetune_task
 from sideslip.agents.vec_env import make_vec_env
 from tests.agents.training.test_corrections import CARD, DRIVE
@@ -28,7 +26,7 @@ from tests.agents.training.test_distill import COURSE, ID, OPTIONS
 from tests.agents.training.test_distill import lesson as distilled
 from tests.agents.training.test_gradient import made, tuned_task
 from tests.agents.training.test_memories import lesson
-from tests.agents.training.test_trained_agent import TASK, foreign
+from tests.agents.training.test_starts import TASK, foreign
 
 VISION = "sideslip/YawVision-v0"
 TINY = TrainingTask(num_envs=8, seed=3, n_eval_envs=4)
@@ -54,7 +52,7 @@ def mixture(message: str, *scenarios: Any) -> Refusal:
 
 
 def training(message: str, *arguments: Any, steps: int = 10, **wrong: Any) -> Refusal:
-    return lambda folder: trainer.train(TrainingTask(*arguments, **wrong), steps, folder), message
+    return lambda folder: Trainer(TrainingTask(*arguments, **wrong), steps, folder).train(), message
 
 
 def settings(message: str, algo: str, activation: str) -> Refusal:
@@ -68,12 +66,11 @@ def finetuned(message: str, policy: Any, algo: str = "ppo") -> Refusal:
 
 def started(message: str, policy: Any, make: Callable[[], TrainingTask]) -> Refusal:
     """Before anybody drives."""
-    begin = RunOptions(), 16, policy
-    return lambda folder: EvalCallback(make(), folder, None, *begin).build(), message
+    return lambda folder: Trainer(make(), 16, folder, trained_agent=policy).train(), message
 
 
 def scaled(message: str, *reads: str) -> Refusal:
-    return lambda _: measure_scaling(TrainingTask().vector_env(4), 0.4, 5, reads), message
+    return lambda _: _measure_scaling(TrainingTask(reads=list(reads))), message
 
 
 def taught(message: str, *lessons: Any, **wrong: Any) -> Refusal:
@@ -97,8 +94,8 @@ def memory(message: str, name: str, fresh: bool = True) -> Refusal:
     return train, message
 
 
-def normalised_twice(_: Path) -> None:
-    model = trainer.EvalCallback(TINY, Path(), None, RunOptions()).build()
+def normalised_twice(folder: Path) -> None:
+    model = Trainer(TINY, 1, folder).build().model
     convert_sb3_policy(model, VecNormalize(make_vec_env(TINY.env_id, 2)))
 
 
@@ -110,13 +107,13 @@ REFUSED: dict[str, Refusal] = {
     "negative seed": config("1 at least", seed=-1),
     "rate": config("learning_rate", learning_rate=float("nan")),
     "noise": config("learning_rate is above zero, noise", noise=-0.1),
-    "told": config("noise and told not below", told=-1.0),
+    "told": config("noise and told not below", auxiliary_weight=-1.0),
     "batch": config("1 at least", batch=0),
-    "told without memory": config("nothing to say", told=1.0, cells=0),
+    "told without memory": config("nothing to say", auxiliary_weight=1.0, cells=0),
     "negative traces": config("cells, traces and seed 0", traces=-1),
     "cells and traces": config("cells or traces, got 3 and 4", traces=4, cells=3),
     "no lessons": taught("no lessons"),
-    "nothing to tell": taught("nothing is left to be told", seeing, told=0.5),
+    "nothing to tell": taught("nothing is left to be told", seeing, auxiliary_weight=0.5),
     "unknown memory": memory("unknown memory 'lstm'; known: mlp, frames, gru", "lstm"),
     "no packets": memory("one sensor with packets, got 0", "gru", fresh=False),
     "no drives": (lambda _: train_correction(CARD, []), "0 drives, 32 episodes, 20 epochs"),
@@ -189,8 +186,8 @@ def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
 
     def refuse(kind: Any, said: str, start: Any = zipped, of: Any = TASK, **more: Any) -> None:
         with pytest.raises(kind, match=said):
-            trainer.train(of, 128, folder, trained_agent=start, **more)
-        assert not (folder / trainer.CHECKPOINT).exists()
+            Trainer(of, 128, folder, trained_agent=start, **more).train()
+        assert not (folder / CHECKPOINT).exists()
 
     refuse(PermissionError, "vecnormalize.pkl is a pickle.*--trust")
     refuse(FileNotFoundError, "none.zip: no such file", tmp_path / "none.zip")

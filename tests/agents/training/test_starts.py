@@ -5,17 +5,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3")
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sideslip.agents.learned.policy import Policy, load_policy
+from sideslip.agents.learned.policy import Card, Policy, load_policy
 from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
-from sideslip.agents.training import callbacks
 from sideslip.agents.training.callbacks import (
+    BEST,
     CHECKPOINT,
     WARM_START_FILE,
     EvalCallback,
@@ -24,14 +27,16 @@ from sideslip.agents.training.callbacks import (
     _make_evaluation_seeds,
 )
 from sideslip.agents.training.config import HYPERPARAMS, TrainingTask
-from sideslip.agents.training.normalise import (
-    RewardScale,
-    RewardScaleWrapper,
-    measure_reward_scale,
-)
-from sideslip.agents.training.trainer import load_initial_policy, read_task, train
+from sideslip.agents.training.export import convert_sb3_policy
+from sideslip.agents.training.normalise import CLIP, RewardScale, RewardScaleWrapper
+from sideslip.agents.training.student import DistillConfig, Scaling, Student
+from sideslip.agents.training.trainer import Trainer, _measure_reward_scale, read_training
 from sideslip.agents.training.warm_start import (
+    WarmStart,
+    _measure_whitening,
+    _MemoryObservation,
     _NetworkAgent,
+    _replace_first_layer,
     make_finetune_task,
     resolve_settings,
 )
@@ -45,7 +50,7 @@ FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
 
 
 def started(task: TrainingTask, folder: Path, policy: Policy = POLICY) -> Any:
-    return EvalCallback(task, folder, None, RunOptions(), 16, policy).build()
+    return Trainer(task, 16, folder, trained_agent=policy).build()
 
 
 def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
@@ -66,7 +71,7 @@ def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
 
 def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
     task = make_finetune_task(POLICY, **FEW)
-    model, env = started(task, tmp_path), task.vector_env(4)
+    model, env = started(task, tmp_path).model, task.vector_env(4)
     obs, _ = env.reset(seed=0)
     for _ in range(20):
         actions, _ = _NetworkAgent(POLICY.network).predict(obs)
@@ -93,7 +98,7 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
         options = task.options(4)
         return make_vec_env(task.env_id, 4, estimator=task.estimator_kwargs, env_kwargs=options)
 
-    table = measure_reward_scale(driver, cars(), 7, 100)  # an episode has 30
+    table = _measure_reward_scale(driver, cars(), 7, 100)  # an episode has 30
     assert all(len(each) == 4 for each in table) and len({x for row in table for x in row}) == 12
     rated, state = RewardScaleWrapper(cars(), RewardScale(table)), None
     rated.seed(7)
@@ -110,24 +115,31 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
     assert paid == pytest.approx(30.0 * costs / (costs + COST_FLOOR), rel=1e-4)
 
 
-@pytest.mark.parametrize("algo, name", [("ppo", "distill-coms-yaw"), ("gradient", "raw-car-yaw")])
-@pytest.mark.parametrize("steps", [0, 96])
+@pytest.mark.parametrize(
+    "algo, name, steps",
+    [
+        ("ppo", "distill-coms-yaw", 0),
+        ("ppo", "distill-coms-yaw", 96),
+        ("gradient", "raw-car-yaw", 96),
+    ],
+)
+@torch.no_grad()
 def test_what_a_training_drives_is_what_the_policy_drove(
     algo: str, name: str, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Driven by the policy, each drive of the training's own cars is paid -1 a step in the mean."""
-    policy = load_policy(name)
+    policy, length = load_policy(name), 30 if algo == "ppo" else 6  # tensors cost much more
     car = {name: x for name, x in policy.card.env_options.items() if name != "scenario"}
     base = "coms-slalom" if algo == "ppo" else "car-step"
-    options = car | {"scenario": {"base": base, "duration": 0.3}}
+    options = car | {"scenario": {"base": base, "duration": 0.01 * length}}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
     task = make_finetune_task(policy, algo=algo, **more)
-    monkeypatch.setattr(callbacks, "_load_parameters", lambda *_: None)
-    network, saved = policy.network, None
+    network, training = policy.network, Trainer(task, 400, tmp_path, trained_agent=policy)
     if steps:
+        monkeypatch.setattr(EvalCallback, "load_parameters", lambda _: None)
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-        saved = {"steps": steps, "scaling": scaling, "evaluations": []}
-    model: Any = EvalCallback(task, tmp_path, saved, RunOptions(), 400, policy).build()
+        training._state = {"steps": steps, "scaling": scaling, "evaluations": []}
+    model: Any = training.build().model
     driver, cars = _NetworkAgent(network), model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
     if algo == "gradient":
@@ -136,7 +148,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
         rates.begin()
     else:
         obs = cars.reset()
-    for step in range(60):  # two drives
+    for step in range(2 * length):
         actions, state = driver.predict(np.asarray(obs), state, start)
         if algo == "gradient":
             obs, rewards, start, truncated, _ = tensors.step(torch.from_numpy(actions))
@@ -148,28 +160,29 @@ def test_what_a_training_drives_is_what_the_policy_drove(
             obs, rewards, start, infos = cars.step(actions)
             paid -= rewards
             costs = np.array([-i["episode"]["r"] for i in infos]) if start.all() else costs
-        if step % 30 == 29:
-            assert start.all() and paid == pytest.approx(
-                30.0 * costs / (costs + COST_FLOOR), rel=3e-3
-            )
+        if step % length == length - 1:
+            expected = length * costs / (costs + COST_FLOOR)
+            assert start.all() and paid == pytest.approx(expected, rel=3e-3)
             paid, costs = np.zeros(4), np.zeros(4)
 
 
+@pytest.mark.long
 def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None:
     """Else a drive would have another drive's weight: episode after episode, on tensors too."""
-    task = make_finetune_task(POLICY, **FEW | {"estimator": "", "estimator_options": {}})
+    short = {"env_options": COMS | {"scenario": {"base": "coms-slalom", "duration": 0.05}}}
+    task = make_finetune_task(POLICY, **FEW | short | {"estimator": "", "estimator_options": {}})
     firsts = []
     for action in (0.0, 1.0):
         env: Any = task.vector_env(2)
         obs, _ = env.reset(seed=[5, 6])
-        for _ in range(60):
+        for _ in range(10):  # two drives
             obs, *_ = env.step(np.full((2, 1), action, np.float32))
         firsts.append(obs)
     assert np.array_equal(*firsts)
     how = {"autoreset_mode": "SameStep", "dtype": "float32", **task.env_options}
     cars: Any = make_device_env(task.env_id, 2, **how)
     seen, _ = cars.reset(seed=[5, 6])
-    for _ in range(60):
+    for _ in range(10):
         seen, *_ = cars.step(torch.zeros(2, 1))
     assert np.abs(seen.numpy() - firsts[0]).max() < 1e-5
 
@@ -177,7 +190,8 @@ def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None
 def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     settings = make_finetune_task(POLICY).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
     task = make_finetune_task(POLICY, settings=settings, **FEW)
-    found = train(task, 64, tmp_path, run_options=RunOptions(eval_freq=32), trained_agent=POLICY)
+    options = RunOptions(eval_freq=32)
+    found = Trainer(task, 64, tmp_path, run_options=options, trained_agent=POLICY).train()
     first = found.evaluations[0]
     assert first.of_start == pytest.approx(1.0, abs=1e-6) and found.best.of_start == min(
         each.of_start or np.inf for each in found.evaluations
@@ -191,21 +205,21 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     )
     ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
-    assert ratio != 1.0 and read_task(tmp_path) == task
-    again = train(task, 96, tmp_path, resume=True)
+    assert ratio != 1.0 and read_training(tmp_path).task == task
+    again = Trainer(task, 96, tmp_path, resume=True).train()
     card = load_policy(tmp_path / "policy.safetensors").card
     assert card.algorithm_options["begun_with"] == "distill-coms-yaw"
-    assert load_initial_policy(tmp_path) is not None
+    assert read_training(tmp_path).load_initial_policy() is not None
     assert again.evaluations[: len(found.evaluations)] == found.evaluations
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["of_start"] == first.of_start
     (tmp_path / WARM_START_FILE).rename(tmp_path / "aside")
     with pytest.raises(FileNotFoundError, match="began with policy distill-coms-yaw, and needs it"):
-        train(task, 128, tmp_path, resume=True)
+        Trainer(task, 128, tmp_path, resume=True).train()
     (tmp_path / "aside").rename(tmp_path / WARM_START_FILE)
     (tmp_path / CHECKPOINT).unlink()  # stopped before it had one: the folder begins anew
-    train(dataclasses.replace(task, settings=TrainingTask().settings), 1, tmp_path)
+    Trainer(dataclasses.replace(task, settings=TrainingTask().settings), 1, tmp_path).train()
     assert not (tmp_path / WARM_START_FILE).exists()
 
 
@@ -214,11 +228,182 @@ def test_the_best_is_that_of_the_score_not_of_the_mean(
     ratio: float, kept: bool, tmp_path: Path
 ) -> None:
     """An older evaluation is beaten by its ratio to the start, whatever its cost was."""
-    other = EvalCallback(
-        make_finetune_task(POLICY, **FEW), tmp_path, None, RunOptions(), 16, POLICY
-    )
-    other.build().set_logger(configure(None, []))
+    other = started(make_finetune_task(POLICY, **FEW), tmp_path)
+    other.model.set_logger(configure(None, []))
     cost = 0.0 if kept else 1e9
     other.evaluations.append(Evaluation(0, 0.0, cost=cost, of_none=cost, of_start=ratio))
     other.evaluate()
     assert (tmp_path / "policy.safetensors").exists() is kept
+
+
+FAST: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.3}}
+TASK = TrainingTask(num_envs=4, env_options=FAST, n_eval_envs=4)
+
+
+def observations() -> Any:
+    env = TASK.vector_env(4)
+    obs, _ = env.reset(seed=1)
+    return np.concatenate([obs, env.step(np.full((4, 1), 0.5))[0]])
+
+
+def begin(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
+    """The model before its first step."""
+    training = Trainer(TASK, 1, tmp_path / "new", trained_agent=zipped, trust=trust)
+    return training.build().model
+
+
+def foreign(path: Path, normalised: bool, **options: Any) -> Any:
+    """A zip as rl-baselines3-zoo leaves it, and what acts in it."""
+    env: Any = make_vec_env(TASK.env_id, 2, env_kwargs=FAST)
+    if normalised:
+        env = VecNormalize(env)
+    model = PPO("MlpPolicy", env, device="cpu", seed=1, n_steps=32, batch_size=64, **options)
+    model.learn(64)
+    model.save(path)
+    if normalised:
+        env.save(path.with_name("vecnormalize.pkl"))
+    return lambda x: model.predict(env.normalize_obs(x) if normalised else x, deterministic=True)[0]
+
+
+def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
+    first = Trainer(TASK, 128, tmp_path / "first").train().model
+    model = begin(tmp_path, tmp_path / "first" / BEST)
+    assert model.num_timesteps == 0
+    one, other = first.policy.state_dict(), model.policy.state_dict()
+    best = PPO.load(tmp_path / "first" / BEST, device="cpu").policy.state_dict()
+    assert one.keys() == other.keys()
+    assert all(torch.equal(best[name], other[name]) for name in best)
+    assert float(other["features_extractor.clip"]) == CLIP
+    start = tmp_path / "first" / BEST
+    done = Trainer(TASK, 128, tmp_path / "on", trained_agent=start).train()
+    assert done.model.num_timesteps == 128
+    again = Trainer(TASK, 256, tmp_path / "on", resume=True).train().model
+    name = "features_extractor.mean"  # the scaling is the zip's still
+    assert torch.equal(again.policy.state_dict()[name], other[name])
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_a_zip_from_elsewhere_acts_as_it_did(normalised: bool, tmp_path: Path) -> None:
+    acts = foreign(tmp_path / "model.zip", normalised)
+    model = begin(tmp_path, tmp_path / "model.zip", trust=True)
+    x = observations()
+    assert np.ptp(acts(x)) > 1e-4
+    if normalised:  # what hardly varied in training is not read, as in an export
+        scale = model.policy.state_dict()["features_extractor.scale"].numpy()
+        x[:, scale == 0.0] = model.policy.state_dict()["features_extractor.mean"].numpy()[
+            scale == 0.0
+        ]
+    assert model.predict(x, deterministic=True)[0] == pytest.approx(acts(x), abs=1e-6)
+
+
+ID = "sideslip/YawFusion-v0"
+OPTIONS: dict[str, Any] = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
+OPTIONS |= {"scenario": {"base": "coms-slalom", "duration": 0.3}}
+STEPS = 30  # of an episode
+
+
+def cars(count: int) -> Any:
+    return gym.make_vec(ID, num_envs=count, autoreset_mode="SameStep", info="ends", **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    """Random weights: it acts in some way that what is remembered decides."""
+    torch.manual_seed(0)
+    card, rng = Card.from_env_id(ID, OPTIONS), np.random.default_rng(0)
+    wide = len(card.observation)
+    scaling = Scaling(rng.normal(size=wide), np.full(wide, 0.3), np.eye(wide))
+    student = Student(wide, 1, DistillConfig(traces=6, hidden=(8, 4)))
+    return Policy("traced", student.network(scaling), card)
+
+
+def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) -> None:
+    """The last one of an episode too, which the row's next episode does not see."""
+    bare, env = cars(3), _MemoryObservation(cars(3), policy.network)
+    state = np.zeros((3, policy.network.memory))
+    seen, (obs, _) = bare.reset(seed=5)[0], env.reset(seed=5)
+    ended = 0
+    for step in range(1, 2 * STEPS + 3):
+        assert obs == pytest.approx(
+            policy.network.compute_features(seen.astype(float), state), abs=1e-5
+        )
+        action = np.full((3, 1), 0.1, np.float32)
+        seen, _, _, over, bares = bare.step(action)
+        obs, _, _, same, infos = env.step(action)
+        assert np.array_equal(over, same) and obs in env.observation_space
+        if over.any():
+            last = np.stack(bares["final_obs"][over]).astype(float)
+            theirs = policy.network.compute_features(last, state[over].copy())
+            assert np.stack(infos["final_obs"][over]) == pytest.approx(theirs, abs=1e-5)
+            state[over], ended = 0.0, ended + 1
+            assert step % STEPS == 0
+    assert ended == 2
+    env.reset(seed=5)
+    first = policy.network.compute_features(bare.reset(seed=5)[0].astype(float), 0.0 * state)
+    assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
+
+
+def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None:
+    rows, mask = [_MemoryObservation(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
+    action = np.full((3, 1), 0.1, np.float32)
+    seen = []
+    for env in rows:
+        env.reset(seed=5)
+        env.step(action)
+        seen.append(env.step(action)[0])
+    before = seen[1]
+    seen[0][:] = 9.0  # whoever has an observation may write into it
+    first = rows[0].reset(seed=[None, 8, None], options={"reset_mask": mask})[0]
+    assert np.array_equal(first[~mask], before[~mask])
+    assert np.array_equal(
+        first[mask], _MemoryObservation(cars(3), policy.network).reset(seed=7)[0][mask]
+    )
+    ours, theirs = (env.step(action)[0] for env in rows)
+    assert np.array_equal(ours[~mask], theirs[~mask]) and (ours[mask] != theirs[mask]).any()
+
+
+def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
+    """And what is remembered in its own drives varies alike, mixed."""
+    net = policy.network
+    mean, mixing = _measure_whitening(cars(60), net, 3)
+    first, x = net.weights[0], np.random.default_rng(1).normal(size=(5, net.dense.inputs))
+    mixed = _replace_first_layer(net, first @ np.linalg.inv(mixing), net.biases[0] + first @ mean)
+    theirs = net.dense(x)
+    assert mixed.dense((x - mean) @ mixing) == pytest.approx(theirs, abs=1e-5)
+    assert np.abs(mixed.dense(x) - theirs).max() > 1e-3
+    env = _MemoryObservation(cars(60), net, (mean, mixing))
+    seen, (obs, _) = [], env.reset(seed=3)
+    for _ in range(STEPS):
+        seen.append(obs)
+        obs, *_ = env.step(_NetworkAgent(mixed.dense).predict(obs)[0])
+    found = np.concatenate(seen[::7])
+    assert np.abs(found.mean(0)).max() < 0.05 and np.var(found, axis=0).max() < 1.1
+
+
+def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
+    settings = make_finetune_task(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    assert settings["learning_rate"] == "lin_1e-4"  # of the entry for hundreds of inputs
+    task = make_finetune_task(policy, settings=settings, num_envs=4, n_eval_envs=4)
+    options = RunOptions(eval_freq=64)
+    found = Trainer(task, 64, tmp_path, run_options=options, trained_agent=policy).train()
+    assert found.evaluations[0].of_start == pytest.approx(1.0, abs=1e-6)
+    kept = load_policy(tmp_path / "policy.safetensors").network
+    for part in ("weight_in", "bias_in"):
+        assert np.array_equal(*(getattr(each.cells[0], part) for each in (kept, policy.network)))
+    assert np.array_equal(kept.mean, policy.network.mean)
+    begun = WarmStart(policy, task)
+    last = begun.merge_network(convert_sb3_policy(found.model))
+    seeds = _make_evaluation_seeds(4)
+    begins, ours, best = (
+        evaluate_costs(task.vector_env(4), _NetworkAgent(each), seeds)
+        for each in (policy.network, last, kept)
+    )
+    theirs = evaluate_costs(begun.wrap_env(task.vector_env(4)), found.model, seeds)
+    assert ours == pytest.approx(theirs, rel=1e-5) and ours != pytest.approx(begins, rel=1e-4)
+    first = found.best is found.evaluations[0]
+    assert best == pytest.approx(begins if first else ours, rel=1e-5)
+    layer: Any = found.model.policy.action_net
+    moved = np.abs(layer.weight.detach().numpy() - policy.network.weights[-1])
+    assert moved.max() > 1e-5 and (tmp_path / WARM_START_FILE).exists()
+    again = Trainer(task, 96, tmp_path, resume=True).train()
+    assert again.evaluations[:2] == found.evaluations and len(again.evaluations) == 3

@@ -14,6 +14,7 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 
+from sideslip import __version__
 from sideslip.agents.learned.policy import PolicyController
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs.vector import StabilityVectorEnv
@@ -25,6 +26,8 @@ from stable_baselines3 import PPO
 
 from sideslip.agents.training import callbacks, trainer
 from sideslip.agents.training.callbacks import (
+    _FORMAT,
+    _STATE,
     BEST,
     CHECKPOINT,
     CURVE,
@@ -34,9 +37,10 @@ from sideslip.agents.training.callbacks import (
     read_state,
 )
 from sideslip.agents.training.config import TrainingTask
-from sideslip.agents.training.trainer import read_task
+from sideslip.agents.training.trainer import read_training
 
-TINY = TrainingTask(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3, n_eval_envs=4)
+SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
+TINY = TrainingTask(num_envs=8, env_options=SHORT, seed=3, n_eval_envs=4)
 ROLLOUT = 256  # steps of 8 environments
 EACH = RunOptions(eval_freq=ROLLOUT)
 
@@ -45,7 +49,7 @@ EACH = RunOptions(eval_freq=ROLLOUT)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a training of three rollouts."""
     path = tmp_path_factory.mktemp("trained")
-    trainer.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
+    trainer.Trainer(TINY, 3 * ROLLOUT, path, run_options=EACH).train()
     return path
 
 
@@ -86,8 +90,8 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return reset(self, seed=seed, options=options)
 
     monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
-    trainer.train(TINY, ROLLOUT, tmp_path)
-    trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+    trainer.Trainer(TINY, ROLLOUT, tmp_path).train()
+    trainer.Trainer(TINY, 2 * ROLLOUT, tmp_path, resume=True).train()
     tested = set(callbacks._make_evaluation_seeds(4))
     others = [seed for seed in told if seed not in tested]
     assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
@@ -96,17 +100,17 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_progress_is_told_after_every_rollout(tmp_path: Path) -> None:
     told: list[Progress] = []
-    task = TrainingTask(num_envs=40, env_options=TINY.env_options, n_eval_envs=4)
-    trainer.train(task, 20 * 40 * 32, tmp_path, run_options=RunOptions(report=told.append))
-    assert [each.steps for each in told] == [40 * 32 * i for i in range(1, 21)]
+    options = RunOptions(report=told.append)
+    trainer.Trainer(TINY, 2 * ROLLOUT, tmp_path, run_options=options).train()
+    assert [each.steps for each in told] == [ROLLOUT, 2 * ROLLOUT]
     assert told[0].cost is None and told[0].evaluations[0].steps == 0
-    assert told[-1].cost is not None and told[-1].cost > 0.0  # 640 steps: episodes have 600
+    assert told[-1].cost is not None and told[-1].cost > 0.0  # 64 steps: episodes have 50
 
 
 def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trainer.train(TINY, ROLLOUT, tmp_path)
+    trainer.Trainer(TINY, ROLLOUT, tmp_path).train()
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def killed(_: int) -> None:
@@ -115,13 +119,12 @@ def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", killed)
         with pytest.raises(KeyboardInterrupt):
-            trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+            trainer.Trainer(TINY, 2 * ROLLOUT, tmp_path, resume=True).train()
     after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert after.keys() == before.keys()
     assert after[CHECKPOINT] == before[CHECKPOINT] and after[CURVE] == before[CURVE]
-    assert (
-        trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True).model.num_timesteps == 2 * ROLLOUT
-    )
+    again = trainer.Trainer(TINY, 2 * ROLLOUT, tmp_path, resume=True).train()
+    assert again.model.num_timesteps == 2 * ROLLOUT
 
 
 @pytest.mark.long
@@ -132,7 +135,7 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
         "options = {'scenario': 'sine-with-dwell'}\n"
         "task = trainer.TrainingTask(num_envs=8, env_options=options, n_eval_envs=4)\n"
         "run_options = trainer.RunOptions(eval_freq=256)\n"
-        "trainer.train(task, 10**8, sys.argv[1], len(sys.argv) > 2, run_options)\n"
+        "trainer.Trainer(task, 10**8, sys.argv[1], len(sys.argv) > 2, run_options).train()\n"
     )
     path, reached = tmp_path / CHECKPOINT, [-1]
     for wait in np.random.default_rng(0).uniform(0.0, 0.5, 4):
@@ -161,19 +164,19 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
 )
 def test_a_checkpoint_of_another_training_is_refused(folder: Path, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"is of {name} .*, not .*: train that in another"):
-        read_task(folder, **{name: value})
-    assert read_task(folder) == TINY
+        read_training(folder, **{name: value})
+    assert read_training(folder).task == TINY
     with pytest.raises(ValueError, match="train that in another folder"):
-        trainer.train(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True)
+        trainer.Trainer(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True).train()
 
 
 def test_a_folder_that_holds_a_training_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
     before = (folder / CHECKPOINT).read_bytes()
     with pytest.raises(ValueError, match="holds a training already: go on with it"):
-        trainer.train(TINY, 10, folder)
+        trainer.Trainer(TINY, 10, folder).train()
     assert (folder / CHECKPOINT).read_bytes() == before
     with pytest.raises(FileNotFoundError, match="holds no training to go on with"):
-        trainer.train(TINY, 10, tmp_path, resume=True)
+        trainer.Trainer(TINY, 10, tmp_path, resume=True).train()
 
 
 def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> None:
@@ -181,10 +184,10 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
     for content in (b"", b"no", whole[:-100]):
         (tmp_path / CHECKPOINT).write_bytes(content)
         with pytest.raises(ValueError, match="is no checkpoint, or is cut short"):
-            read_task(tmp_path)
+            read_training(tmp_path)
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}))
     with pytest.raises(ValueError, match="is no checkpoint of this format"):
-        read_task(tmp_path)
+        read_training(tmp_path)
 
 
 def test_a_tracked_training_hands_over_what_is_logged(
@@ -193,7 +196,7 @@ def test_a_tracked_training_hands_over_what_is_logged(
     """One run: named as the folder, told the task, given evaluations and losses, and ended."""
     run = Mock()
     monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init))
-    trainer.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))
+    trainer.Trainer(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars")).train()
     assert run.init.call_args.kwargs["project"] == "cars"
     assert run.init.call_args.kwargs["name"] == "mine"
     assert run.init.call_args.kwargs["config"]["env_id"] == TINY.env_id
@@ -209,11 +212,65 @@ def test_a_tracked_training_hands_over_what_is_logged(
     assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ModuleNotFoundError, match="tracking needs wandb: pip install wandb"):
-        trainer.train(TINY, ROLLOUT, tmp_path / "other", run_options=RunOptions(track="cars"))
+        trainer.Trainer(TINY, 9, tmp_path / "other", run_options=RunOptions(track="cars"))
     assert not (tmp_path / "other").exists()
+
+
+WHOLE: dict[str, object] = dict.fromkeys(sorted(_STATE), 0)
+WHOLE |= {"format": _FORMAT, "task": dataclasses.asdict(TrainingTask()), "sideslip": __version__}
+WHOLE |= {"aim": {"steps": 7, "eval_freq": 3}}
+
+
+def without(key: str, values: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in values.items() if name != key}
+
+
+def of(**change: object) -> dict[str, object]:
+    """A state whose task has something else."""
+    return WHOLE | {"task": dataclasses.asdict(TrainingTask()) | change}
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        *((without(key, WHOLE), f": the checkpoint's state lacks {key}") for key in sorted(_STATE)),
+        *(
+            (WHOLE | {"task": without(each.name, WHOLE["task"])}, f"'s task lacks {each.name}")  # type: ignore[arg-type]
+            for each in dataclasses.fields(TrainingTask)
+        ),
+        (without("format", WHOLE), "is no checkpoint of this format"),
+        ([1], "is no checkpoint of this format"),
+        (WHOLE | {"sideslip": "0.0.1"}, "was made by sideslip 0.0.1, this is"),
+        ("cut", "is no checkpoint: its state is no JSON"),
+        (WHOLE | {"task": 0}, "'s task lacks env_id"),
+        (of(seed="3"), ": the task: seed is '3', not int"),
+        (of(reads=3), ": the task: reads is 3, not list"),
+        (of(algo="dqn"), ": the task: unknown algorithm 'dqn'"),
+        (of(estimator="evil.py"), ": estimator is a name, got the entry point 'evil.py'"),
+        (
+            of(estimator="dakf", estimator_options={"estimator": "evil.py"}),
+            ": estimator_options holds an estimator",
+        ),
+        (WHOLE | {"aim": 7}, ": the aim: expected a JSON object"),
+        (WHOLE | {"aim": {"steps": "7"}}, "the aim: missing eval_freq"),
+        (of(env_id="evil:Car-v0"), ": env_id is that of a registered env, got 'evil:Car-v0'"),
+    ],
+)
+def test_what_a_checkpoint_lacks_is_named(state: object, message: str, tmp_path: Path) -> None:
+    text = "{" if state == "cut" else json.dumps(state)
+    (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, {"checkpoint": text}))
+    with pytest.raises(ValueError, match=message) as caught:
+        read_training(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / CHECKPOINT))
+
+
+def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
+    state = {"checkpoint": json.dumps(WHOLE)}
+    (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
+    assert read_training(tmp_path).task == TrainingTask()
 
 
 @pytest.mark.long
 def test_ppo_passes_a_quarter_of_none_within_a_minute(tmp_path: Path) -> None:
-    found = trainer.train(TrainingTask(), 250_000, tmp_path).best
+    found = trainer.Trainer(TrainingTask(), 250_000, tmp_path).train().best
     assert found.of_none < 0.25

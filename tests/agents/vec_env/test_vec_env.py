@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sideslip.agents.training.normalise import RewardScale, RewardScaleWrapper
-from sideslip.agents.vec_env import EMPTY_INFO, NativeVecEnv, make_vec_env
+from sideslip.agents.vec_env import EMPTY_INFO, _NativeVecEnv, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}
@@ -39,9 +39,9 @@ ESTIMATE: dict[str, Any] = {"estimator": "exact-kf", "outputs": ["beta"]}
 RANDOM: dict[str, Any] = {"phase": None, "loss": 0.2}
 
 
-def native(name: str, count: int, wish: Any = None, **arguments: Any) -> NativeVecEnv:
+def native(name: str, count: int, wish: Any = None, **arguments: Any) -> _NativeVecEnv:
     env = make_vec_env(name, count, estimator=wish, env_kwargs=arguments).venv
-    assert isinstance(env, NativeVecEnv)
+    assert isinstance(env, _NativeVecEnv)
     return env
 
 
@@ -275,9 +275,9 @@ def test_what_cannot_be_bridged_says_why() -> None:
     with pytest.raises(ValueError, match="has no native vector env"):
         make_vec_env("Pendulum-v1", 2)
     with pytest.raises(TypeError, match="SyncVectorEnv is no native vector env"):
-        NativeVecEnv(gym.make_vec(VISION, num_envs=2, vectorization_mode="sync"))
+        _NativeVecEnv(gym.make_vec(VISION, num_envs=2, vectorization_mode="sync"))
     with pytest.raises(ValueError, match=r"autoreset_mode='SameStep', not .*NEXT_STEP"):
-        NativeVecEnv(StabilityVectorEnv(2))
+        _NativeVecEnv(StabilityVectorEnv(2))
     with pytest.raises(gym.error.NameNotFound):
         make_vec_env("sideslip/Yaw-v0", 2)
     with pytest.raises(ValueError, match="dakf needs the slow sensor gps"):

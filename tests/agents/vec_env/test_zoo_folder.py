@@ -14,10 +14,10 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sideslip.agents import zoo
 from sideslip.agents.rollout import evaluate_costs
-from sideslip.agents.training import callbacks
+from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
 from sideslip.agents.training.config import TrainingTask
-from sideslip.agents.training.trainer import train
+from sideslip.agents.training.trainer import Trainer
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"
@@ -37,10 +37,10 @@ TASK = TrainingTask(
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training of two evaluations."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(callbacks, "_SCALING_ENVS", 8)
+    patch.setattr(trainer, "_SCALING_ENVS", 8)
     place = TASK.find_zoo_folder(tmp_path_factory.mktemp("logs"))
     TASK.describe_for_zoo(place, 256, 128)
-    train(TASK, 128, place, run_options=RunOptions(eval_freq=128))
+    Trainer(TASK, 128, place, run_options=RunOptions(eval_freq=128)).train()
     patch.undo()
     return place
 
@@ -108,14 +108,14 @@ def test_evaluations_are_as_eval_callback_has_them_and_go_on(folder: Path) -> No
     short = round(3.0 / 0.01)  # the mixture's second
     assert (first["results"] < 0.0).all() and (first["ep_lengths"][:, 1] == short).all()
     assert (first["ep_lengths"][:, 0] > short).all()
-    train(TASK, 256, folder, resume=True, run_options=RunOptions(eval_freq=128))
+    Trainer(TASK, 256, folder, resume=True, run_options=RunOptions(eval_freq=128)).train()
     assert found()["timesteps"].tolist() == [0, 128, 256]
     assert np.array_equal(found()["results"][:2], first["results"])
 
 
 def test_another_folder_gets_none_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
-    train(TrainingTask(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain")
+    monkeypatch.setattr(trainer, "_SCALING_ENVS", 8)
+    Trainer(TrainingTask(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain").train()
     assert not list((tmp_path / "plain").glob("sideslip*"))
     assert not (tmp_path / "plain" / zoo.EVALUATIONS).exists()
 

@@ -84,28 +84,6 @@ def test_a_session_may_not_choose_code(
     assert status == 2 and said in err and "it ran" not in err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("live",), "name an ESTIMATOR, or --simulate, --relay or --replay"),
-        (("live", "exact-kff", "--port", "0"), "did you mean 'exact-kf'?"),
-        (("live", "exact-kf", "--port", "0", "--agent", "lqrr"), "did you mean 'lqr'?"),
-        (("live", "exact-kf", "--publish", "nowhere"), "HOST:PORT"),
-        (("live", "exact-kf", "--host", "192.0.2.1"), "is none"),
-        (("live", "exact-kf", "--json", "a.txt"), "ends in .json"),
-        (("live", "--simulate", "--env", "sideslip/YawVison-v0"), "did you mean"),
-        (("live", "--relay", "no-such-file"), "no-such-file"),
-        (("live", "exact-kf", "--port", "0", "--gps", "tcp:nowhere"), "expected tcp:HOST:PORT"),
-        (("live", "--replay", "no-such-file"), "no-such-file"),
-        (("live", "--replay", __file__), "is no session"),
-        (("live", "exact-kf", "--port", "0", "--record", __file__), "exists"),
-    ],
-)
-def test_a_mistake_is_one_line(run: Run, arguments: tuple[str, ...], message: str) -> None:
-    status, _, err = run(*arguments)
-    assert status == 2 and message in err and "Traceback" not in err
-
-
 def test_a_port_in_use_is_one_line(run: Run) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))

@@ -31,22 +31,3 @@ def test_the_file_names_its_filter_and_its_command(run: Run) -> None:
     both = SENSOR_SETS["fusion"]
     found = make_estimator("learned", file="mine.safetensors", sensors=both)
     assert "rear_tyres" in found.names
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--base", "magic"), "unknown estimator 'magic'"),
-        (("--base", "multirate-kf"), "a correction's base is course-kf"),
-        (("--scenarios", "moon"), "unknown scenario 'moon'"),
-        (("--option", "depth=3"), "unknown option"),
-        (("--episodes", "0"), " 0 episodes"),
-        (("--out", "there.zip"), "there.zip: expected a file that ends in .safetensors"),
-    ],
-)
-def test_a_mistake_is_one_line_that_names_it(
-    run: Run, tmp_path: Path, arguments: tuple[str, ...], said: str
-) -> None:
-    status, _, err = run("mine", *arguments)
-    assert status == 2 and said in err, err
-    assert list(tmp_path.iterdir()) == []

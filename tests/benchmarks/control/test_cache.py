@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import run
-from sideslip.benchmarks.control.entries import ControlEntry
-from sideslip.benchmarks.control.run import CachedDrive, Chunk, DriveResult
+from sideslip.benchmarks.control.entries import Entry
+from sideslip.benchmarks.control.run import Chunk, DriveResult, make_storage
 from sideslip.benchmarks.control.tasks import ControlTask
+from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.envs.numerics import kernel_cache
 from sideslip.estimators.learned.network import SUFFIX
 
@@ -65,9 +66,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_case_is_driven_again(
-    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_case_is_driven_again(damage: str, tmp_path: Path) -> None:
     """Not taken for a result, and no error."""
     rng = np.random.default_rng(1)
     numbers, series = rng.normal(size=(len(SEEDS), NUMBERS)), rng.normal(size=(9, SIGNALS))
@@ -77,9 +76,8 @@ def test_a_damaged_case_is_driven_again(
         driven.append(chunk)
         return DriveResult(numbers, 1.0, series)
 
-    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", drive_it)
-    cached = CachedDrive(tmp_path)
-    chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", "none"), SEEDS, keep=True)
+    cached = StoredFunction(drive_it, tmp_path, make_storage())
+    chunk = Chunk(ControlTask(scenario="gust"), Entry("none"), SEEDS, keep=True)
     cached(chunk)
     (path,) = tmp_path.iterdir()
     DAMAGE[damage](path)
@@ -107,27 +105,24 @@ def test_other_options_of_an_id_and_another_car_s_file_are_another_case(
     assert kernel_cache.hash_experiment() == seen[-1]
 
 
-def test_other_tuned_options_are_another_case(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_tuned_options_are_another_case(monkeypatch: pytest.MonkeyPatch) -> None:
     """The salt follows them, and a case's name the salt: a tuning makes old cases nobody's."""
-    drive = CachedDrive(tmp_path)
-    chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", "nominal"), SEEDS)
+    chunk = Chunk(ControlTask(scenario="gust"), Entry("nominal"), SEEDS)
     names = []
     for salt in ("one", "another", "one"):
         monkeypatch.setattr(run, "make_salt", lambda salt=salt: salt)
         run.hash_sources.cache_clear()
-        names.append(drive._make_path(chunk).name)
+        names.append(make_storage().describe(chunk))
     run.hash_sources.cache_clear()
     assert names[0] == names[2] != names[1]
 
 
 def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None:
     """A policy that is trained further keeps its path, not its episodes."""
-    file, drive = tmp_path / f"mine{SUFFIX}", CachedDrive(tmp_path / "cases")
+    file = tmp_path / f"mine{SUFFIX}"
     names = []
     for weights in (b"one", b"another", b"one"):
         file.write_bytes(weights)
-        chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", str(file)), SEEDS)
-        names.append(drive._make_path(chunk).name)
+        chunk = Chunk(ControlTask(scenario="gust"), Entry(str(file)), SEEDS)
+        names.append(make_storage().describe(chunk))
     assert names[0] == names[2] != names[1]

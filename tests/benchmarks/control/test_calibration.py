@@ -16,22 +16,25 @@ from sideslip.agents.clairvoyant import plan as clairvoyant
 from sideslip.agents.clairvoyant.plan import ClairvoyantResult
 from sideslip.benchmarks.control import calibration
 from sideslip.benchmarks.control.calibration import (
-    calibrate,
-    check_current,
-    compute_regrets,
+    Calibration,
+    CalibrationRecord,
     derive_seeds,
-    make_cases,
-    measure_calibrated,
+    measure_regrets,
     read_calibration,
-    remove_cases,
+    read_current,
     update,
 )
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.tasks import NOMINAL, STATE, YAW, ControlTask
 
 GUST = ControlTask("1", YAW, "coms", "zero-slip", "gust")
 SINE = ControlTask("1", YAW, "coms", "zero-slip", "sine")
+
+
+def calibrate(folder: Path, *tasks: ControlTask) -> list[CalibrationRecord]:
+    """On two seeds, in this process."""
+    return Calibration(tasks, folder / "cases", 2).run(jobs=1)
 
 
 @pytest.fixture
@@ -63,21 +66,21 @@ def test_seeds_are_its_own_and_follow_the_version(monkeypatch: pytest.MonkeyPatc
 
 def test_a_stopped_run_goes_on(asked: list[int], tmp_path: Path) -> None:
     folder = tmp_path / "cases"
-    calibrate([GUST], folder, seeds=3, jobs=1)
-    (entry,) = calibrate([GUST], folder, seeds=5, jobs=1)
+    Calibration([GUST], folder, 3).run(jobs=1)
+    (entry,) = Calibration([GUST], folder, 5).run(jobs=1)
     assert asked == derive_seeds(GUST, 5)  # each once
     assert entry.costs.tolist() == [seed % 10 for seed in asked]
-    calibrate([SINE], folder, seeds=3, jobs=1)
+    Calibration([SINE], folder, 3).run(jobs=1)
     assert len(asked) == 8  # another question
-    remove_cases(make_cases([GUST], folder, 5))
+    Calibration([GUST], folder, 5).remove_cases()
     assert len(list(folder.iterdir())) == 3  # the other question's
-    remove_cases(make_cases([SINE], folder, 3))
+    Calibration([SINE], folder, 3).remove_cases()
     assert not folder.exists()
 
 
 def test_a_file_keeps_other_entries(asked: list[int], tmp_path: Path) -> None:
     path = tmp_path / "clairvoyant.json"
-    both = calibrate([GUST, SINE], tmp_path / "cases", seeds=2, jobs=1)
+    both = calibrate(tmp_path, GUST, SINE)
     update(path, both)
     changed = dataclasses.replace(both[0], command="other")
     update(path, [changed])
@@ -102,7 +105,7 @@ def test_a_file_that_does_not_fit_is_refused_by_name(
     message: str, asked: list[int], tmp_path: Path
 ) -> None:
     path = tmp_path / "clairvoyant.json"
-    update(path, calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1))
+    update(path, calibrate(tmp_path, GUST))
     spoiled = SPOILED[message](path.read_text())
     path.write_text(spoiled)
     stale = "is stale" in message
@@ -112,35 +115,40 @@ def test_a_file_that_does_not_fit_is_refused_by_name(
         assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
     assert path.read_text() == spoiled
     if stale:  # its other entries stay, and new ones can be written
-        (made,) = calibrate([SINE], tmp_path / "cases", seeds=2, jobs=1)
+        (made,) = calibrate(tmp_path, SINE)
         update(path, [made])
         assert read_calibration(path) == {SINE: made}
 
 
 def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_path: Path) -> None:
     """Whatever its version: the uncontrolled car no longer costs what it did."""
-    (entry,) = calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1)
+    (entry,) = calibrate(tmp_path, GUST)
+    path = tmp_path / "file"
+    update(path, [entry])
+    assert read_current(path, [SINE]) == {}
     with pytest.raises(ValueError, match="file: gust, yaw is stale: the uncontrolled car costs"):
-        check_current({GUST: entry}, "file")
-    found = measure([ControlEntry(GUST, "", "none")], derive_seeds(GUST, 2), jobs=1)
-    none = found.select(GUST, "none").costs
+        read_current(path, [GUST])
+    found = measure([(GUST, Entry("none"))], derive_seeds(GUST, 2), jobs=1)
+    none = found[GUST, Entry("none")].costs
     episodes = tuple(
         dataclasses.replace(episode, costs={"none": cost})
         for episode, cost in zip(entry.episodes, none.tolist(), strict=True)
     )
-    check_current({GUST: dataclasses.replace(entry, episodes=episodes)}, "file")
+    update(path, [dataclasses.replace(entry, episodes=episodes)])
+    assert read_current(path, [GUST]).keys() == {GUST}
 
 
 def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
     asked: list[int], tmp_path: Path
 ) -> None:
-    (entry,) = calibrate([GUST], tmp_path / "cases", seeds=4, jobs=1)
-    none = ControlEntry(GUST, "", "none")
-    there = measure_calibrated({GUST: entry}, [none, ControlEntry(SINE, "", "none")], jobs=1)
-    assert list(there.outcomes) == [none]
-    costs = measure([none], derive_seeds(GUST, 4), jobs=1).select(GUST, "none").costs
+    (entry,) = Calibration([GUST], tmp_path, 4).run(jobs=1)
+    none = ControlCase(GUST, Entry("none"))
+    cases = [none, ControlCase(SINE, Entry("none"))]
+    regrets, there = measure_regrets({GUST: entry}, cases, jobs=1)
+    assert list(there) == [none]
+    costs = measure([none], derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
     expected = np.clip(np.log((costs + 0.001) / (entry.costs + 0.001)), -3.0, 3.0)
-    assert compute_regrets({GUST: entry}, there)[none] == pytest.approx(expected)
+    assert regrets[none] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -152,21 +160,21 @@ def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
     ids=range(11),
 )
 def test_a_damaged_case_is_sought_again(content: Any, asked: list[int], tmp_path: Path) -> None:
-    first = calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1)
+    first = calibrate(tmp_path, GUST)
     path = next((tmp_path / "cases").iterdir())
     if isinstance(content, tuple):
         key, value = content
         content = json.dumps(json.loads(path.read_text()) | {key: value})
     path.write_text(content)
-    assert calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1) == first
+    assert calibrate(tmp_path, GUST) == first
     assert len(asked) == 3
-    assert calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1) == first
+    assert calibrate(tmp_path, GUST) == first
     assert len(asked) == 3  # the file is whole again
 
 
 @pytest.mark.long
 def test_a_real_episode_is_no_dearer_than_the_rungs(tmp_path: Path) -> None:
-    (entry,) = calibrate([SINE], tmp_path / "cases", seeds=2, jobs=1)
+    (entry,) = calibrate(tmp_path, SINE)
     for episode in entry.episodes:
         assert episode.cost == min(episode.costs.values())
         assert set(episode.costs) == {"none", NOMINAL, STATE, f"from {NOMINAL}", f"from {STATE}"}
@@ -174,4 +182,4 @@ def test_a_real_episode_is_no_dearer_than_the_rungs(tmp_path: Path) -> None:
 
 def test_one_seed_is_too_few(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="two seeds or more, got 1"):
-        calibrate([GUST], tmp_path / "cases", seeds=1)
+        Calibration([GUST], tmp_path, 1)

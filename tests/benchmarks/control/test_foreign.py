@@ -3,14 +3,13 @@
 from typing import Any
 
 import numpy as np
-import pytest
 
 from sideslip.agents import Controller
-from sideslip.benchmarks.control.baseline_gaps import make_score_scales
-from sideslip.benchmarks.control.entries import ControlEntry, measure_decision_time
-from sideslip.benchmarks.control.run import measure
-from sideslip.benchmarks.control.score import make_rows, rank_entries
+from sideslip.benchmarks.control.entries import ControlCase, Entry
+from sideslip.benchmarks.control.run import measure, measure_decision_time
+from sideslip.benchmarks.control.score import make_score_scales, rank_entries
 from sideslip.benchmarks.control.tasks import ControlTask
+from sideslip.benchmarks.harness.results import Suite
 
 MINE: dict[str, Any] = {
     "name": "my bend",
@@ -31,26 +30,27 @@ class Damper(Controller):
         action[:, 0] = 20.0 * inputs[:, 0]
 
 
-BEND = ControlTask(scenario=MINE["name"])
+BEND = ControlTask(scenario=MINE["name"], changes={"scenario": MINE})
 
 
-def cell(controller: str, estimator: str = "") -> ControlEntry:
-    return ControlEntry(BEND, estimator, controller, {"scenario": MINE})
+def cell(agent: str, estimator: str = "") -> ControlCase:
+    return ControlCase(BEND, Entry(agent, estimator))
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_users_controller_on_a_users_scenario_stands_in_the_tables(jobs: int) -> None:
+def test_a_users_controller_on_a_users_scenario_stands_in_the_tables() -> None:
     mine = cell(f"{__name__}:Damper", "bicycle-kf")
     asked = [mine, *(cell(who) for who in ("none", "nominal", "oracle-state"))]
-    found = measure(asked, range(6), jobs=jobs)
-    assert not any(driven.error for driven in found.outcomes.values())
-    ours, none = found.outcomes[mine], found.outcomes[cell("none")]
+    found = measure(asked, range(6), jobs=2)
+    assert not any(driven.error for driven in found.values())
+    ours, none = found[mine], found[cell("none")]
     assert np.median(ours["rms_slip"] / none["rms_slip"]) < 0.95  # it does what it is for
-    table = rank_entries(found.outcomes, "", make_score_scales(found, [BEND]))
-    standing = {each.entry.controller: each for each in table}[mine.controller]
-    rows = make_rows(standing, "ab")
+    table = rank_entries(found, "", make_score_scales(found, [BEND]))
+    standing = {each.entry: each for each in table}[mine.entry]
+    suite = Suite("control", "", "")
+    standing.add_rows(suite, "ab")
+    rows = suite.rows
     assert {row.scenario for row in rows} == {"my bend, yaw", "tier "}
     assert {row.metric for row in rows} >= {"score", "cost_vs_nominal", "share_won"}
-    assert {row.controller for row in rows} == {mine.controller}
+    assert {row.controller for row in rows} == {mine.entry.agent}
     assert all("my bend" in row.spec for row in rows if row.scenario == BEND.name)
     assert measure_decision_time(mine) > 0.0

@@ -1,5 +1,6 @@
 """The matrix: one cell is what single episodes are, failures are told, a stopped run goes on."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +10,17 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.control import entries
 from sideslip.benchmarks.control import run as drive
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control.entries import (
     LEARNED,
     ORACLE_NAMES,
     REFERENCE_FILTER,
-    ControlEntry,
-    make_entries,
+    ControlCase,
+    Entry,
+    make_cases,
 )
-from sideslip.benchmarks.control.run import CachedDrive, Chunk, measure
+from sideslip.benchmarks.control.run import Chunk, measure
 from sideslip.benchmarks.control.tasks import (
     PARAMETERS,
     STATE,
@@ -29,6 +30,7 @@ from sideslip.benchmarks.control.tasks import (
     list_scored_tasks,
     make_salt,
 )
+from sideslip.benchmarks.report.study import Request, StoredFunction
 from sideslip.envs import COMS, FAILURES, SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import EstimateObservation
@@ -43,20 +45,20 @@ PAIRS = (
 
 def test_a_correction_gives_controllers_what_its_filter_gives() -> None:
     for name, base in (("exact-kf", "exact-kf"), ("joint", "joint, friction")):
-        assert entries.list_outputs(f"learned-{name}") == entries.list_outputs(base)
-    assert entries.list_outputs("joint")[-2:] == ("front_tyres", "rear_tyres")
+        assert Entry("lqr", f"learned-{name}").outputs == Entry("lqr", base).outputs
+    assert Entry("lqr", "joint").outputs[-2:] == ("front_tyres", "rear_tyres")
 
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
 def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
-    cell = ControlEntry(DWELL, estimator, controller, tuned={"filter": {}, "controller": {}})
-    driven = drive.run_chunk(Chunk(cell, SEEDS, keep=True))
+    entry = Entry(controller, estimator, {"filter": {}, "controller": {}})
+    driven = drive.run_chunk(Chunk(DWELL, entry, SEEDS, keep=True))
     assert driven.error == ""
-    env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.task.scenario)
+    env: gym.Env[Any, Any] = gym.make(YAW, scenario=DWELL.scenario)
     if estimator:
-        outputs = entries.list_outputs(estimator)
-        env = EstimateObservation(env, estimator, outputs=outputs, std=False)
+        env = EstimateObservation(env, estimator, outputs=entry.outputs, std=False)
     agent = make_agent(controller, env)
+    assert rollout(*entry.make(DWELL), SEEDS[0]).cost == rollout(env, agent, SEEDS[0]).cost
     for i, seed in enumerate(SEEDS):
         alone = rollout(env, agent, seed)
         assert driven["cost"][i] == pytest.approx(alone.cost, rel=1e-12)
@@ -75,16 +77,16 @@ def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
 
 
 def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
-    all_ = list(make_entries(list_scored_tasks()))
+    all_ = list(make_cases(list_scored_tasks()))
     assert len(set(all_)) == len(all_)
     for contest in list_scored_tasks():
-        mine = [cell for cell in all_ if cell.task == contest]
-        assert {cell.controller for cell in mine} >= {*ORACLE_NAMES, "none", "lqr"}
-        assert sum(cell.estimator == REFERENCE_FILTER for cell in mine) >= 4
-        pairs = {(cell.estimator, cell.controller) for cell in mine}
-        assert pairs >= {*LEARNED.get(contest.kind, ())}
-    fast = list(make_entries(list_scored_tasks(), quick=True))
-    assert set(fast) < set(all_) and not any(cell.slow and not cell.oracle for cell in fast)
+        mine = {entry for task, entry in all_ if task == contest}
+        assert {entry.agent for entry in mine} >= {*ORACLE_NAMES, "none", "lqr"}
+        assert sum(entry.estimator == REFERENCE_FILTER for entry in mine) >= 4
+        assert mine >= {*LEARNED.get(contest.kind, ())}
+    fast = list(make_cases(list_scored_tasks(), quick=True))
+    assert set(fast) < set(all_)
+    assert not any(ControlCase(task, entry).is_slow and not entry.is_oracle for task, entry in fast)
 
 
 @pytest.mark.parametrize("estimator", [REFERENCE_FILTER, "joint"])
@@ -92,9 +94,9 @@ def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
     """Its levels are the scenario's, which has no accelerometer then."""
     contest = ControlTask(scenario="tie-vision-fig8")
     assert not make_scenario("tie-vision-fig8").roll
-    options = entries.make_estimate_options(ControlEntry(contest, estimator, "lqr"))["options"]
+    options = ControlCase(contest, Entry("lqr", estimator)).estimate_options["options"]
     assert "fast" not in options and "accel_y_noise" not in options
-    driven = drive.run_chunk(Chunk(ControlEntry(contest, estimator, "lqr"), (1,)))
+    driven = drive.run_chunk(Chunk(contest, Entry("lqr", estimator), (1,)))
     assert not driven.error and np.isfinite(driven.costs).all()
 
 
@@ -111,17 +113,18 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
     )
     one = {find_oracle(each, PARAMETERS)[-4:]: each for each in list_scored_tasks()}
     contest = one["nmpc"]
-    assert ControlEntry(contest, "joint, friction", "adaptive-nmpc").best == found["adaptive-nmpc"]
-    assert ControlEntry(one["-lqr"], "", PARAMETERS).best == found["adaptive-lqr"]
-    parameters, state = (ControlEntry(contest, "", each).best for each in (PARAMETERS, STATE))
+    adaptive = Entry("adaptive-nmpc", "joint, friction")
+    assert ControlCase(contest, adaptive).options == found["adaptive-nmpc"]
+    assert ControlCase(one["-lqr"], Entry(PARAMETERS)).options == found["adaptive-lqr"]
+    parameters, state = (ControlCase(contest, Entry(each)).options for each in (PARAMETERS, STATE))
     assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
     assert state == {"filter": {}, "controller": {"horizon": 0.3}}
 
 
 def test_truth_is_told_without_error() -> None:
-    env, _ = entries.make_cars(ControlEntry(GUST, "truth", "two-dof"), 2)
-    obs, infos = env.reset(seed=[1, 2])  # type: ignore[arg-type]
-    names = [entry.name for entry in env.layout]  # type: ignore[attr-defined]
+    env, _ = Entry("two-dof", "truth").make(GUST, 2)
+    obs, infos = env.reset(seed=[1, 2])
+    names = [entry.name for entry in env.layout]
     for _ in range(30):
         obs, *_, infos = env.step(np.full((2, 1), 0.3, np.float32))
     assert np.array_equal(obs[:, names.index("beta_hat")], infos["beta"].astype(np.float32))
@@ -143,8 +146,8 @@ class Broken:
 
 
 def broken(monkeypatch: pytest.MonkeyPatch, agent: Any) -> None:
-    make = entries.make_cars
-    monkeypatch.setattr(drive, "make_cars", lambda cell, n: (make(cell, n)[0], agent))
+    make = Entry.make
+    monkeypatch.setattr(Entry, "make", lambda entry, *args: (make(entry, *args)[0], agent))
 
 
 class SquareWave:
@@ -164,8 +167,8 @@ def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_aske
     """From limit to limit five times a second: ten times the limit, in N m/s, whatever the lag."""
     scenario = {"base": "straight", "duration": 4.0, "speed": 8.0}
     broken(monkeypatch, SquareWave())
-    task = ControlTask(scenario="straight")
-    driven = drive.run_chunk(Chunk(ControlEntry(task, "", "none", {"scenario": scenario}), SEEDS))
+    task = ControlTask(scenario="straight", changes={"scenario": scenario})
+    driven = drive.run_chunk(Chunk(task, Entry("none"), SEEDS))
     limit = COMS.yaw_moment_limit
     assert driven["moment_rate"] == pytest.approx(np.full(3, 2.0 * limit / 0.2), rel=0.05)
     assert driven["largest_step"] == pytest.approx(np.full(3, 2.0 * limit))
@@ -173,10 +176,10 @@ def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_aske
 
 
 def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    cell = ControlEntry(GUST, "", "none")
-    whole = drive.run_chunk(Chunk(cell, SEEDS))
+    chunk = Chunk(GUST, Entry("none"), SEEDS)
+    whole = drive.run_chunk(chunk)
     broken(monkeypatch, Broken())
-    driven = drive.run_chunk(Chunk(cell, SEEDS))
+    driven = drive.run_chunk(chunk)
     assert FAILURES[int(driven["failure"][0])] == "bad-action"
     assert driven["cost"][0] > 90.0 * (SCENARIOS["gust"].duration - 0.1)
     assert np.array_equal(driven.numbers[1:], whole.numbers[1:])
@@ -184,47 +187,46 @@ def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_actions_of_the_wrong_shape_are_failures_too(monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch, Broken("wrong"))
-    driven = drive.run_chunk(Chunk(ControlEntry(GUST, "", "none"), SEEDS))
+    driven = drive.run_chunk(Chunk(GUST, Entry("none"), SEEDS))
     assert driven.error == ""
     assert {FAILURES[int(code)] for code in driven["failure"]} == {"bad-action"}
 
 
 def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
-    asked = [ControlEntry(GUST, "", "none"), ControlEntry(GUST, "nobody-kf", "two-dof")]
+    asked = [(GUST, Entry("none")), (GUST, Entry("two-dof", "nobody-kf"))]
     found = measure(asked, range(4), jobs=1)
-    assert np.isfinite(found.select(GUST, "none").costs).all()
-    assert "nobody-kf" in found.select(GUST, "two-dof", "nobody-kf").error
+    assert np.isfinite(found[GUST, Entry("none")].costs).all()
+    assert "nobody-kf" in found[asked[1]].error
 
 
 def test_standing_car_and_diverging_plant_end_finite() -> None:
     still = {"base": "gust", "speed": 0.0}
     thrown = {"base": "random-steering", "speed": 60.0, "amplitude": 0.5}
     for scenario, name in ((still, "none"), (thrown, "spin")):
-        cell = ControlEntry(GUST, "exact-kf", "lqr", {"scenario": scenario})
-        driven = drive.run_chunk(Chunk(cell, SEEDS))
+        task = ControlTask(scenario="gust", changes={"scenario": scenario})
+        driven = drive.run_chunk(Chunk(task, Entry("lqr", "exact-kf"), SEEDS))
         assert driven.error == "" and np.isfinite(driven.numbers).all()
         assert FAILURES[int(driven["failure"][0])] == name
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chunk = Chunk(ControlEntry(GUST, "", "none"), SEEDS, keep=True)
-    cached = CachedDrive(tmp_path)
+    chunk = Chunk(GUST, Entry("none"), SEEDS, keep=True)
+    cached = StoredFunction(drive.run_chunk, tmp_path, drive.make_storage())
     first = cached(chunk)
-    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", None)
+    cached = replace(cached, function=lambda _: pytest.fail("it is driven again"))
     again = cached(chunk)
     assert np.array_equal(first.numbers, again.numbers)
     assert first.series is not None and again.series is not None
     assert np.array_equal(first.series, again.series)
-    with pytest.raises(TypeError):  # another chunk is driven
-        cached(Chunk(chunk.entry, SEEDS[:2], keep=True))
-    monkeypatch.setattr("sideslip.benchmarks.control.run.hash_sources", lambda: "edited")
-    with pytest.raises(TypeError):  # other sources: driven again
+    with pytest.raises(pytest.fail.Exception):  # another chunk is driven
+        cached(Chunk(GUST, chunk.entry, SEEDS[:2], keep=True))
+    monkeypatch.setattr(drive, "hash_sources", lambda: "edited")
+    with pytest.raises(pytest.fail.Exception):  # other sources: driven again
         cached(chunk)
     monkeypatch.undo()
-    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", None)
     (found,) = tmp_path.iterdir()
     found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
-    with pytest.raises(TypeError):
+    with pytest.raises(pytest.fail.Exception):
         cached(chunk)
 
 
@@ -232,17 +234,18 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     """Tables, rows, figures, menus, tracks; a contestant that cannot drive leaves the rest."""
     few = [ControlTask(tier, YAW, "coms", "zero-slip", f"coms-{name}")
            for tier, name in (("", "step"), ("2a", "random"))]  # fmt: skip
-    some = [ControlEntry(c, "", rung) for c in few for rung in (*ORACLE_NAMES, "none")]
+    some = [(c, Entry(rung)) for c in few for rung in (*ORACLE_NAMES, "none")]
     filters = ("exact-kf", "bicycle-kf", "nobody-kf")
-    some += [ControlEntry(c, name, "lqr") for c in few for name in filters]
+    some += [(c, Entry("lqr", name)) for c in few for name in filters]
     monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
-    monkeypatch.setattr(control, "make_entries", lambda *_: some)
+    monkeypatch.setattr(control, "make_cases", lambda *_: some)
     monkeypatch.setattr(control, "TITLES", {"": "no tier", "2a": "a tier"})
-    for room in ("baseline_gaps", "report"):
+    for room in ("tables", "report"):
         named = {"": "no tier", "2a": "a"}
         monkeypatch.setattr(f"sideslip.benchmarks.control.{room}.TITLES", named)
-    monkeypatch.setattr(control, "measure_delay_cost", lambda *_, **__: ([], []))
-    suite = control.run(4, jobs=1)
+    monkeypatch.setattr(control, "measure_delay_cost", lambda *_, **__: ({}, []))
+    monkeypatch.setattr(control, "measure_decision_time", lambda *_: 10.0)
+    suite = control.STUDY.run(Request(jobs=1, episodes=4))
     assert {row.salt for row in suite.rows} == {make_salt()}
     assert {row.metric for row in suite.rows} >= {"score", "cost_vs_nominal", "failure_rate"}
     assert [row for row in suite.rows if not np.isfinite(row.value)] == []
@@ -252,7 +255,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     assert all("nobody-kf" in line[-1] for line in wrong) and len(wrong) == 2
     first = next(iter(suite.tables))
     assert list(first.header)[1] == "fails / %" and len(first.cells) == 7
-    assert {line[-4] for line in first.cells} == {"1 of 1", "0 of 1"}  # contests, n, left out, us
+    assert {line["contests"] for line in first.cells} == {(1, 1), (0, 1)}
     assert "is not calibrated" in tables["The ladder"].note
     assert len(suite.explorers) == 1 and len(suite.explorers[0].cells) == len(some) - 2
     assert len(suite.files) == 2

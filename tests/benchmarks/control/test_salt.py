@@ -13,7 +13,7 @@ import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import readme
 from sideslip.benchmarks.control import baseline_gaps, calibration, run, tasks
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, measure
 from sideslip.benchmarks.control.tasks import (
     ControlTask,
@@ -24,23 +24,25 @@ from sideslip.benchmarks.control.tasks import (
     make_task_seeds,
     make_tuning_seeds,
 )
+from sideslip.benchmarks.report import study
 from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.studies.learned_outside import KINDS, make_outside_task
-from sideslip.benchmarks.suites import SALTED, SUITES, Request, _run_suite
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suites
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 from sideslip.estimators.learned.network import SUFFIX
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
 GUST = ControlTask(scenario="gust")
-NONE, SLOW = (ControlEntry(GUST, "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
+SHORTENED = ControlTask(scenario="gust", changes={"scenario": SHORT})
+NONE, SLOW = (ControlCase(SHORTENED, Entry(who)) for who in ("none", "mpc"))
 
 
 @pytest.mark.parametrize("salt", [ONE, OTHER])
 def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order and across chunks: each costs what the env alone does on that seed."""
     monkeypatch.setattr(run, "CHUNK", 3)
-    costs = measure([NONE], make_salted_seeds(salt, 5), jobs=1).select(GUST, "none").costs
+    costs = measure([NONE], make_salted_seeds(salt, 5), jobs=1)[NONE].costs
     env = gym.make(GUST.env_id, scenario=SHORT)
     alone = [rollout(env, None, seed).cost for seed in make_salted_seeds(salt, 5)]
     assert costs == pytest.approx(alone, rel=1e-12)
@@ -49,7 +51,7 @@ def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.Monke
 
 def test_another_salt_is_other_episodes() -> None:
     drawn = (make_salted_seeds(salt, 3) for salt in (ONE, OTHER))
-    one, other = (measure([NONE], seeds, jobs=1).select(GUST, "none") for seeds in drawn)
+    one, other = (measure([NONE], seeds, jobs=1)[NONE] for seeds in drawn)
     assert not set(one.costs) & set(other.costs)
 
 
@@ -61,7 +63,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         cases.extend((function, chunk) for chunk in chunks)
         return [DriveResult(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
 
-    monkeypatch.setattr(run, "run_cases", stand_in)
+    monkeypatch.setattr(study, "run_cases", stand_in)
     return cases
 
 
@@ -70,9 +72,9 @@ def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_pa
     cases = asked(monkeypatch)
     first = make_salted_seeds(ONE, 300)
     measure([NONE, SLOW], first, keep=tmp_path)
-    driven: dict[ControlEntry, list[int]] = {}
+    driven: dict[ControlCase, list[int]] = {}
     for kept, chunk in cases:
-        driven.setdefault(chunk.entry, []).extend(chunk.seeds)
+        driven.setdefault(chunk.case, []).extend(chunk.seeds)
         assert kept.folder == tmp_path
     assert driven == {NONE: first, SLOW: first[:64]}
 
@@ -81,11 +83,11 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
     """An interval over contests takes them for independent, and a seed draws the car."""
     cases = asked(monkeypatch)
     scored = list_scored_tasks()[:6]
-    cells = [ControlEntry(each, "", who) for each in scored for who in ("none", "nominal")]
+    cells = [(each, Entry(who)) for each in scored for who in ("none", "nominal")]
     measure(cells, make_task_seeds(ONE, 50))
     driven: dict[ControlTask, set[tuple[int, ...]]] = {}
     for _, chunk in cases:
-        driven.setdefault(chunk.entry.task, set()).add(chunk.seeds)
+        driven.setdefault(chunk.task, set()).add(chunk.seeds)
     assert all(len(mine) == 1 for mine in driven.values())  # in a contest everybody the same
     every = [seed for mine in driven.values() for own in mine for seed in own]
     assert len(set(every)) == len(every) == 6 * 50
@@ -94,7 +96,7 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = asked(monkeypatch)
     baseline_gaps.measure_delay_cost(make_salted_seeds(OTHER, 4))
-    assert len(cases) == len(baseline_gaps.DELAYS) * len(baseline_gaps.CONTESTANTS)
+    assert len(cases) == len(baseline_gaps.DELAYS) * len(baseline_gaps.DELAY_ENTRIES)
     assert {chunk.seeds for _, chunk in cases} == {tuple(make_salted_seeds(OTHER, 4))}
 
 
@@ -105,19 +107,19 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     """Rows from before and after a change of the sources compare; without one it follows them."""
     found: list[list[int]] = []
 
-    def stand_in(cells: list[ControlEntry], seeds: Any, **_: Any) -> None:
+    def stand_in(cells: list[ControlCase], seeds: Any, **_: Any) -> None:
         found.append(seeds(GUST)[:4])
         raise StopIteration
 
-    module = import_module(SUITES.get(name, (".readme",))[0], "sideslip.benchmarks")
+    module = import_module(SUITES.get(name, ".readme"), "sideslip.benchmarks")
     monkeypatch.setattr(module, "measure", stand_in)
-    monkeypatch.setattr(module, "find_spec", lambda _: True, raising=False)
-    monkeypatch.setattr(module, "check_fresh", lambda *_: None, raising=False)
+    monkeypatch.setattr(study, "find_spec", lambda _: True)
+    monkeypatch.setattr(module, "read_current", lambda *_: {}, raising=False)
     for salt in (ONE, OTHER, ""):
         with pytest.raises(StopIteration):
             if module is readme:
                 readme._measure_first(salt=salt)
-            _run_suite(name, Request(quick=True, episodes=4, salt=salt))
+            run_suites([name], Request(quick=True, episodes=4, salt=salt))
     salts = (ONE, OTHER, make_salt())
     assert found == [make_salted_seeds(salt, 4, GUST.seed_text) for salt in salts]
 

@@ -1,31 +1,30 @@
 """Standings: failures first, the best first, findings and the answer; what went wrong is said."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.baseline_gaps import (
-    describe_findings,
-    find_below_optimum,
-    list_failures,
-    make_knowledge_table,
-    make_oracle_table,
-    make_score_scales,
-)
-from sideslip.benchmarks.control.entries import REFERENCE_FILTER, ControlEntry
-from sideslip.benchmarks.control.report import _find_best_controller, compose_verdict
+from sideslip.benchmarks.control.entries import REFERENCE_FILTER, Entry
+from sideslip.benchmarks.control.report import _group_agents, compose_verdict
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
-from sideslip.benchmarks.control.score import (
-    Standing,
-    make_main_table,
-    make_motion_table,
-    make_rows,
+from sideslip.benchmarks.control.score import Standing, make_score_scales, rank_entries
+from sideslip.benchmarks.control.tables import (
+    Matrix,
+    _describe_findings,
+    _make_knowledge_table,
+    _make_main_table,
+    _make_motion_table,
+    _make_oracle_table,
+    _select_cheaper,
+    list_failures,
     make_task_table,
-    rank_entries,
 )
 from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, STATE, ControlTask
 from sideslip.benchmarks.harness.metrics import EPISODE
+from sideslip.benchmarks.harness.results import ResultRow, ResultTable, Suite
+from sideslip.benchmarks.report.tables import format_columns
 from sideslip.envs import FAILURES
 
 ONE, TWO = ControlTask("1", scenario="gust"), ControlTask("1", scenario="straight")
@@ -47,23 +46,37 @@ def undriven(error: str) -> DriveResult:
 
 
 def results(*contests: ControlTask, **failed: int) -> Results:
-    found = Results()
+    found: Results = {}
     for contest in contests or (ONE, TWO):
         for who, level in BEST.items():
             filter_ = REFERENCE_FILTER if who in ("lqr", "esc") else ""
-            cell = ControlEntry(contest, filter_, who)
-            found.outcomes[cell] = episodes(level, failed.get(who, 0))
-        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(3.0)
+            found[contest, Entry(who, filter_)] = episodes(level, failed.get(who, 0))
+        found[contest, Entry("lqr", "dakf")] = episodes(3.0)
     return found
 
 
 def table(found: Results, *contests: ControlTask) -> list[Standing]:
-    return rank_entries(found.outcomes, "1", make_score_scales(found, contests or (ONE, TWO)))
+    return rank_entries(found, "1", make_score_scales(found, contests or (ONE, TWO)))
+
+
+def rows(standing: Standing) -> list[ResultRow]:
+    suite = Suite("control", "", "")
+    standing.add_rows(suite, "ab")
+    return suite.rows
+
+
+def texts(shown: ResultTable) -> list[tuple[str, ...]]:
+    """Lines as people read them."""
+    return list(zip(*(column.texts for column in format_columns(shown)), strict=True))
+
+
+def matrix(found: Results, **more: Any) -> Matrix:
+    return Matrix(found, {"1": table(found)}, **more)
 
 
 def test_the_best_come_first_with_their_numbers() -> None:
     standing = table(results())
-    labels = [each.entry.controller for each in standing]
+    labels = [each.entry.agent for each in standing]
     assert labels == [STATE, "lqr", "lqr", PARAMETERS, "esc", NOMINAL, "none"]
     lqr = standing[1].overall
     assert lqr["score"].value == pytest.approx(2.0 / 3.0, abs=0.02)  # log 4 / log 8
@@ -76,10 +89,10 @@ def test_the_best_come_first_with_their_numbers() -> None:
 def test_won_are_episodes_that_count() -> None:
     """Of those that nominal fails nothing is compared, cheap as they may be."""
     found = results(nominal=8)
-    for cell, driven in found.outcomes.items():
-        if cell.controller == "lqr":
+    for (_, entry), driven in found.items():
+        if entry.agent == "lqr":
             driven.numbers[:8, COST] = 1e3  # lost, where nominal fails
-    lqr = next(each for each in table(found) if each.entry.controller == "lqr")
+    lqr = next(each for each in table(found) if each.entry.agent == "lqr")
     assert lqr.n == 64 and lqr.overall["share_won"].value == 1.0
     assert all(each["share_won"].value == 1.0 for each in lqr.by_task.values())
 
@@ -90,12 +103,13 @@ def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> No
     lqr = standing[f"lqr on {REFERENCE_FILTER}"]
     assert lqr.overall["failure_rate"].value == 3 / 40
     assert (lqr.n, lqr.excluded) == (76, 4)
-    assert [each.entry.controller for each in table(some)][:2] == [STATE, "lqr"]
+    assert [each.entry.agent for each in table(some)][:2] == [STATE, "lqr"]
     often = results(nominal=6, lqr=30)
-    assert [each.entry.controller for each in table(often)][-1] == "lqr"  # the one that failed
-    found = make_main_table("", table(often))
+    assert [each.entry.agent for each in table(often)][-1] == "lqr"  # the one that failed
+    found = _make_main_table("", table(often))
     assert found.header[1] == "fails / %"
-    assert [float(line[1]) for line in found.cells] == sorted(float(x[1]) for x in found.cells)
+    rates = [line["failure_rate"].value for line in found.cells]
+    assert rates == sorted(rates)
 
 
 @pytest.mark.parametrize("filter_, best", [("joint", "adaptive-lqr"), ("dakf", "lqr")])
@@ -104,32 +118,32 @@ def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
 ) -> None:
     found = results()
     for contest in (ONE, TWO):
-        found.outcomes[ControlEntry(contest, filter_, "adaptive-lqr")] = episodes(1.5)
-    assert _find_best_controller({"1": table(found)}) == best
+        found[contest, Entry("adaptive-lqr", filter_)] = episodes(1.5)
+    assert _group_agents({"1": table(found)}).find_best() == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
     found = results()
-    cell = ControlEntry(TWO, "dakf", "lqr")
-    found.outcomes[cell] = undriven("no GPS")
+    cell = (TWO, Entry("lqr", "dakf"))
+    found[cell] = undriven("no GPS")
     standing = next(each for each in table(found) if each.entry.estimator == "dakf")
     assert np.isfinite(standing.overall["score"].value)
-    assert make_main_table("", [standing]).cells[0][9] == "1 of 2"
-    assert make_task_table("", [standing], [ONE, TWO]).cells[0][2] == "not driven"
+    assert texts(_make_main_table("", [standing]))[0][6] == "1 of 2"
+    assert texts(make_task_table("", [standing], [ONE, TWO]))[0][2] == "not driven"
     assert ["1", TWO.name, "lqr on dakf", "not driven: no GPS"] in list_failures(found)
-    assert all(np.isfinite(row.value) for row in make_rows(standing, "ab"))
+    assert all(np.isfinite(row.value) for row in rows(standing))
 
 
 def test_a_contest_in_which_every_car_fails_counts_nowhere_and_says_so() -> None:
     found = results()
     for who in (NOMINAL, STATE):
-        found.outcomes[ControlEntry(TWO, "", who)] = episodes(9.0, 40)
+        found[TWO, Entry(who)] = episodes(9.0, 40)
     standing = table(found)
     assert all(len(each.pairs) == 1 for each in standing)
-    shown = make_task_table("", standing, [TWO]).cells
-    assert [NOMINAL, "no episode counts (100)"] in shown
-    assert ["none", "no episode counts (0)"] in shown
-    lines = make_oracle_table(found, [ONE, TWO], {}).cells
+    shown = texts(make_task_table("", standing, [TWO]))
+    assert (NOMINAL, "no episode counts (100)") in shown
+    assert ("none", "no episode counts (0)") in shown
+    lines = texts(_make_oracle_table(matrix(found)))
     none = "no episode that nominal and oracle-state survive"
     assert [line[-1] for line in lines] == ["yes", none]
     assert ["1", TWO.name, NOMINAL, "every car fails"] in list_failures(found)
@@ -138,17 +152,17 @@ def test_a_contest_in_which_every_car_fails_counts_nowhere_and_says_so() -> None
 
 def test_a_rung_that_cannot_be_computed_leaves_its_contest_without_score() -> None:
     found = results()
-    found.outcomes[ControlEntry(TWO, "", STATE)] = undriven("no plant")
+    found[TWO, Entry(STATE)] = undriven("no plant")
     standing = table(found)
-    lqr = next(each for each in standing if each.entry.controller == "lqr")
+    lqr = next(each for each in standing if each.entry.agent == "lqr")
     assert list(lqr.pairs) == [ONE] and np.isfinite(lqr.overall["score"].value)
-    assert make_task_table("", [lqr], [TWO]).cells[0][1].startswith("no yardstick")
-    assert make_oracle_table(found, [ONE, TWO], {}).cells[1][-1] == "no plant"
+    assert texts(make_task_table("", [lqr], [TWO]))[0][1].startswith("no yardstick")
+    assert texts(_make_oracle_table(matrix(found)))[1][-1] == "no plant"
 
 
 def test_a_nan_of_a_contestant_is_a_failure_that_is_not_the_cars() -> None:
     found = results()
-    found.outcomes[ControlEntry(ONE, "dakf", "lqr")] = episodes(3.0, 10, "bad-action")
+    found[ONE, Entry("lqr", "dakf")] = episodes(3.0, 10, "bad-action")
     assert ["1", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in list_failures(found)
     standing = next(each for each in table(found) if each.entry.estimator == "dakf")
     assert standing.by_task[ONE]["bad_action_rate"].value == 0.25
@@ -158,39 +172,39 @@ def test_a_nan_of_a_contestant_is_a_failure_that_is_not_the_cars() -> None:
 def test_nothing_to_win_is_said() -> None:
     found = results()
     for who in (NOMINAL, STATE):
-        found.outcomes[ControlEntry(TWO, "", who)] = episodes(5.0)
-    (cells,) = make_task_table("", table(found)[:1], [TWO]).cells
+        found[TWO, Entry(who)] = episodes(5.0)
+    (cells,) = texts(make_task_table("", table(found)[:1], [TWO]))
     assert cells[1].startswith("nothing to win here")
-    assert make_oracle_table(found, [TWO], {}).cells[0][-1] == "nothing to win here"
+    assert texts(_make_oracle_table(matrix(found)))[1][-1] == "nothing to win here"
 
 
 def test_who_is_above_the_oracle_is_a_finding() -> None:
-    assert describe_findings(table(results())) == []
+    assert _describe_findings(table(results())) == []
     found = results()
     for contest in (ONE, TWO):
-        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(0.5)
-    (said,) = describe_findings(table(found))
+        found[contest, Entry("lqr", "dakf")] = episodes(0.5)
+    (said,) = _describe_findings(table(found))
     assert "lqr on dakf costs less than oracle-state in tier 1" in said
 
 
 def test_who_is_surely_below_the_clairvoyant_is_named() -> None:
     rng = np.random.default_rng(0)
     leads = [rng.normal(0.3, 0.3, 64), rng.normal(-0.3, 0.3, 64), rng.normal(0.0, 0.3, 64)]
-    assert find_below_optimum(["above", "below", "level"], leads) == ["below"]
+    assert _select_cheaper(["above", "below", "level"], leads) == ["below"]
     many = [rng.normal(0.0, 0.3, 64) for _ in range(40)]
-    assert find_below_optimum([str(k) for k in range(40)], many) == []
+    assert _select_cheaper([str(k) for k in range(40)], many) == []
 
 
 def test_the_ladders_steps_are_ratios_of_costs() -> None:
-    ahead = {ONE: np.full(8, np.log(1.5))}
-    made = make_knowledge_table(results(), {"1": [ONE, TWO]}, ahead)
-    numbers = [float(text.split(" ")[0]) for text in made.cells[0][1:]]
+    ahead = {(ONE, Entry(STATE)): np.full(8, np.log(1.5))}
+    made = _make_knowledge_table(matrix(results(), regrets=ahead))
+    numbers = [float(text.split(" ")[0]) for text in texts(made)[0][1:]]
     assert numbers == pytest.approx([2.0, 4.0, 1.5], rel=0.05)
-    assert make_knowledge_table(results(), {"1": [ONE, TWO]}, {}).cells[0][3] == ""
+    assert texts(_make_knowledge_table(matrix(results())))[0][3] == ""
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
-    _, controller, estimator, why, rest = compose_verdict({"1": table(results())}).splitlines()
+    _, controller, estimator, why, rest = compose_verdict(matrix(results())).splitlines()
     best = REFERENCE_FILTER.replace(", ", " with ")
     assert f"controller, {best} costs least, 6" in estimator and "as much as dakf" in estimator
     assert "controllers lqr costs least, 33 % [" in controller and "as much as esc" in controller
@@ -202,46 +216,46 @@ def test_the_answer_names_the_best_and_by_how_much() -> None:
 def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
     found, other = results(), results()
     for contest in (ONE, TWO):
-        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(2.0)
-        other.outcomes[ControlEntry(contest, REFERENCE_FILTER, "esc")] = episodes(1.5)
-        found.outcomes[ControlEntry(contest, REFERENCE_FILTER, "esc")] = episodes(60.0)
-    _, _, estimator, *_ = compose_verdict({"1": table(found)}).splitlines()
+        found[contest, Entry("lqr", "dakf")] = episodes(2.0)
+        other[contest, Entry("esc", REFERENCE_FILTER)] = episodes(1.5)
+        found[contest, Entry("esc", REFERENCE_FILTER)] = episodes(60.0)
+    _, _, estimator, *_ = compose_verdict(matrix(found)).splitlines()
     assert "cost least, too close to tell apart" in estimator and "dakf" in estimator
     two = [replace(each, scales=table(found)[0].scales) for each in table(found)]
     elsewhere = {ControlTask("2", scenario=c.scenario): c for c in (ONE, TWO)}
     for each, there in zip(two, [{e.label: e for e in table(other)}] * len(two), strict=True):
         each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
-    *_, rest = compose_verdict({"1": table(found), "2": two}).splitlines()
+    *_, rest = compose_verdict(Matrix(found, {"1": table(found), "2": two})).splitlines()
     assert rest.startswith("It costs less with esc in tier 2. ")
 
 
 def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> None:
     """A policy of one class of contests, however little it costs there."""
     found = results()
-    found.outcomes[ControlEntry(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
-    _, controller, *_, rest = compose_verdict({"1": table(found)}).splitlines()
+    found[TWO, Entry("distill-car-yaw", "joint")] = episodes(1.2)
+    _, controller, *_, rest = compose_verdict(matrix(found)).splitlines()
     assert "controllers lqr costs least, 33 % [" in controller
     assert rest.startswith("It costs less with distill-car-yaw on its own manoeuvres. ")
-    found.outcomes[ControlEntry(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
-    _, controller, *_, rest = compose_verdict({"1": table(found)}).splitlines()
+    found[ONE, Entry("distill-car-yaw", "joint")] = episodes(1.2)
+    _, controller, *_, rest = compose_verdict(matrix(found)).splitlines()
     assert "controllers distill-car-yaw costs" in controller and rest.startswith("Not covered")
 
 
 def test_without_an_episode_that_counts_nobody_wins() -> None:
     found = results()
     for contest in (ONE, TWO):
-        found.outcomes[ControlEntry(contest, "", STATE)] = episodes(9.0, 40)
-    _, controller, estimator, *_ = compose_verdict({"1": table(found)}).splitlines()
+        found[contest, Entry(STATE)] = episodes(9.0, 40)
+    _, controller, estimator, *_ = compose_verdict(matrix(found)).splitlines()
     assert "nobody has a score" in estimator and "nobody has a score" in controller
 
 
 def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
     standing = table(results())
-    metrics = {row.metric for row in make_rows(standing[0], "ab")}
+    metrics = {row.metric for row in rows(standing[0])}
     assert {metric.name for metric in EPISODE} - {"failure"} <= metrics
-    shown = make_motion_table("", standing)
+    shown = _make_motion_table("", standing)
     for metric in EPISODE:
         if metric.heading:
             column = list(shown.header).index(metric.heading)
-            value = float(shown.cells[0][column]) / metric.scale
+            value = float(texts(shown)[0][column]) / metric.scale
             assert value == pytest.approx(standing[0].mean(metric.name), abs=0.5 / metric.scale)

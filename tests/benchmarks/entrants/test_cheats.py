@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import Chunk
 from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.entrants.worker import run_isolated_chunk, run_rehearsal
+from sideslip.benchmarks.entrants.worker import IsolatedDrive
 
 SEEDS = (918273645, 918273646)
 LANDLOCK = ctypes.CDLL(None).syscall(444, None, 0, 1) if sys.platform == "linux" else 0
@@ -42,15 +42,14 @@ def cheat(folder: Path, init: str, predict: str = "") -> Chunk:
         "        return np.zeros((len(observation), 1), np.float32), state",
     ]
     (folder / "mine.py").write_text("\n".join(lines))
-    options = {"scenario": {"base": "gust", "duration": 0.05}}
-    return Chunk(
-        ControlEntry(ControlTask(scenario="gust"), "", str(folder / "mine.py"), options), SEEDS
-    )
+    changes = {"scenario": {"base": "gust", "duration": 0.05}}
+    task = ControlTask(scenario="gust", changes=changes)
+    return Chunk(task, Entry(str(folder / "mine.py")), SEEDS)
 
 
 def test_neither_env_nor_seeds_nor_files_of_the_driver_are_in_reach(tmp_path: Path) -> None:
     (tmp_path / "result.npz").write_bytes(b"right")
-    driven = run_isolated_chunk(cheat(tmp_path, f"""
+    driven = IsolatedDrive()(cheat(tmp_path, f"""
 base, parent = env.unwrapped, f"/proc/{{os.getppid()}}"
 found = {{
     "state": attempt(lambda: base.states),
@@ -89,14 +88,14 @@ raise ValueError(json.dumps(found))
 def test_a_hang_ends_with_what_it_started(tmp_path: Path) -> None:
     """At the limit, and the reason says where it was."""
     body = 'subprocess.Popen(["sleep", "91827.364"])\nwhile True: pass'
-    driven = run_isolated_chunk(cheat(tmp_path, body), limit=2.0)
+    driven = IsolatedDrive(2.0)(cheat(tmp_path, body))
     assert re.fullmatch(r"no end within 2 s, still in mine.py, line \d+", driven.error)
     running = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
     assert not any(b"91827.364" in text for text in running)
 
 
 def test_memory_ends_at_a_stated_limit(tmp_path: Path) -> None:
-    driven = run_isolated_chunk(cheat(tmp_path, "self.kept = bytearray(5 * 2**30)"))
+    driven = IsolatedDrive()(cheat(tmp_path, "self.kept = bytearray(5 * 2**30)"))
     stated = r"MemoryError: .mine.py, line \d+.; a contestant has 4 GiB of memory"
     assert re.fullmatch(stated, driven.error)
 
@@ -108,11 +107,11 @@ def test_what_it_opens_shows_in_a_rehearsal_or_ends_it(when: str, tmp_path: Path
     (tmp_path / "table.txt").write_text("2")
     read = f"open({str(tmp_path / 'table.txt')!r}).read()"
     if when == "before":
-        driven, opened = run_rehearsal(cheat(tmp_path, f"import neighbour\n{read}"))
+        opened = IsolatedDrive().rehearse(cheat(tmp_path, f"import neighbour\n{read}"))
         names = {"mine.py", "neighbour.py", "table.txt"}
-        assert not driven.error and opened == {str(tmp_path / name) for name in names}
+        assert opened == {str(tmp_path / name) for name in names}
         return
-    allowed = [str(tmp_path / name) for name in ("mine.py", "neighbour.py")]
-    driven = run_isolated_chunk(cheat(tmp_path, "import neighbour", read), allowed=allowed)
+    allowed = frozenset(str(tmp_path / name) for name in ("mine.py", "neighbour.py"))
+    driven = IsolatedDrive(allowed=allowed)(cheat(tmp_path, "import neighbour", read))
     right = f"it opened {tmp_path}/table.txt, which it had not opened in the rehearsal"
     assert driven.error == right

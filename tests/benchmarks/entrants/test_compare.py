@@ -12,8 +12,8 @@ import pytest
 import sideslip
 from sideslip.benchmarks.control.entries import (
     REFERENCE_FILTER,
-    ControlEntry,
-    make_agent_options,
+    ControlCase,
+    Entry,
     select_quick_tasks,
 )
 from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, Results, run_chunk
@@ -31,8 +31,8 @@ from sideslip.benchmarks.entrants import baselines, score
 from sideslip.benchmarks.entrants.challenge import (
     EPISODES,
     ComparisonRequest,
-    UserEntry,
     make_user_entries,
+    make_user_entry,
 )
 from sideslip.benchmarks.entrants.score import _make_sentence, compose_verdict, make_table
 from tests.benchmarks.conftest import Run
@@ -43,7 +43,7 @@ class Pd:
     def __init__(self, env):
         pass
 """
-Driven = list[tuple[ControlEntry, tuple[int, ...]]]
+Driven = list[tuple[ControlCase, tuple[int, ...]]]
 
 
 def wrapped(folder: Path, options: dict[str, Any]) -> str:
@@ -58,11 +58,12 @@ def wrapped(folder: Path, options: dict[str, Any]) -> str:
     return f"{path}:Mine"
 
 
+@pytest.mark.long
 def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run) -> None:
     """Bit for bit, by command and by `score`; so it is nominal, whose design LQR is."""
     contest = ControlTask("", YAW, "coms", "zero-slip", "gust")
-    shipped = ControlEntry(contest, REFERENCE_FILTER, "lqr")
-    mine = wrapped(tmp_path, make_agent_options(shipped))
+    shipped = Entry("lqr", REFERENCE_FILTER)
+    mine = wrapped(tmp_path, ControlCase(contest, shipped).agent_options)
     rows = tmp_path / "rows.json"
     arguments = ("--scenario", "gust", "--env", YAW, "--episodes", 4, "--jobs", 1, "--json", rows)
     status, out, error = run("bench", "control", "--agent", mine, *arguments)
@@ -73,7 +74,7 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
         if row["controller"] == mine and row["scenario"] == contest.name
     }
     seeds = tuple(make_task_seeds(make_salt(), 4)(contest))
-    costs = run_chunk(Chunk(shipped, seeds)).costs
+    costs = run_chunk(Chunk(contest, shipped, seeds)).costs
     assert number["cost"] == np.mean(costs)
     assert number["score"] == 0.0 and number["cost_vs_nominal"] == 1.0
     words = " ".join(out.split())
@@ -93,30 +94,34 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     """Every cell that is to be driven with its seeds; none is. Whom the user brings costs half."""
     asked: Driven = []
 
-    def stand_in(cells: Sequence[ControlEntry], seeds: Seeds, **_: Any) -> Results:
-        mine = [(c, tuple(seeds(c.task) if callable(seeds) else seeds)) for c in cells]
+    def stand_in(cells: Sequence[ControlCase], seeds: Seeds, **_: Any) -> Results:
+        mine = [(c, tuple(seeds(c[0]) if callable(seeds) else seeds)) for c in cells]
         asked.extend(mine)
-        return Results({cell: episodes(cell, len(each)) for cell, each in mine})
+        return {cell: episodes(cell[1], len(each)) for cell, each in mine}
 
     monkeypatch.setattr(score, "measure", stand_in)
     monkeypatch.setattr(baselines, "measure", stand_in)
     return asked
 
 
-def episodes(cell: ControlEntry, n: int) -> DriveResult:
+def episodes(entry: Entry, n: int) -> DriveResult:
     levels = {NOMINAL: 4.0, "oracle-state": 1.0, "none": 20.0}
     numbers = np.zeros((n, len(NUMBERS)))
-    numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
-    numbers[: n // 3, FAILURE] = cell.controller.endswith("e.py")
-    if "broken" in cell.controller:
+    numbers[:, COST] = levels.get(entry.agent, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
+    numbers[: n // 3, FAILURE] = entry.agent.endswith("e.py")
+    if "broken" in entry.agent:
         nothing = np.full_like(numbers, np.nan)
         return DriveResult(nothing, np.nan, error="ValueError: no (pd.py, line 3)")
     return DriveResult(numbers, 0.0)
 
 
+def on_default(agent: str) -> Entry:
+    return make_user_entry(agent, REFERENCE_FILTER)
+
+
 def challenge(folder: Path, **options: Any) -> ComparisonRequest:
     (folder / "pd.py").write_text(PD)
-    return ComparisonRequest((UserEntry(f"{folder}/pd.py:Pd"),), **options)
+    return ComparisonRequest((on_default(f"{folder}/pd.py:Pd"),), **options)
 
 
 def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) -> None:
@@ -124,16 +129,16 @@ def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) 
     monkeypatch.setattr(baselines, "FILE", folder / "baselines.json")
     monkeypatch.setattr(baselines, "EPISODES", 8)
     monkeypatch.setattr(baselines, "make_salt", lambda: "abcd")
-    baselines.write_baselines(folder / "baselines.json")
+    baselines._write_baselines(folder / "baselines.json")
     text = json.loads((folder / "baselines.json").read_text())
     for entry in text:
         entry["costs"] = [change * cost for cost in entry["costs"]]
     (folder / "baselines.json").write_text(json.dumps(text))
 
 
-def salted(salt: str, n: int, cell: ControlEntry) -> tuple[int, ...]:
+def salted(salt: str, n: int, cell: ControlCase) -> tuple[int, ...]:
     """A contest's test seeds."""
-    return tuple(make_task_seeds(salt, n)(cell.task))
+    return tuple(make_task_seeds(salt, n)(cell[0]))
 
 
 def test_committed_baselines_serve_where_a_sample_costs_the_same(
@@ -143,11 +148,11 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
     del driven[:]
     found = score.compare(challenge(tmp_path, episodes=8))
     assert found.on_file and found.salt == "abcd"
-    mine = [(cell, seeds) for cell, seeds in driven if cell.is_users]
+    mine = [(cell, seeds) for cell, seeds in driven if cell[1].is_users]
     assert mine and all(seeds == salted("abcd", 8, cell) for cell, seeds in mine)
-    again = [(cell, seeds) for cell, seeds in driven if not cell.is_users]
+    again = [(cell, seeds) for cell, seeds in driven if not cell[1].is_users]
     assert again and all(seeds == salted("abcd", 2, cell) for cell, seeds in again)
-    assert {cell.controller for cell, _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
+    assert {entry.agent for (_, entry), _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
     assert "on file, a sample driven again" in compose_verdict(found)[-1]
 
 
@@ -168,8 +173,8 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     found = score.compare(challenge(tmp_path, **{"episodes": 8} | options))
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
-    assert set(everyone) == set(found.results.outcomes)
-    contests = {cell.task for cell in everyone}
+    assert set(everyone) == set(found.results)
+    contests = {task for task, _ in everyone}
     assert len(set(everyone.values())) == (1 if why == "seeds" else len(contests))
     if why in ("costs", "episodes", "vehicle", "scenario"):
         salt = make_salt()
@@ -177,7 +182,11 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     if why == "seeds":
         assert set(everyone.values()) == {(5, 6, 7)} and found.salt == ""
     if why == "vehicle":
-        cars = [cell.env_options[car] for cell in everyone for car in ("vehicle", "nominal")]
+        cars = [
+            ControlCase(task, entry).env_options[car]
+            for task, entry in everyone
+            for car in ("vehicle", "nominal")
+        ]
         assert {car["mass"] for car in cars} == {900.0}
     assert ("Publishable" in compose_verdict(found)[-1]) == (why == "fresh")
 
@@ -193,14 +202,14 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     again = score.compare(challenge(tmp_path, salt=found[0].salt))
     assert again.salt == found[0].salt and "Not publishable" in compose_verdict(again)[-1]
     assert f"--salt {found[0].salt} repeats them" in compose_verdict(found[0])[-1]
-    mine = [seeds for cell, seeds in driven if cell.is_users]
+    mine = [seeds for cell, seeds in driven if cell[1].is_users]
     third = len(mine) // 3
     assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
     monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
     salts = set()
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
-        request = ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)
+        request = ComparisonRequest((on_default(f"{tmp_path}/pd.py"),), fresh=True)
         salts.add(score.compare(request).salt)
     assert len(salts) == 2
 
@@ -208,26 +217,27 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
 def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     tmp_path: Path, driven: Driven
 ) -> None:
-    pairs = [UserEntry(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
+    pairs = [on_default(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
-        Path(str(pair.agent)).write_text(PD)
+        Path(pair.agent).write_text(PD)
     found = score.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
     lines = compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
-    mine = found.select(pairs[0])
-    assert lines[0] == f"Place 3 of 9: {_make_sentence(mine)}."
+    mine, fails, broken = (
+        _make_sentence(next(x for x in found.overall if x.entry == pairs[i])) for i in (0, 4, 1)
+    )
+    assert lines[0] == f"Place 3 of 9: {mine}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
-    assert "fails in 33.3 % (nominal 0.0 %)" in _make_sentence(found.select(pairs[4]))
-    broken = _make_sentence(found.select(pairs[1]))
+    assert "fails in 33.3 % (nominal 0.0 %)" in fails
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
     cells = make_table(found).cells
-    assert sum(line[0].startswith("> ") for line in cells) == 5
+    assert sum(line["label"].startswith("> ") for line in cells) == 5
     assert len(cells) == 5 + 4
 
 
 def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
-    assert make_user_entries(["esc"], []) == [UserEntry("esc", REFERENCE_FILTER)]
+    assert make_user_entries(["esc"], []) == [on_default("esc")]
     found = make_user_entries(["esc", "two-dof"], ["dakf", ""])
     assert [(pair.agent, pair.estimator) for pair in found] == [
         *(("esc", "dakf"), ("esc", ""), ("two-dof", "dakf"), ("two-dof", "")),
@@ -237,8 +247,8 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
 
 
 def test_contests_are_those_of_the_id() -> None:
-    esc = (UserEntry("esc"),)
-    assert list(ComparisonRequest(esc).tasks) == select_quick_tasks(list_scored_tasks())
+    esc = (on_default("esc"),)
+    assert ComparisonRequest(esc).tasks == select_quick_tasks(list_scored_tasks())
     steering = ComparisonRequest(esc, env_id=STEERING).tasks
     assert {contest.env_id for contest in steering} == {STEERING} and len(steering) == 4
     vision = list(ComparisonRequest(esc, env_id="sideslip/YawVision-v0").tasks)
@@ -261,17 +271,19 @@ def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> N
         "sideslip.benchmarks.control.entries.get_tuned_options",
         lambda kind, name: tuned.get(name, {}),
     )
-    mine = UserEntry("my.py:Pd").make_entry(ControlTask())
-    assert mine.best == {"filter": {"force_sd": 7.0}, "controller": {}}
-    assert mine.is_users and not UserEntry("esc").make_entry(ControlTask()).is_users
-    assert not UserEntry(NOMINAL, "").make_entry(ControlTask()).is_users
+    mine = on_default("my.py:Pd")
+    assert ControlCase(ControlTask(), mine).options == {
+        "filter": {"force_sd": 7.0},
+        "controller": {},
+    }
+    assert mine.is_users and not on_default("esc").is_users and not on_default(NOMINAL).is_users
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "agent": ({"entries": (UserEntry("lqrr"),)}, "unknown agent 'lqrr'"),
-    "estimator": ({"entries": (UserEntry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
-    "zip": ({"entries": (UserEntry("mine.zip"),)}, "mine.zip"),
-    "file": ({"entries": (UserEntry("mine.py:A"),)}, "there is no file mine.py"),
+    "agent": ({"entries": (on_default("lqrr"),)}, "unknown agent 'lqrr'"),
+    "estimator": ({"entries": (Entry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
+    "zip": ({"entries": (on_default("mine.zip"),)}, "mine.zip"),
+    "file": ({"entries": (on_default("mine.py:A"),)}, "there is no file mine.py"),
     "id": ({"env_id": "YawFusion"}, "env"),
     "one episode": ({"episodes": 1}, "two episodes"),
     "no files": ({"fresh": True}, "there is none"),
@@ -287,7 +299,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) -> None:
     options, message = WRONG[case]
     with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message):
-        ComparisonRequest(**{"entries": (UserEntry("esc"),)} | options)
+        ComparisonRequest(**{"entries": (on_default("esc"),)} | options)
 
 
 @pytest.mark.parametrize(
@@ -310,6 +322,6 @@ def test_options_that_do_not_go_together(
 @pytest.mark.long
 def test_the_baselines_on_file_still_cost_the_same() -> None:
     """Else: `python -m sideslip.benchmarks.entrants.baselines`."""
-    cells = baselines.make_baseline_entries(select_quick_tasks(list_scored_tasks()))
+    cells = baselines.make_baseline_cases(select_quick_tasks(list_scored_tasks()))
     assert len(baselines.read_baselines()) == len(cells)
     assert baselines.find_baselines(cells, EPISODES) is not None

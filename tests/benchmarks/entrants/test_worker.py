@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import Chunk
 from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.entrants.worker import _find_place, run_isolated_chunk, run_user_chunk
+from sideslip.benchmarks.entrants.worker import IsolatedDrive, _find_place, run_user_chunk
 
-GUST = ControlTask(scenario="gust")
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
+GUST = ControlTask(scenario="gust", changes=SHORT)
 HEAD = """
 import os
 import numpy as np
@@ -30,8 +30,7 @@ class Mine:
 
 def chunk(folder: Path, body: str, estimator: str = "") -> Chunk:
     (folder / "mine.py").write_text(f"{HEAD}        {body}\n")
-    cell = ControlEntry(GUST, estimator, str(folder / "mine.py"), dict(SHORT))
-    return Chunk(cell, (0, 1, 2), keep=True)
+    return Chunk(GUST, Entry(str(folder / "mine.py"), estimator), (0, 1, 2), keep=True)
 
 
 WRONG = {
@@ -65,12 +64,12 @@ def test_what_it_does_to_its_process_is_its_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends, or never returns; the numbers of one that drives are those of this process."""
-    gone = run_isolated_chunk(chunk(tmp_path, "os._exit(3)"))
+    gone = IsolatedDrive()(chunk(tmp_path, "os._exit(3)"))
     assert gone.error == "its process ended with status 3"
     asleep = chunk(tmp_path, "import time; time.sleep(1e6)")
-    assert run_isolated_chunk(asleep, limit=1.0).error.startswith("no end within 1 s")
+    assert IsolatedDrive(1.0)(asleep).error.startswith("no end within 1 s")
     fine = chunk(tmp_path, "print('hello'); action[:] = 0.1; return action, state")
-    apart, here = run_isolated_chunk(fine), run_user_chunk(fine)
+    apart, here = IsolatedDrive()(fine), run_user_chunk(fine)
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)
     assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
@@ -106,7 +105,7 @@ class Integrator:
 
 def test_a_filter_in_a_child_gives_the_bits_of_one_in_this_process(tmp_path: Path) -> None:
     (tmp_path / "filter.py").write_text(FILTER)
-    cell = ControlEntry(GUST, str(tmp_path / "filter.py"), "lqr", dict(SHORT))
-    apart, here = (drive(Chunk(cell, (0, 1, 2))) for drive in (run_isolated_chunk, run_user_chunk))
+    chunk = Chunk(GUST, Entry("lqr", str(tmp_path / "filter.py")), (0, 1, 2))
+    apart, here = (drive(chunk) for drive in (IsolatedDrive(), run_user_chunk))
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)

@@ -7,10 +7,12 @@ from zipfile import ZipFile
 import pytest
 
 import sideslip
+from sideslip.benchmarks.control.entries import ControlCase
 from sideslip.benchmarks.control.tasks import YAW, ControlTask
 from sideslip.benchmarks.entrants.challenge import ComparisonRequest, make_user_entries
 
 
+@pytest.mark.long
 def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
     """On the observation that it was trained on."""
     sb3 = pytest.importorskip("stable_baselines3")
@@ -36,7 +38,7 @@ def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
         archive.writestr("data", "{}")
         archive.writestr("policy.pth", "")
     (pair, other) = make_user_entries([mine, "esc"], [], trust=True)
-    assert pair.estimator == "" and pair.make_entry(ControlTask()).best["controller"] == {
+    assert pair.estimator == "" and ControlCase(ControlTask(), pair).options["controller"] == {
         "trust": True
     }
     assert not other.trust

@@ -121,6 +121,7 @@ def hits(estimates: Sequence[Estimate], true: float) -> int:
     return sum(each.low <= true <= each.high for each in estimates)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", OF_STRATA)
 def test_intervals_over_strata_cover_93_of_100_data_sets(name: str) -> None:
     """The true number is that of strata as large as can be, of the same laws."""
@@ -133,6 +134,7 @@ def test_intervals_over_strata_cover_93_of_100_data_sets(name: str) -> None:
         assert count <= MOST
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", OF_SEEDS)
 def test_intervals_over_seeds_cover_93_of_100_data_sets(name: str) -> None:
     statistic, true = OF_SEEDS[name]

@@ -18,12 +18,13 @@ from rich.console import Console
 
 from sideslip.benchmarks.harness import parallel
 from sideslip.benchmarks.harness.parallel import (
-    execute_cases,
+    _execute_cases,
     run_cases,
     use_engine,
     use_shared_bar,
 )
-from sideslip.benchmarks.studies.estimation import run
+from sideslip.benchmarks.report.study import Request
+from sideslip.benchmarks.studies.estimation import STUDY
 
 CASES = [float(k) for k in range(12)]
 
@@ -63,7 +64,7 @@ def test_an_engine_that_is_none_is_refused(engine: tuple[str, ...], message: str
 
 
 class Deadly:
-    """Ray's calls that `execute_cases` makes; the worker of each case dies so many times."""
+    """Ray's calls that `_execute_cases` makes; the worker of each case dies so many times."""
 
     def __init__(self, deaths: int) -> None:
         self.deaths = deaths
@@ -89,10 +90,10 @@ class Deadly:
 def test_a_case_outlives_so_many_deaths_of_its_worker_and_no_more() -> None:
     token = parallel._CLUSTER.set(Deadly(parallel.RETRIES))
     try:
-        assert dict(execute_cases(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
+        assert dict(_execute_cases(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
         parallel._CLUSTER.set(Deadly(parallel.RETRIES + 1))
         with pytest.raises(ChildProcessError):
-            list(execute_cases(abs, [-1]))
+            list(_execute_cases(abs, [-1]))
     finally:
         parallel._CLUSTER.reset(token)
 
@@ -116,7 +117,7 @@ def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     nodes, second = cluster
     with use_engine("ray", nodes.address):
         found: list[float] = []
-        for _, result in execute_cases(partial(noted, str(tmp_path), 1.0), CASES):
+        for _, result in _execute_cases(partial(noted, str(tmp_path), 1.0), CASES):
             found.append(result)
             if len(found) == 4:
                 before = counted(tmp_path, "done")
@@ -127,27 +128,38 @@ def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     assert max(starts.values()) <= 2 and sum(starts.values()) <= len(CASES) + 2
 
 
-@pytest.mark.long
-def test_a_case_that_ends_its_process_ends_the_work(
-    cluster: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from ray.exceptions import WorkerCrashedError
+ENDING = """
+import os, sys
+from ray.exceptions import WorkerCrashedError
+from sideslip.benchmarks.harness import parallel
 
-    monkeypatch.setattr(parallel, "RETRIES", 1)
-    with pytest.raises(WorkerCrashedError), use_engine("ray", cluster[0].address):
-        run_cases(os._exit, [1])
+parallel.RETRIES = 1
+with parallel.use_engine("ray", sys.argv[1]):
+    try:
+        parallel.run_cases(os._exit, [1])
+    except WorkerCrashedError:
+        print("the work ended", flush=True)
+"""
+
+
+@pytest.mark.long
+def test_a_case_that_ends_its_process_ends_the_work(cluster: Any) -> None:
+    """In a process of its own, which Ray's shutdown may end by a signal after such a death."""
+    command = [sys.executable, "-c", ENDING, cluster[0].address]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "the work ended" in done.stdout, done.stderr
 
 
 DRIVER = """
 import sys
 from pathlib import Path
-from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.control.run import CHUNK, measure
 from sideslip.benchmarks.harness.parallel import use_engine
 
 with use_engine("ray", sys.argv[1]):
-    cells = [ControlEntry(contest, "", "none") for contest in list_scored_tasks()[:6]]
+    cells = [(contest, Entry("none")) for contest in list_scored_tasks()[:6]]
     measure(cells, range(4 * CHUNK), keep=Path(sys.argv[2]))
 """
 
@@ -170,9 +182,9 @@ def test_a_driver_that_is_killed_goes_on(cluster: Any, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
     nodes, _ = cluster
-    alone = run(1, jobs=2)
+    alone = STUDY.run(Request(episodes=1, jobs=2))
     with use_engine("ray", nodes.address):
-        there = run(1)
+        there = STUDY.run(Request(episodes=1))
     timed = "us_per_tick"
     rows = [[repr(row) for row in each.rows if row.metric != timed] for each in (alone, there)]
     assert rows[0] == rows[1]  # as text: NaN is no NaN

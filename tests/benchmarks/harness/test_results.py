@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sideslip.benchmarks.harness.results import (
+    Column,
     ResultRow,
     ResultTable,
     Suite,
@@ -35,13 +36,14 @@ def test_rows_round_trip_through_json(tmp_path: Path) -> None:
 
 
 def test_a_notebook_shows_verdict_and_table_and_pandas_has_the_rows() -> None:
-    table = ResultTable("Costs", ("who", "cost"), [["a < b", "1.0"]], "n = 3")
+    columns = ("who", Column("cost", "cost / %", 100.0))
+    table = ResultTable("Costs", columns, [{"who": "a < b", "cost": 0.5}], "n = 3")
     suite = Suite("s", "A suite", "", ROWS, [table], verdict="a wins.\nb does not.")
     html = suite._repr_html_()
     for text in ("<p>a wins.</p>", "A suite", "a &lt; b", "n = 3"):
         assert text in html
     assert suite.to_pandas().to_dict("records")[0]["metric"] == ROWS[0].metric
-    assert table.to_pandas()["cost"].tolist() == ["1.0"]
+    assert table.to_pandas()["cost / %"].tolist() == [50.0]
 
 
 def test_rows_as_parquet(tmp_path: Path) -> None:

@@ -7,18 +7,25 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES, describe_leader, format_verdict
+from sideslip.benchmarks.harness.verdict import (
+    LETTERS,
+    LINES,
+    Explorer,
+    Panel,
+    describe_leader,
+    format_verdict,
+)
 from sideslip.benchmarks.papers import suite as papers
-from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredPart
+from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredClaim, MeasuredPart
 from sideslip.benchmarks.procedures import iso3888
 from sideslip.benchmarks.procedures import suite as procedures
-from sideslip.benchmarks.procedures.drive import CARS, ENTRIES
+from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
-from sideslip.benchmarks.procedures.tables import ProcedureCase, SineDwellOutcome
 from sideslip.benchmarks.recorded import suite as recorded
 from sideslip.benchmarks.recorded.suite import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
+from sideslip.benchmarks.speed.timing import Taken
 from sideslip.benchmarks.studies import coordinated_control, estimation, recovery_region
 
 RNG = np.random.default_rng(0)
@@ -52,9 +59,10 @@ def test_an_interval_that_reaches_one_is_a_tie() -> None:
 def errors(levels: dict[str, float], experiment: estimation.Experiment) -> Any:
     """Squared errors of 50 seeds, of those not named 16."""
     common = RNG.lognormal(0.0, 0.3, 50)
-    means = [levels.get(each.label, 16.0) for each in experiment.filters]
-    columns = [mean * common * RNG.lognormal(0.0, 0.05, 50) for mean in means]
-    return np.array(columns).T, 1.0 * common
+    labels = [each.label for each in experiment.filters]
+    scales = {label: levels.get(label, 16.0) * RNG.lognormal(0.0, 0.05, 50) for label in labels}
+    scales[estimation.BOUND] = np.ones(50)
+    return {label: np.stack([scale * common, scale], 1) for label, scale in scales.items()}
 
 
 def test_the_best_estimator_is_named_for_each_experiment() -> None:
@@ -63,7 +71,7 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
         errors({"multirate-kf": 4.0, "bicycle-kf": 64.0} | true, estimation.EXPERIMENTS[0]),
         errors({"dakf": 4.0, "course-kf": 4.0} | true, estimation.EXPERIMENTS[1]),
     ]
-    _, camera, gps, why, _ = fits(estimation.compose_verdict(found))
+    _, camera, gps, why, _ = fits(estimation.STUDY.compose_verdict(found))
     assert camera.startswith("Late camera: multirate-kf errs least, 50 % [")
     assert "2.00 times the least possible" in camera
     assert "err least, too close to tell apart" in gps and "dakf" in gps and "course-kf" in gps
@@ -80,12 +88,12 @@ def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
     cars = {"a car": {name: shares(level) for name, level in levels.items()}}
     cars["a car"][recovery_region.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
     cars["another"] = cars["a car"] | {"lqr": cars["a car"]["esc"]}
-    _, first, second, why, _ = fits(recovery_region.compose_verdict(cars))
+    _, first, second, why, _ = fits(recovery_region.STUDY.compose_verdict(cars))
     assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
     assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
     assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
     undriven = {"a car": {"none": shares(0.1)}}
-    assert len(fits(recovery_region.compose_verdict(undriven))) == 2
+    assert len(fits(recovery_region.STUDY.compose_verdict(undriven))) == 2
 
 
 def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None:
@@ -97,22 +105,25 @@ def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None
     lanes = [np.full((30, 3), 5.0)]
     for i in range(1, len(coordinated_control.LANE_CONTROLLERS)):
         lanes.append(np.column_stack([RNG.normal(1.0 if i != 4 else 0.5, 0.05, 30)] * 3))
-    _, follows, lane, why, _ = fits(coordinated_control.compose_verdict(found, lanes))
+    compose = coordinated_control.STUDY.compose_verdict
+    results = coordinated_control.FollowingResults(found, found, lanes)
+    _, follows, lane, why, _ = fits(compose(results))
     assert "K = 20 rad/s errs least, 10 %" in follows and "fail at 50, 100" in follows
     assert lane.startswith("Lanes: both on multirate-residual-kf strays least, 5")
     assert "m by -4" in why and "5.0 m" in why
     found[..., 3] = 1.0
-    assert "every bandwidth" in coordinated_control.compose_verdict(found, lanes)
+    assert "every bandwidth" in compose(results)
 
 
 def claim(paper: str, stated: str, value: float) -> Any:
-    part = ClaimPart("x", "s", lambda _: np.empty(0), Bound(stated, 1.0), Bound("<", 9.0))
-    return Claim(paper, "Fig. 1", "smaller", (part,)), (MeasuredPart(part, np.full(4, value)),)
+    part = ClaimPart("x", "s", "a", stated=Bound(stated, 1.0), threshold=Bound("<", 9.0))
+    parts = (MeasuredPart(part, np.full(4, value)),)
+    return MeasuredClaim(Claim(paper, "Fig. 1", "smaller", part), parts)
 
 
 def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
     ledger = [claim("one", "<", 0.5), claim("one", ">", 0.5), claim("two", "<", 0.1)]
-    counts, by, failed, missed, _ = fits(papers.compose_verdict(ledger))
+    counts, by, failed, missed, _ = fits(papers._compose_verdict(papers.LedgerResults(ledger, {})))
     assert counts == "3 claims of 2 papers: 2 reproduced, 1 not reproduced."
     assert "one 1 of 2; two 1 of 1" in by
     assert failed.startswith("Not reproduced: one Fig. 1.")
@@ -123,7 +134,7 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
     def sine(fails: bool) -> Any:
         ratio = 0.9 if fails else 0.1
         runs = (SineDwellRun(1.0, 3.0, 0.1, 0.1, 2.0), SineDwellRun(2.0, 6.0, ratio, 0.1, 2.0))
-        return SineDwellOutcome(SineDwellResult(0.3, runs), None)  # type: ignore[arg-type]
+        return SineDwellResult(0.3, runs)
 
     track = next(iter(iso3888.TRACKS))
     monkeypatch.setattr(iso3888, "find_highest_speed", lambda runs: runs)
@@ -132,26 +143,37 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
         for k in range(len(ENTRIES)):
             done[ProcedureCase("fmvss-126", car, k)] = sine(fails=k not in (2, 3, 4))
             done[ProcedureCase(track, car, k)] = 30.0 if k == 3 else 20.0
-    lines = fits(procedures.make_verdict(done))
+    lines = fits(procedures._make_verdict(done))
     assert "coms: two-dof, lqr and esc; none fails above 3 A" in lines[1]
     assert "coms 108 with lqr (none 72)" in " ".join(lines)
 
 
 def test_a_replay_without_truth_has_no_winner() -> None:
     traces = {"bicycle-kf": np.zeros(3), "exact-kf": np.zeros(3)}
-    first, *_ = fits(recorded.compose_verdict(Replayed(traces=traces), False))
+    first, *_ = fits(recorded._compose_verdict(Replayed(traces=traces), False))
     assert first.startswith("Nobody wins")
     squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
-    lines = fits(recorded.compose_verdict(Replayed(squares=squares, traces=traces), True))
+    lines = fits(recorded._compose_verdict(Replayed(squares=squares, traces=traces), True))
     assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]
     assert "0.57 deg" in lines[2] and "1.15 deg" in lines[3] and "drawn noise" in lines[4]
 
 
 def test_speed_counts_its_goals_and_names_those_that_are_missed() -> None:
-    taken = {env_steps.FUSION: [9.0, 10.0, 11.0], env_steps.AT_ONCE: [0.5], env_steps.LANE: [300.0]}
+    rounds = {env_steps.FUSION: [9.0, 10.0, 11.0], env_steps.AT_ONCE: [0.5]}
+    taken = {name: Taken(x) for name, x in {**rounds, env_steps.LANE: [300.0]}.items()}
     cells = [["a", ">= 2 x", "3", "", "met"], ["b", ">= 9 x", "3", "", "not met"]]
     cells.append(["c", ">= 1 x", "", "", "not measured"])
-    lines = fits(speed.make_verdict(taken, ResultTable("Targets", ("",) * 5, cells)))
+    lines = fits(speed._make_verdict(taken, ResultTable("Targets", ("",) * 5, cells)))
     assert lines[0].startswith("10 ms of driving cost 10 us on one core, 0.5 us a car")
     assert "it is 30 for lane-keeping" in lines[1]
     assert lines[2] == "1 of 3 goals are met; not met: b (3 of >= 9 x)."
+
+
+def test_cells_that_do_not_fit_an_explorer_are_refused() -> None:
+    t, panels = np.zeros(3), (Panel("slip / mrad", (("beta", "true"),)),)
+    with pytest.raises(ValueError, match="no cells"):
+        Explorer("x", ("a",), {}, panels)
+    with pytest.raises(ValueError, match="has 1 names, 1 menus and a contestant make 2"):
+        Explorer("x", ("a",), {("p",): {"t": t, "beta": t}}, panels)
+    with pytest.raises(ValueError, match="lacks beta"):
+        Explorer("x", (), {("p",): {"t": t}}, panels)

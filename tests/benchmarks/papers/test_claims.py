@@ -13,11 +13,6 @@ from sideslip.benchmarks.papers.ledger import (
     Claim,
     ClaimPart,
     SimulationResult,
-    evaluate_claim,
-    join_results,
-    make_number_part,
-    measure_parts,
-    select_ratio,
 )
 from sideslip.benchmarks.papers.suite import CLAIMS, FIGURES, SIMULATIONS
 from sideslip.benchmarks.papers.tie_vision_theory import _compute_residuals
@@ -28,13 +23,8 @@ def judged(*parts: tuple[Any, Any]) -> str:
     results = {
         "s": SimulationResult({(str(i), "m"): np.array(v) for i, (v, _) in enumerate(parts)})
     }
-    claim = Claim(
-        "p", "(1)", "t", tuple(
-            make_number_part("l", "s", str(i), "m", bound) for i,
-            (_, bound) in enumerate(parts)
-        ),
-    )  # fmt: skip
-    return evaluate_claim(measure_parts(claim, results))
+    made = [ClaimPart("l", "s", str(i), "m", bound) for i, (_, bound) in enumerate(parts)]
+    return Claim("p", "(1)", "t", *made).measure(results).verdict
 
 
 BELOW = Bound("<", 1.0)
@@ -62,20 +52,25 @@ def test_the_verdict_follows_from_the_numbers(parts: Any, expected: str) -> None
 
 def test_a_threshold_is_one_of_the_median_and_not_of_the_verdict() -> None:
     results = {"s": SimulationResult({("a", "m"): np.array([0.7, 0.8, 5.0])})}
-    part = make_number_part("l", "s", "a", "m", BELOW, Bound("<=", 0.75))
-    found = measure_parts(Claim("p", "(1)", "t", (part,)), results)
-    assert found[0].number == (0.8, 0.7, 5.0)
-    assert found[0].meets_threshold is False
-    assert evaluate_claim(found) == "partly"
+    part = ClaimPart("l", "s", "a", "m", BELOW, Bound("<=", 0.75))
+    found = Claim("p", "(1)", "t", part).measure(results)
+    assert found.parts[0].number == (0.8, 0.7, 5.0)
+    assert found.parts[0].meets_threshold is False
+    assert found.verdict == "partly"
 
 
 def test_ratios_are_taken_seed_by_seed() -> None:
     numbers = {("a", "beta"): [1.0, 2.0], ("b", "beta"): [2.0, 1.0], ("c", "beta"): [4.0, 8.0]}
     results = {"s": SimulationResult({key: np.array(value) for key, value in numbers.items()})}
-    np.testing.assert_array_equal(select_ratio("s", "a", "b")(results), [0.5, 2.0])
-    poorest = select_ratio("s", "a", "b", "c", pick=np.max)
-    np.testing.assert_array_equal(poorest(results), [0.25, 0.25])
-    np.testing.assert_array_equal(select_ratio("s", "a", "b", "c")(results), [0.5, 2.0])
+    for rivals, pick, expected in (
+        (("b",), np.min, [0.5, 2.0]),
+        (("b", "c"), np.max, [0.25, 0.25]),
+        (("b", "c"), np.min, [0.5, 2.0]),
+    ):
+        found = ClaimPart("l", "s", "a", rivals=rivals, pick=pick).measure(results)
+        np.testing.assert_array_equal(found, expected)
+    pooled = ClaimPart("l", "s", "a", rivals=("c",), is_pooled=True).measure(results)
+    assert pooled == pytest.approx([0.25])
 
 
 def test_bad_claims_are_refused() -> None:
@@ -84,10 +79,10 @@ def test_bad_claims_are_refused() -> None:
     with pytest.raises(ValueError, match="inf"):
         Bound("<", float("inf"))
     with pytest.raises(ValueError, match="at least one part"):
-        Claim("p", "(1)", "t", ())
-    empty = ClaimPart("l", "s", lambda results: np.zeros(0))
+        Claim("p", "(1)", "t")
+    empty = {"s": SimulationResult({("a", "beta"): np.zeros(0)})}
     with pytest.raises(ValueError, match=r"\(0,\) numbers"):
-        measure_parts(Claim("p", "(1)", "t", (empty,)), {})
+        Claim("p", "(1)", "t", ClaimPart("l", "s", "a")).measure(empty)
 
 
 def test_the_ledger_names_what_exists() -> None:
@@ -115,7 +110,7 @@ def test_chunks_cover_every_seed_once() -> None:
 
 def test_joined_chunks_keep_the_order_of_the_seeds() -> None:
     parts = [SimulationResult({("a", "m"): np.arange(k, k + 2.0)}) for k in (0, 2)]
-    np.testing.assert_array_equal(join_results(parts).numbers["a", "m"], np.arange(4.0))
+    np.testing.assert_array_equal((parts[0] + parts[1]).numbers["a", "m"], np.arange(4.0))
 
 
 def test_exact_ranks() -> None:

@@ -86,7 +86,8 @@ def test_gains_from_the_pseudo_noise_grow(strength: float) -> None:
     """docs/PAPERS.md found a radius of 1.17 to 1.22, as printed and as corrected."""
     q = np.array([1e-4, 1e-4, 1e-4, strength, strength, strength])
     A, C = make_extended_model()
-    shares = spread.compute_shares_29(A, np.diag(q) * 1e-3, C, np.array([[COURSE_SD**2]]), RATIO)
+    R = np.array([[COURSE_SD**2]])
+    shares = spread.SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
     ours = float(np.abs(np.linalg.eigvals(spread.frame_map(A, C, shares))).max())
     corrected, printed = radius_of_29(q, False), radius_of_29(q, True)
     assert ours == pytest.approx(corrected, rel=1e-3)

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.tie_vision_theory import _find_crossings, compute_gain_margin
+from sideslip.benchmarks.papers.tie_vision_control import _compute_gain_margin, _find_crossings
 
 DT = 0.01
 
@@ -49,7 +49,7 @@ def test_the_crossover_at_half_the_sampling_rate() -> None:
     """Jury's test for k / (z - 1/2): stable for -1/2 < k < 3/2, the upper end at z = -1."""
     loop = control.tf([1.0], [1.0, -0.5], DT)
     assert _find_crossings(loop) == pytest.approx(np.array([[1.5, math.pi / DT]]), rel=1e-12)
-    assert compute_gain_margin(loop)[0] == pytest.approx(20.0 * math.log10(1.5), rel=1e-12)
+    assert _compute_gain_margin(loop)[0] == pytest.approx(20.0 * math.log10(1.5), rel=1e-12)
     assert np.abs(control.feedback(1.499 * loop, 1).poles()).max() < 1.0
     assert np.abs(control.feedback(1.501 * loop, 1).poles()).max() > 1.0
     lost = control.stability_margins(loop)[0]
@@ -62,7 +62,7 @@ def test_a_positive_end_is_no_crossover() -> None:
 
 def test_a_loop_that_never_crosses_has_infinite_margins() -> None:
     loop = control.tf([0.1, 0.02], [1.0, 0.0], DT)  # positive real, gain below 1
-    assert compute_gain_margin(loop)[0] == math.inf and len(_find_crossings(loop)) == 0
+    assert _compute_gain_margin(loop)[0] == math.inf and len(_find_crossings(loop)) == 0
 
 
 def test_transfer_function_and_state_space_agree() -> None:

@@ -9,7 +9,7 @@ import pytest
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
 from sideslip.benchmarks.harness.parallel import split_seeds
-from sideslip.benchmarks.papers.ledger import PaperFilter, get_paper_tuning, make_filters
+from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS, PaperFilter, make_filters
 from sideslip.benchmarks.papers.manoeuvres import (
     EstimationSimulation,
     FollowingSimulation,
@@ -90,7 +90,7 @@ def test_claims_are_judged_with_the_papers_tuning() -> None:
     facts = make_filter_arguments(env.unwrapped)
     (ours,) = make_filters([PaperFilter("dakf", "dakf")], env.unwrapped).values()
     package = call_quietly(make_estimator, "dakf", **facts)
-    wanted = call_quietly(make_estimator, "dakf", **facts, **get_paper_tuning("dakf"))
+    wanted = call_quietly(make_estimator, "dakf", **facts, **PAPER_TUNINGS["dakf"])
     Q = [np.diag(each.filters[0].Q)[:5] for each in (ours, wanted, package)]
     assert np.array_equal(Q[0], Q[1])
     assert (Q[0] != Q[2]).all()

@@ -13,11 +13,11 @@ from sideslip.benchmarks.papers.tie_vision_control import (
     PRINTED,
     SENSORS,
     LoopDesign,
+    _compute_gain_margin,
     _make_estimator_loop,
     _make_plain_loop,
     _search,
 )
-from sideslip.benchmarks.papers.tie_vision_theory import compute_gain_margin
 from sideslip.envs import COMS
 from sideslip.envs.vehicle.linear import make_bicycle_model, make_vision_model
 from sideslip.estimators.design.kalman import joseph_form, kalman_gain
@@ -90,7 +90,7 @@ def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
 def test_table_ii_within_half_a_decibel() -> None:
     """PAPERS section 3: 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
     for printed, dt in zip(PRINTED, (0.033, 0.001), strict=True):
-        decibels, omega = compute_gain_margin(_make_estimator_loop(COMS, DESIGN, dt))
+        decibels, omega = _compute_gain_margin(_make_estimator_loop(COMS, DESIGN, dt))
         assert decibels == pytest.approx(printed, abs=0.5)
         assert omega == pytest.approx(math.pi / dt, rel=1e-12)
 
@@ -100,7 +100,7 @@ def test_the_multirate_loop_has_the_larger_gain_margin_with_the_same_pi(placemen
     """PAPERS section 3: by 20 dB at least."""
     design = dataclasses.replace(DESIGN, placement=placement)
     slow, fast = (
-        compute_gain_margin(_make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
+        _compute_gain_margin(_make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
     )
     assert fast - slow >= 20.0
 

@@ -10,11 +10,10 @@ from sideslip.benchmarks.procedures import fmvss126
 from sideslip.benchmarks.procedures.drive import (
     DriveFunction,
     Fields,
-    Law,
     Series,
     TestCar,
-    _simulate_plant,
 )
+from sideslip.benchmarks.procedures.outside import Law, _simulate_plant
 from sideslip.envs.outside.plants import Drift, make_outside_vehicle
 from sideslip.envs.vehicle.dynamics import Motion
 from sideslip.envs.vehicle.parameters import GRAVITY
@@ -40,9 +39,8 @@ def steering(fields: Fields, t: float) -> float:
 def drive_with(law: Law | None) -> DriveFunction:
     def drive(fields: Fields) -> Series:
         hold = fields["steering"] == "ramp"
-        return _simulate_plant(
-            Drift(), lambda t: steering(fields, t), V, fields["duration"], hold, law
-        )
+        seconds = 3.0 if hold else fields["duration"]  # enough to pass 0.375 g
+        return _simulate_plant(Drift(), lambda t: steering(fields, t), V, seconds, hold, law)
 
     return drive
 
@@ -59,14 +57,16 @@ def A() -> float:
     return fmvss126.measure_reference_angle(drive_with(None), BMW)
 
 
+@pytest.mark.long
 def test_without_control_the_car_fails_at_5_a(A: float) -> None:
     result = fmvss126.run(drive_with(None), BMW, A, [3.0, 5.0])
     assert result.highest == pytest.approx(3.0)
     assert not any(run.stable for run in result.runs if run.multiple > 4.9)
 
 
+@pytest.mark.long
 def test_a_yaw_moment_of_500_n_m_passes_at_6_5_a(A: float) -> None:
-    result = fmvss126.run(drive_with(within_500), BMW, A, [5.0, 6.5])
+    result = fmvss126.run(drive_with(within_500), BMW, A, [6.5])
     assert result.passed
     assert min(run.sideways for run in result.runs) >= 1.83
 

@@ -12,9 +12,8 @@ from sideslip.benchmarks.procedures.drive import (
     ENTRIES,
     DriveFunction,
     Series,
-    _make_steering_profile,
-    make_env_drive,
 )
+from sideslip.benchmarks.procedures.outside import _make_steering_profile
 from sideslip.envs import Scenario
 from sideslip.envs.scenarios.steering import compute_steering
 from sideslip.envs.ticks import TICK
@@ -42,8 +41,8 @@ def slow(name: str) -> float:
 def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, output: str) -> None:
     """C (j w I - A)^-1 B, within the estimate's error."""
     car = CARS[name]
-    found = iso7401.run_sweep(linear(name), car, slow(name))[output]
-    theory = iso7401.compute_linear_response(car.vehicle, car.speed, found.frequency)[output]
+    found = iso7401._run_sweep(linear(name), car, slow(name))[output]
+    theory = iso7401._compute_linear_response(car.vehicle, car.speed, found.frequency)[output]
     assert (np.abs(found.H - theory) < 3.0 * found.sd).all()
     np.testing.assert_allclose(found.H, theory, rtol=0.03)
 
@@ -51,9 +50,9 @@ def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, outp
 @EACH
 def test_the_linear_plant_steps_as_the_linear_model_does(name: str) -> None:
     car = CARS[name]
-    driven = linear(name)(iso7401.make_step(car, slow(name)))
-    theory = iso7401.compute_linear_step(car.vehicle, car.speed, driven)["gamma"]
-    found = iso7401.compute_responses(driven)["gamma"]
+    driven = linear(name)(iso7401._make_step(car, slow(name)))
+    theory = iso7401._compute_linear_step(car.vehicle, car.speed, driven)["gamma"]
+    found = iso7401._compute_responses(driven)["gamma"]
     assert vars(found) == pytest.approx(vars(theory), rel=0.02, abs=1e-3)
 
 
@@ -67,7 +66,7 @@ def test_a_slow_circle_of_the_linear_plant_has_its_gradient(name: str) -> None:
 def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
     """One period of 0.7 Hz that waits for 0.5 s at the second peak."""
     car = CARS["passenger-car"]
-    fields = fmvss126.make_sine_with_dwell(car, side * 2.0)
+    fields = fmvss126._make_sine_with_dwell(car, side * 2.0)
     programme = _make_steering_profile(Scenario(**(CALM | dict(fields))))
 
     def angle(t: float) -> float:
@@ -102,8 +101,9 @@ def test_a_slow_driver_touches_no_cone(name: str, track: str) -> None:
 
 
 def test_a_failed_episode_is_told_and_ends_early() -> None:
-    drive = make_env_drive("sideslip/YawFusion-v0", vehicle="passenger-car")
-    spun = drive({"steering": "held-step", "amplitude": 0.5, "speed": 30.0, "duration": 5.0})
+    spun = ENTRIES[0].drive("passenger-car")(
+        {"steering": "held-step", "amplitude": 0.5, "speed": 30.0, "duration": 5.0}
+    )
     assert spun.failed
     assert spun.t[-1] < 5.0
 

@@ -66,7 +66,7 @@ def test_the_frequency_response_of_the_linear_car_is_the_matrices(vehicle: Vehic
     driven = linear(vehicle, speed, t, steer)
     for name in iso7401.OUTPUTS:
         found = iso7401._estimate_frequency_response(driven.t, driven.steer, getattr(driven, name))
-        theory = iso7401.compute_linear_response(vehicle, speed, found.frequency)[name]
+        theory = iso7401._compute_linear_response(vehicle, speed, found.frequency)[name]
         assert found.frequency[[0, -1]].tolist() == pytest.approx([0.2, 2.0])
         assert (np.abs(found.H - theory) < 2.0 * found.sd).all()
         np.testing.assert_allclose(found.H, theory, rtol=0.02)
@@ -97,7 +97,7 @@ def test_a_drive_shorter_than_a_segment_is_refused() -> None:
 def test_the_linear_step_is_that_of_a_linear_drive() -> None:
     t = np.arange(0.0, 5.0, 0.001)
     driven = linear(PASSENGER_CAR, V, t, 0.01 * np.clip((t - 1.0) / 0.2, 0.0, 1.0))
-    theory = iso7401.compute_linear_step(PASSENGER_CAR, V, driven)
+    theory = iso7401._compute_linear_step(PASSENGER_CAR, V, driven)
     found = iso7401._compute_step_response(driven.t, driven.steer, driven.gamma)
     assert vars(theory["gamma"]) == pytest.approx(vars(found), rel=1e-9)
     model = make_bicycle_model(PASSENGER_CAR, V)

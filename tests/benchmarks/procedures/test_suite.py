@@ -6,9 +6,8 @@ pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
 from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import outside, suite
-from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID
-from sideslip.benchmarks.procedures.tables import ProcedureCase
-from sideslip.benchmarks.suites import SUITES
+from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
+from sideslip.benchmarks.suites import SUITES, Request
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 
@@ -43,7 +42,7 @@ def test_who_plans_is_left_out_of_a_quick_run() -> None:
 
 
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suite, "find_spec", lambda name: None)
+    monkeypatch.setattr(suite, "_HAS_OUTSIDE", False)
     kinds = {case.procedure for case in suite._make_cases(quick=True)}
     assert kinds == {"fmvss-126", "iso-3888-1", "iso-3888-2", "iso-4138", "iso-7401"}
 
@@ -63,10 +62,10 @@ def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.Mo
     known = [case for case in suite._make_cases(quick=True) if case.contestant == 0]
     cases = [case for case in known if case.car != "multi-body"]
     monkeypatch.setattr(suite, "_make_cases", lambda quick: cases)
-    found = suite.run(quick=True, jobs=1)
+    found = suite.STUDY.run(Request(quick=True, jobs=1))
     assert [table.title.split(",")[0] for table in found.tables[:2]] == ["FMVSS 126", "ISO 3888"]
     for table in found.tables:
-        assert {len(cells) for cells in table.cells} == {len(table.header)}
+        assert all(len(cells) == len(table.cells) for _, cells in table.split())
     metrics = {row.metric for row in found.rows}
     assert metrics >= {"amplitude", "speed", "understeer_gradient", "overshoot", "cost", "share"}
     assert [row.verdict for row in found.rows if row.verdict] == ["reproduced", "reproduced"]

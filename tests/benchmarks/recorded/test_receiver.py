@@ -1,6 +1,7 @@
 """Noise that follows HDOP is found to pay where it does, and to cost where it does not."""
 
 import math
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ ORIGIN = (48.0, 11.0)
 Q, NOISE = 2.0, 1.5
 
 
-def drive(weight: float, count: int = 700, seed: int = 0) -> list[Epoch]:
+def drive(weight: float, count: int = 500, seed: int = 0) -> list[Epoch]:
     """Fixes of a car with white acceleration; the noise follows HDOP by so much."""
     rng = np.random.default_rng(seed)
     hdop = np.round(np.exp(rng.normal(0.9, 0.7, count)).clip(0.8, 15.0), 1)
@@ -84,9 +85,15 @@ def test_predictions_are_gaussian_conditioning() -> None:
         assert error[k] == pytest.approx(abs(values[k - 1] - weight @ values[: k - 1]), rel=1e-6)
 
 
+@cache
+def compared(weight: float) -> tuple[receiver._Signal, dict[str, receiver._NoiseLawResult]]:
+    """The position of a drive, and the results of all laws."""
+    (position, _) = receiver._make_signals(receiver._make_track(drive(weight)))
+    return position, receiver._compare(position)
+
+
 def test_likelihood_finds_the_noise_and_who_follows_hdop_rightly_wins() -> None:
-    (position, _) = receiver._make_signals(receiver._make_track(drive(1.0)))
-    found = receiver._compare(position)
+    _, found = compared(1.0)
     table = found["table"]
     assert table.r == pytest.approx(NOISE, rel=0.15)
     assert table.q == pytest.approx(Q, rel=0.35)
@@ -97,15 +104,13 @@ def test_likelihood_finds_the_noise_and_who_follows_hdop_rightly_wins() -> None:
 
 
 def test_where_the_noise_is_constant_tuning_by_hdop_costs() -> None:
-    (position, _) = receiver._make_signals(receiver._make_track(drive(0.0)))
-    found = receiver._compare(position)
+    _, found = compared(0.0)
     assert found["constant"].r == pytest.approx(NOISE, rel=0.15)
     assert receiver._compute_gain(found["table"], found["constant"]).high < 0.0
 
 
 def test_the_same_information_is_the_mean_of_the_inverse_variances() -> None:
-    (position, _) = receiver._make_signals(receiver._make_track(drive(1.0, 300)))
-    found = receiver._compare(position)
+    position, found = compared(1.0)
     sizes = receiver._compute_law_size(position.track.hdop, 1.0)[: position.half]
     variances = (found["table"].r * sizes) ** 2
     assert found[receiver.SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)

@@ -95,9 +95,9 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     table, found = suite.tables
     joint = [line[1] for line in found.cells if line[0] == "joint"]
     assert joint == ["front_tyres", "rear_tyres"]
-    assert {line[0] for line in table.cells} == served
+    assert {line["estimator"] for line in table.cells} == served
     assert "`joint-robust` left out: needs the column accel_y" in table.note
-    numbers = [float(line[1]) for line in table.cells]
+    numbers = [line["rmse"].value for line in table.cells]
     assert numbers == sorted(numbers)
     assert "cannot see" in table.note  # dakf's unobservable direction
     ((question, bars, closest),) = suite.answers

@@ -4,6 +4,7 @@ slide down that valley, its intervals know it, and no estimator gets worse by th
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
+from sideslip.benchmarks.recorded import replay
 from sideslip.benchmarks.recorded.bicycle_fit import (
     BicycleFit,
     Theta,
@@ -19,7 +21,12 @@ from sideslip.benchmarks.recorded.bicycle_fit import (
     fit,
     make_windows,
 )
-from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
+from sideslip.benchmarks.recorded.identify import (
+    POSSIBLE,
+    TYRES,
+    IdentificationResult,
+    identify,
+)
 from sideslip.benchmarks.recorded.quality import find_saturated
 from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
 from sideslip.benchmarks.recorded.wires import SignalCalibration, apply_wires
@@ -117,18 +124,27 @@ def test_rows_that_are_alike_count_once() -> None:
         assert _estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
 
 
-def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
+def test_a_car_that_cannot_be_is_not_identified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing is written, the exit status is 1, and a replay keeps the stated car."""
+    results: list[IdentificationResult] = []
+
+    def identify_once(*arguments: Any) -> IdentificationResult:
+        results.extend([] if results else [identify(*arguments)])
+        return results[0]
+
+    monkeypatch.setattr(replay, "identify", identify_once)
     log = driven(PASSENGER_CAR.replace(yaw_inertia=0.35 * 2700.0))
-    found = identify([log], PASSENGER_CAR)
-    assert "I/(m l_f l_r) = 0." in found.reason
-    assert found.car == PASSENGER_CAR and found.wires.gain == 1.0
-    assert not any(row.is_determined for row in found.findings[:8])
     path, out = tmp_path / "drive.csv", tmp_path / "car.toml"
     as_table(log).to_csv(path, index=False)
     run = CliRunner().invoke(app, ["identify", str(path), "--out", str(out)])
     assert run.exit_code == 1 and not out.exists()
     assert any(line.startswith("Not identified.") for line in run.output.splitlines())
+    (found,) = results
+    assert "I/(m l_f l_r) = 0." in found.reason
+    assert found.car == PASSENGER_CAR and found.wires.gain == 1.0
+    assert not any(row.is_determined for row in found.findings[:8])
     again = ["replay", str(path), "--vehicle", "identify", "--estimator", "exact-kf"]
     run = CliRunner().invoke(app, again)
     assert run.exit_code == 0, run.output

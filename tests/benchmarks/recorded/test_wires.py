@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sideslip.benchmarks.cli.data import parse_estimator_options
+from sideslip.benchmarks.cli.data import _parse_estimator_options
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.benchmarks.recorded.wires import (
@@ -101,7 +101,7 @@ def test_parts_are_replayed_by_themselves(tmp_path: Path) -> None:
 
 
 def test_options_of_estimators() -> None:
-    found = parse_estimator_options(["joint.members=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
+    found = _parse_estimator_options(["joint.members=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
     assert found == {"joint": {"members": 4, "gate": 0.9}, "dakf": {"q_beta": 1e-4}}
     with pytest.raises(ValueError, match=r"ESTIMATOR\.NAME=VALUE, got 'members=4'"):
-        parse_estimator_options(["members=4"])
+        _parse_estimator_options(["members=4"])

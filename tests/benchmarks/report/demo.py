@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import ResultTable, Suite
+from sideslip.benchmarks.harness.results import Column, Line, ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
 from sideslip.benchmarks.harness.verdict import Explorer, Panel
 
@@ -21,19 +21,20 @@ ESTIMATORS = {
 
 
 def estimation(figures: bool = True) -> Suite:
-    cells = [
-        [name, f"{rmse:.2f}", f"{low:.2f} .. {high:.2f}", f"{over:.2f}", f"{cost:.3f}"]
-        for name, (rmse, low, high, over, cost) in ESTIMATORS.items()
+    records: list[Line] = [
+        {"estimator": name, "rmse": Estimate(*errors), "over the bound": over, "cost": cost}
+        for name, (*errors, over, cost) in ESTIMATORS.items()
     ]
-    cells.append(["the bound", "1.29", "", "1", ""])
-    header = ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick")
+    records.append({"estimator": "the bound", "rmse": 1.29, "over the bound": 1.0})
+    rmse, cost = Column("rmse", "RMSE / mrad", form=".2f"), Column("cost", "us per tick")
+    columns = ("estimator", rmse, Column("over the bound", form=".2f"), cost)
     suite = Suite(
         "estimation",
         "Which estimator comes closest to the sideslip angle",
         "Root mean square error from 2 s on; `exact-kf` knows the delay.\n\nIntervals are 95 %.",
         tables=[
             ResultTable(
-                "tie-vision Fig. 7 (100 seeds)", header, cells, "Sine steering at 25 km/h."
+                "tie-vision Fig. 7 (100 seeds)", columns, records, "Sine steering at 25 km/h."
             ),
             ResultTable("Odd texts", ("name", HOSTILE), [[HOSTILE, "a < b"]], HOSTILE),
         ],
@@ -55,13 +56,14 @@ def answered() -> tuple[str, Any, str]:
 
 def control() -> Suite:
     cells = [
-        ["none", "12.41", "1", "0.0"],
-        ["feedforward", "6.52", "0.53", "1.3"],
-        ["single-rate", "5.04", "0.41", "96.0"],
-        ["multirate", "3.98", "0.32", "11.2"],
+        ["none", 12.41, 1.0, 0.0],
+        ["feedforward", 6.52, 0.53, 1.3],
+        ["single-rate", 5.04, 0.41, 96.0],
+        ["multirate", 3.98, 0.32, 11.2],
     ]
-    header = ("controller", "RMS slip / mrad", "over none", "largest 1 ms step / N m")
-    table = ResultTable("tie-vision Fig. 8, tyres as believed (20 seeds)", header, cells)
+    numbers = map(Column, ("RMS slip / mrad", "over none", "largest 1 ms step / N m"))
+    columns = ("controller", *numbers)
+    table = ResultTable("tie-vision Fig. 8, tyres as believed (20 seeds)", columns, cells)
     text = "A single lane change at 25 km/h."
     suite = Suite("control", "Which controller keeps it small", text, tables=[table])
     suite.verdict = "Best controller: multirate."
@@ -82,15 +84,16 @@ def drawn() -> list[tuple[str, Any, str]]:
     seen = np.where(np.arange(t.size) % 33 == 0, beta + rng.normal(size=t.size), np.nan)
     lines = {name: beta + error for name, error in errors.items()}
     label = "sideslip angle / mrad"
-    values, lows, highs = (np.array([v[i] for v in ESTIMATORS.values()]) for i in range(3))
-    names = [*ESTIMATORS, "the bound"]
-    bars = ([*values, 1.29], [*lows, 1.29], [*highs, 1.29], "RMSE of the sideslip angle / mrad")
+    numbers = {name: Estimate(*v[:3]) for name, v in ESTIMATORS.items()} | {
+        "the bound": Estimate(1.29)
+    }
+    bars = figures.draw_groups({"All": numbers}, "RMSE of the sideslip angle / mrad", {})
     x, y = 7.0 * t, 1.75 * (1 + np.tanh(t - 5.0))
     paths = {"truth": (x, y), "multirate-kf": (x, y + 0.02 * t), "bicycle-kf": (x, y + 0.2 * t)}
     course = {"truth": beta, "camera": seen} | lines
     return [
-        ("Error of each estimator", figures.draw_bars(names, *bars), "Shorter is better."),
-        ("The same once more, without a caption", figures.draw_bars(names, *bars), ""),
+        ("Error of each estimator", bars, "Shorter is better."),
+        ("The same once more, without a caption", bars, ""),
         (
             "The sideslip angle",
             figures.draw_time_series(t, course, label, dots=["camera"]),
@@ -98,7 +101,7 @@ def drawn() -> list[tuple[str, Any, str]]:
         ),
         (
             "Errors (seed 0)",
-            figures.draw_error_series(t, errors, f"error of the {label}"),
+            figures.draw_time_series(t, errors, f"error of the {label}", zero_line=True),
             "Estimate minus truth.",
         ),
         ("The track", figures.draw_track(paths), "Dead reckoning with each estimate."),

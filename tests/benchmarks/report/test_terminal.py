@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks.harness.results import ResultTable, Suite
+from sideslip.benchmarks.harness.results import Column, ResultTable, Suite
 from sideslip.benchmarks.report.terminal import print_run, print_suite
 from sideslip.estimators.make import ESTIMATORS
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
-ROWS = [[f"contestant {k} on a filter", *(f"{100 * k + i}.5" for i in range(12))] for k in (1, 2)]
+ROWS = [[f"contestant {k} on a filter", *(100 * k + i + 0.5 for i in range(12))] for k in (1, 2)]
 
 
 def printed(suite: Suite, width: int = 80) -> str:
@@ -31,7 +31,7 @@ def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
     assert parts == text.count("contestant 2 on a filter") == 1 + text.count("(continued)")
     assert (parts == 1) == (width == 400)
     for entry in (*HEADER[1:], *ROWS[0][1:], *ROWS[1][1:]):
-        assert entry in text
+        assert str(entry) in text
 
 
 def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
@@ -55,8 +55,9 @@ LONG = "Fig. 9 (twin): multirate-residual-kf/constant-delay-kf"
 def test_no_name_is_lost_on_a_narrow_screen(width: int, colour: Any) -> None:
     """However narrow, with and without colour: words wrap, and go on where they are too long."""
     names = [*ESTIMATORS, "model-following on exact-kf, all sensors", LONG]
-    cells = [[name, "0.31", "0.29 .. 0.33", "why it is so, in a few words"] for name in names]
-    header = ("controller and estimator", "score", "95 % interval", "remark")
+    cells = [[name, 0.31, (0.29, 0.33), "why it is so, in a few words"] for name in names]
+    interval = Column("95 % interval", form="{:.2f} .. {:.2f}")
+    header = ("controller and estimator", "score", interval, "remark")
     title = "A title that is longer than a narrow screen"
     suite = Suite("names", title, "Text.", verdict="Best: `a`.\nNot covered: [b].")
     suite.tables.append(ResultTable("Numbers", header, cells))
@@ -86,7 +87,7 @@ def line_end(text: str, width: int) -> int:
 @pytest.mark.parametrize("count", [1, 2, 12])
 def test_a_run_fits_on_a_screen_and_says_where_the_rest_is(count: int) -> None:
     """At 80 columns, whatever the tables hold; the verdicts stand there."""
-    cells = [[f"filter-{i}", *["0.123456"] * 12] for i in range(50)]
+    cells = [[f"filter-{i}", *[0.123456] * 12] for i in range(50)]
     table = ResultTable("errors", ("estimator", *"abcdefghijkl"), cells, "a note " * 40)
     verdict = "\n".join(["It is so. " * 9, "And so. " * 9, *["More of it. " * 9] * 3])
     suites = [Suite(f"s{i}", f"Suite {i}", "a text", tables=[table] * 3) for i in range(count)]

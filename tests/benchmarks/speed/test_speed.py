@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.results import Suite
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.speed import env_steps, first_use, learning, plant, suite, timing
 from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
@@ -89,11 +90,10 @@ def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
     mine = plant._make_cars(32, seed=3)
     mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(-1, LANES)  # m/s of v_y: tyres slide
-    mine.roads[0] = np.array(
-        [[0.01], [0.5], [2.0], [0.3], [0.2], [0.0]]
-    )  # the others: straight, flat
+    bend = [0.01, 0.5, 2.0, 0.3, 0.2]  # the other roads are straight and flat
+    mine.roads[0] = np.array([*bend, *[0.0] * (mine.roads.shape[1] - len(bend))])[:, None]
     theirs = mine.clone()
-    plant._advance_in_lanes(mine, 500)
+    plant._advance(mine, 500)
     plant.make_c_advance()(theirs, 500)
     assert np.isfinite(mine.motions).all()
     scale = np.abs(mine.motions).max(axis=(0, 2), keepdims=True)
@@ -169,11 +169,11 @@ def test_ratios_are_taken_round_by_round() -> None:
     """Their median is not the ratio of the medians."""
     target = suite.TARGETS[0]
     taken = {
-        target.over: [20.0, 300.0, 80.0],
-        target.workload: [1.0, 10.0, 2.0],
+        target.over: timing.Taken([20.0, 300.0, 80.0]),
+        target.workload: timing.Taken([1.0, 10.0, 2.0]),
     }
     measured = Suite("speed", "", "")
-    suite.add(measured, taken, {}, {})
+    suite._add_targets(measured, taken, {})
     (row,) = measured.rows
     assert (row.scenario, row.metric) == (target.name, "ratio")
     assert (row.value, row.low, row.high, row.n) == (30.0, 20.0, 40.0, 3)
@@ -183,7 +183,9 @@ def test_ratios_are_taken_round_by_round() -> None:
 
 def test_every_target_stands_in_the_table() -> None:
     measured = Suite("speed", "", "")
-    suite.add(measured, {}, {first_use.FIRST: [0.6]}, {env_steps.LANE: "it rains"})
+    suite._add_targets(
+        measured, {first_use.FIRST: timing.Taken([0.6])}, {env_steps.LANE: "it rains"}
+    )
     (table,) = measured.tables
     assert [(cells[0], cells[1]) for cells in table.cells] == [
         ("gym.make step, lane-keeping over ours", ">= 30 x"),
@@ -220,7 +222,7 @@ def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
     b = ["start of b", "b"]
     assert order == ["a", "a", *b, *b] + ["a", *b] * 3
     assert {name: len(each) for name, each in taken.items()} == {"a": 3, "b": 3}
-    assert timing.compute_range([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
+    assert timing.Taken([3.0, 1.0, 2.0]).range == (2.0, 1.0, 3.0)
 
 
 def test_learning_runs_on_one_thread() -> None:
@@ -246,9 +248,9 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(env_steps, "add_filters", lambda *_: None)
     name = first_use.__name__
     monkeypatch.setattr(first_use, "add", lambda *_: ({name: (1.0,)}, {name: "not there"}))
-    monkeypatch.setattr(suite, "add", judge)
-    monkeypatch.setattr(suite, "make_verdict", lambda *_: "")
-    suite.run(quick=True)
-    taken, seconds, absent = held
-    assert list(taken) == [part.__name__ for part in (env_steps, plant, learning)]
-    assert list(absent) == [*taken, first_use.__name__] and list(seconds) == [first_use.__name__]
+    monkeypatch.setattr(suite, "_add_targets", judge)
+    monkeypatch.setattr(suite, "_make_verdict", lambda *_: "")
+    suite.STUDY.run(Request(quick=True))
+    taken, absent = held
+    parts = [part.__name__ for part in (env_steps, plant, learning, first_use)]
+    assert list(taken) == parts and list(absent) == parts

@@ -10,6 +10,8 @@ pytest.importorskip("torch")
 from sideslip.agents.training.recurrent import MEMORIES
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
+from sideslip.benchmarks.report import study
+from sideslip.benchmarks.report.study import Request, StoredFunction
 from sideslip.benchmarks.studies import recurrent
 from sideslip.benchmarks.studies.recurrent import (
     CONDITIONS,
@@ -18,7 +20,6 @@ from sideslip.benchmarks.studies.recurrent import (
     PPO,
     REPEATED,
     Budget,
-    CaseCache,
     MemoryCase,
     MemoryResult,
     _run_case,
@@ -31,22 +32,24 @@ def test_a_quick_run_has_its_rows_and_nobody_beats_the_optimum(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(recurrent, "QUICK", TINY)
-    found = recurrent.run(quick=True, episodes=4, jobs=1, keep=tmp_path)
+    request = Request(quick=True, episodes=4, jobs=1, keep=tmp_path)
+    found = recurrent.STUDY.run(request)
     rows = {row.controller: row for row in found.rows}
     assert set(rows) == {FILTER, "mlp", "frames", "gru", "linear-rnn", "kalman", "transformer"}
     for who, row in rows.items():
         assert row.n == 4 * (LQG_FACTOR if who == FILTER else 1) and row.metric == "gap"
         assert row.low <= row.value <= row.high and (who == FILTER or row.low > 0.0)
     assert abs(rows[FILTER].value) < 0.5  # 32 short episodes scatter by 0.12
-    assert [cells[0] for cells in found.tables[0].cells] == list(rows)
+    assert [cells["memory"] for cells in found.tables[0].cells] == list(rows)
     assert found.verdict and not found.answers
     monkeypatch.setattr(recurrent, "_run_case", None)  # so that a second run trains nobody
-    again = recurrent.run(quick=True, episodes=4, jobs=1, keep=tmp_path)
+    again = recurrent.STUDY.run(request)
     assert again.rows == found.rows and again.tables == found.tables
 
 
 def test_what_is_kept_is_of_one_case_and_a_damaged_file_is_made_anew(tmp_path: Path) -> None:
-    kept, case = CaseCache(tmp_path), MemoryCase(FILTER, REPEATED, 0, TINY, 1)
+    kept = StoredFunction(_run_case, tmp_path, recurrent._STORAGE)
+    case = MemoryCase(FILTER, REPEATED, 0, TINY, 1)
     first = kept(case)
     (file,) = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:100])
@@ -92,7 +95,7 @@ def made(gaps: Mapping[str, float]) -> dict[str, dict[str, list[MemoryResult]]]:
 
 
 def test_the_verdict_ranks_and_the_figure_has_a_line_each() -> None:
-    pytest.importorskip("plotly")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     results = made({FILTER: 0.0, "mlp": 2.0, "gru": 0.25, "kalman": 0.02, PPO: 4.0})
     long = made({FILTER: 0.0, PPO: 4.0, **dict.fromkeys(MEMORIES, 12.3)})
     results[PPO] = {REPEATED: results[PPO][REPEATED]}
@@ -101,15 +104,15 @@ def test_the_verdict_ranks_and_the_figure_has_a_line_each() -> None:
     assert max(map(len, [*lines, *recurrent._make_verdict(long).splitlines()])) <= LETTERS
     assert "kalman 2 %, gru 25 %, mlp 200 %" in lines[0] and "ppo" in lines[2]
     made_suite = Suite("", "", "", verdict="Who wins.")
-    recurrent._draw(made_suite, results)
+    recurrent._add_figures(made_suite, results, figures)
     ((_, figure, said),) = made_suite.answers
     assert [trace.name for trace in figure.data] == ["mlp", "gru", "kalman"]
     assert list(figure.data[0].x) == [0.0, 100.0, 300.0] and said == "Who wins."
-    plain = results["gru"][REPEATED][0].compute_paired_gap(results[FILTER][REPEATED][0])
+    plain = recurrent._compute_paired_gap(results["gru"][REPEATED][0], results[FILTER][REPEATED][0])
     assert plain.low < 0.25 < plain.high
 
 
 def test_without_torch_nobody_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recurrent, "find_spec", lambda name: None)
-    found = recurrent.run(quick=True)
+    monkeypatch.setattr(study, "find_spec", lambda name: None)
+    found = recurrent.STUDY.run(Request(quick=True))
     assert not found.rows and "sideslip[train]" in found.verdict

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import unknown, unknown_conditions
 from sideslip.benchmarks.studies.unknown_conditions import (
     CAMERA,
@@ -50,11 +51,10 @@ def test_a_curve_changes_what_it_says() -> None:
 @pytest.fixture(scope="module")
 def few() -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        for module in (unknown, unknown):
-            patch.setattr(module, "CONDITIONS", FEW)
-            patch.setattr(module, "CURVES", CURVES[3:4])
-            patch.setattr(module, "PARTS", PARTS[2:3])
-        yield unknown.run(4, jobs=1)
+        patch.setattr(unknown, "CONDITIONS", FEW)
+        patch.setattr(unknown, "CURVES", CURVES[3:4])
+        patch.setattr(unknown, "PARTS", PARTS[2:3])
+        yield unknown.STUDY.run(Request(episodes=4, jobs=1))
 
 
 def test_every_condition_has_its_numbers_and_the_bound_holds(few: Any) -> None:
@@ -71,7 +71,7 @@ def test_every_condition_has_its_numbers_and_the_bound_holds(few: Any) -> None:
     assert own == pytest.approx(numbers[CAR, "nees"], rel=0.5)
     assert numbers[LATE, "rmse_over_bound"] > 1.5  # a delay that filters do not know harms
     table = few.tables[0]
-    assert [line[0] for line in table.cells] == [each.name for each in FEW]
+    assert [line["condition"] for line in table.cells] == [each.name for each in FEW]
     assert few.verdict.splitlines()[1].startswith("joint, which estimates them, has")
 
 
@@ -124,14 +124,14 @@ def test_a_filter_without_bias_states_pays_for_the_bias(few: Any) -> None:
 def test_a_gust_has_the_bound_of_a_filter_that_does_not_know_its_strength() -> None:
     """The bound that knows it is that of the same drives without wind."""
     conditions = (NAMED["a gust of unknown strength"], NAMED["camera"])
-    gust, calm = unknown_conditions.measure_all(conditions, 2, "", 1)
+    gust, calm = unknown_conditions.measure_all(Request(jobs=1), conditions, 2, "")
     assert (gust.best > 1.02 * calm.best).all()
 
 
 def test_an_episode_that_ends_early_is_left_out_and_counted() -> None:
     spinning = unknown_conditions.Condition("fast", CAMERA, {"speed": 25.0, "rear_stiffness": 0.3})
-    (found,) = unknown_conditions.measure_all([spinning], 2, "", 1)
-    assert found.left_out == 2 and np.shape(found.squares) == (0, 2)
+    (found,) = unknown_conditions.measure_all(Request(jobs=1), [spinning], 2, "")
+    assert found.left_out == 2 and list(map(len, found.squares.values())) == [0, 0]
 
 
 def test_filterpys_filter_errs_as_ours_where_the_camera_is_at_once() -> None:

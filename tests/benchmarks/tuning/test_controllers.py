@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("optuna")
 
 from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
-from sideslip.benchmarks.control.entries import ControlEntry, make_estimate_options
+from sideslip.benchmarks.control.entries import ControlCase
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import ControlTask, make_tuning_seeds
 from sideslip.benchmarks.tuning import controllers
@@ -27,7 +27,7 @@ from sideslip.benchmarks.tuning.controllers import (
     _run_contestant,
     tune,
 )
-from sideslip.benchmarks.tuning.estimator import write_tuned
+from sideslip.benchmarks.tuning.estimator import SearchOptions, write_tuned
 from tests.benchmarks.conftest import Run
 
 SHORT = ControlTask(scenario="sine-with-dwell")
@@ -47,7 +47,7 @@ def storage(folder: Path) -> str:
 def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     """An LQR that may use a hundredth of the tyres' grip does nothing: the search leaves it."""
     planted = task(SearchNumber("grip", 0.01, 0.01, 1.0), name="lqr")
-    log = tune(planted, 12, storage(tmp_path), jobs=1)
+    log = tune(planted, SearchOptions(12, storage(tmp_path), jobs=1))
     assert len(log["trials"]) == 12
     assert log["trials"][0]["numbers"] == {"grip": 0.01}  # the start is the first trial
     assert log["start"] == log["trials"][0]["objective"]
@@ -73,14 +73,15 @@ def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its numbers reach that filter, and nobody else's on the same one."""
-    asked: list[ControlEntry] = []
-    monkeypatch.setattr(controllers, "run_chunk", lambda chunk: asked.append(chunk.entry))
+    asked: list[ControlCase] = []
+    monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
     asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
     options = asked_of.options(asked_of.start | {"force_sd": 77.0})
     _run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
-    (cell,) = asked
-    assert make_estimate_options(cell)["options"]["force_sd"] == 77.0
-    assert make_estimate_options(replace(cell, controller="lqr"))["options"]["force_sd"] != 77.0
+    ((contest, entry),) = asked
+    other = replace(entry, agent="lqr")
+    own, others = (ControlCase(contest, x).estimate_options["options"] for x in (entry, other))
+    assert own["force_sd"] == 77.0 != others["force_sd"]
 
 
 def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +119,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
     )
     slow = task(SearchNumber("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(make_tuning_seeds(16)))
     first = slow.seeds[0]
-    log = tune(slow, 16, storage(tmp_path), jobs=1)
+    log = tune(slow, SearchOptions(16, storage(tmp_path), jobs=1))
     parts = [slow.seeds[low:high] for low, high in ((0, 2), (2, 4), (4, 8), (8, 16))]
     assert [asked.count(part) for part in parts] == [16, 8, 4, 2]
     assert [row["seeds"] for row in log["trials"]].count(16) == 2
@@ -142,9 +143,9 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     monkeypatch.setattr(controllers, "_compute_objective", fake)
     once = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     with pytest.raises(KeyboardInterrupt):
-        tune(once, 16, storage(tmp_path), jobs=1)
+        tune(once, SearchOptions(16, storage(tmp_path), jobs=1))
     before, calls[:] = calls[:8], []  # a whole batch
-    log = tune(once, 16, storage(tmp_path), jobs=1)
+    log = tune(once, SearchOptions(16, storage(tmp_path), jobs=1))
     assert len(calls) == 8
     driven = [row["numbers"]["gain"] for row in log["trials"]]
     assert driven == [float(f"{each:.3g}") for each in before + calls]

@@ -14,7 +14,7 @@ from sideslip.benchmarks.tuning import estimator as tune_file
 from sideslip.benchmarks.tuning import estimator as tune_task
 from sideslip.benchmarks.tuning import study as tune
 from sideslip.benchmarks.tuning import study as tune_study
-from sideslip.benchmarks.tuning.estimator import EstimatorTuning
+from sideslip.benchmarks.tuning.estimator import EstimatorTuning, SearchOptions
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design import options
 
@@ -69,7 +69,9 @@ def test_found_is_the_best_that_was_tried(
     task: EstimatorTuning, drives: list[LoggedEpisode], tmp_path: Path
 ) -> None:
     url = storage(tmp_path)
-    found = tune_study._search(tune_study.create_study(task, url), task, drives, 12, 1)
+    found = tune_study._search(
+        tune_study.create_study(task, url), task, drives, SearchOptions(12, jobs=1)
+    )
     trials = tried(task, url)
     assert len(trials) == 12
     best = min(trials, key=lambda trial: trial.value)
@@ -90,7 +92,7 @@ def test_the_search_is_the_same_for_any_number_of_jobs(
     for jobs in (1, 2):
         url = storage(tmp_path) + str(jobs)
         study = tune_study.create_study(task, url, sampler)
-        found.append(tune_study._search(study, task, drives, 40, jobs))
+        found.append(tune_study._search(study, task, drives, SearchOptions(40, jobs=jobs)))
     assert found[0] == found[1]
 
 
@@ -100,7 +102,7 @@ def test_the_shipped_tuning_of_the_bicycle_model_is_found_again(tmp_path: Path) 
     task = tune_task.make_estimator_tuning("bicycle-kf", "tie-vision-fig7", seeds=8)
     drives = tune_task.simulate(task, range(8), "", 1, None)
     study = tune_study.create_study(task, storage(tmp_path), "tpe", seed=1)
-    found = tune_study._search(study, task, drives, 120, 1)
+    found = tune_study._search(study, task, drives, SearchOptions(120, jobs=1))
     error, shipped = (
         tune_task.compute_squares(task, drives, numbers).mean() for numbers in (found, {})
     )
@@ -114,27 +116,29 @@ def test_a_stopped_search_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url, count = storage(tmp_path), iter(range(12))
-    score = tune_study._evaluate_trial
+    score = tune_study._evaluate_file
 
     def stopping(*arguments: Any) -> float:
         if next(count) == 11:
             raise KeyboardInterrupt
         return score(*arguments)
 
-    monkeypatch.setattr(tune_study, "_evaluate_trial", stopping)
+    monkeypatch.setattr(tune_study, "_evaluate_file", stopping)
     with pytest.raises(KeyboardInterrupt):
-        tune_study._search(tune_study.create_study(task, url), task, drives, 16, 1)
-    monkeypatch.setattr(tune_study, "_evaluate_trial", score)
+        tune_study._search(
+            tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1)
+        )
+    monkeypatch.setattr(tune_study, "_evaluate_file", score)
     kept = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(kept) == 8  # a whole batch
-    tune_study._search(tune_study.create_study(task, url), task, drives, 16, 1)
+    tune_study._search(tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1))
     finished = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(finished) == 16 and finished[:8] == kept
     assert len({tuple(params.values()) for params in finished}) == 16  # nothing is tried twice
     monkeypatch.setattr(
-        tune_study, "_evaluate_trial", lambda *_: pytest.fail("there is nothing to do")
+        tune_study, "_evaluate_file", lambda *_: pytest.fail("there is nothing to do")
     )
-    tune_study._search(tune_study.create_study(task, url), task, drives, 16, 1)
+    tune_study._search(tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1))
 
 
 def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> None:
@@ -149,7 +153,7 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
     fast = [LoggedEpisode(drive.log, drive.facts | {"speed": 40.0})]
     study = tune_study.create_study(task, storage(tmp_path))
     with pytest.raises(ValueError, match="its error grows by a factor"):
-        tune_study._search(study, task, fast, 3, 1)
+        tune_study._search(study, task, fast, SearchOptions(3, jobs=1))
     assert [trial.value for trial in tried(task, storage(tmp_path))] == [np.inf] * 3
 
 
@@ -185,7 +189,7 @@ def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Pat
     task = tune_task.make_estimator_tuning(
         "bicycle-kf", SCENARIO, options=held, search={"q_beta": (1e-12, 1.2e-12)}, seeds=2
     )
-    suite, found = tune.run(task, 8, 3, storage(tmp_path), jobs=1)
+    suite, found = tune.run(task, SearchOptions(8, storage(tmp_path), jobs=1), 3)
     comparison, numbers = suite.tables
     assert comparison.header == ("tuning", "2 training seeds", "3 test seeds")
     assert [row[0] for row in comparison.cells] == ["default", "found"]

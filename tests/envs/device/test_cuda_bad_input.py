@@ -41,13 +41,13 @@ def test_rows_that_do_not_fit_are_refused_with_how_many_would(
     free, device = 0, torch.device("cuda:0")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
     with pytest.raises(MemoryError, match=r"1000 rows of \d+ bytes .* on cuda:0") as refused:
-        cuda_env.check_memory(sizes, 1000, device)
+        cuda_env._check_memory(sizes, 1000, device)
     row = int(re.findall(r"(\d+) bytes", str(refused.value))[0])
     free = 500 * row - 1
     with pytest.raises(MemoryError, match="at most 499 rows"):
-        cuda_env.check_memory(sizes, 1000, device)
+        cuda_env._check_memory(sizes, 1000, device)
     free = 1000 * row
-    cuda_env.check_memory(sizes, 1000, device)
+    cuda_env._check_memory(sizes, 1000, device)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.envs.device import TensorVectorEnv, make_device_env  # noqa: E402
-from sideslip.envs.device.gradients import GradientGate  # noqa: E402
+from sideslip.envs.numerics.torch_backend import GradientGate  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
 from .moments import DRIVEN, FUSION  # noqa: E402

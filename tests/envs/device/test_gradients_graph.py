@@ -137,7 +137,7 @@ ALL = [
 
 @pytest.mark.parametrize("scenario", ALL)
 def test_gradients_are_numbers_in_every_scenario_and_at_a_standstill(scenario: str) -> None:
-    env = made(2, scenario=scenario, control_period=10)
+    env = made(2, scenario=scenario, control_period=4)
     state = {"v_x": leaf(5.0, 0.0), "v_y": leaf(0.0, 0.0), "gamma": leaf(0.0, 0.0)}
     parameters = {"friction": leaf(0.8, 0.8), "rear_stiffness": leaf(2e4, 2e4)}
     env.reset(seed=0, options={"state": state, "parameters": parameters})

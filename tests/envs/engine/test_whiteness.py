@@ -73,7 +73,7 @@ def test_the_fast_sensors_noise_is_white_across_env_steps(n: int) -> None:
     assert_white(fast_noise(noisy, silent), range(1, 4 * n + 1))
 
 
-@pytest.mark.parametrize("n", [1, 10, 33])
+@pytest.mark.parametrize("n", [10, 33])
 @pytest.mark.parametrize("sensor", SLOW_SIZES)
 def test_the_slow_sensors_noise_is_white_across_env_steps(sensor: int, n: int) -> None:
     sizes = SLOW_SIZES[sensor]
@@ -83,7 +83,7 @@ def test_the_slow_sensors_noise_is_white_across_env_steps(sensor: int, n: int) -
     assert_white((noisy - silent)[mine, values] / sizes, range(1, 41))
 
 
-@pytest.mark.parametrize("n", [1, 10, 33])
+@pytest.mark.parametrize("n", [10, 33])
 def test_the_satellites_wander_by_fresh_numbers(n: int) -> None:
     """The innovations of log HDOP, an Ornstein-Uhlenbeck process sampled every 10 ms."""
     keep = np.exp(-0.01 / 0.05)
@@ -94,9 +94,8 @@ def test_the_satellites_wander_by_fresh_numbers(n: int) -> None:
     assert_white(fresh[:, None], range(1, 41))
 
 
-@pytest.mark.parametrize("n", [1, 10])
-def test_links_lose_delay_and_double_by_fresh_numbers(n: int) -> None:
-    found = driven(40_000 // n, n, STRAIGHT, loss=0.3, jitter=0.003, duplicate=0.3)[1]
+def test_links_lose_delay_and_double_by_fresh_numbers() -> None:
+    found = driven(4000, 10, STRAIGHT, loss=0.3, jitter=0.003, duplicate=0.3)[1]
     for sensor in SLOW_SIZES:
         captured, arrived = found[found[:, PACKET.sensor] == sensor][:, ROUTE].T
         frames, copies = np.unique(captured, return_counts=True)

@@ -4,6 +4,8 @@ That compiled code finds the parts where Python does, `test_whole_steps` shows.
 """
 
 import copy
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +22,9 @@ SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
 @pytest.mark.parametrize("entries", [4, 5])
 @pytest.mark.parametrize("n", [1, 10, 33])
 def test_every_part_has_a_place_of_its_own(n: int, entries: int) -> None:
-    work = _make_workspace(n, np.zeros((2, entries)), max_packets=3, trace_width=2)
-    row, bounds, window = as_python(split_workspace)(work)
-    parts = [row.p, row.z, row.switches, row.obs, row.report, row.rows, row.packets, bounds, window]
+    shape: Any = {"layout": (None,) * entries, "max_packets": 3, "bounds": np.zeros((2, entries))}
+    work = _make_workspace(SimpleNamespace(control_period=n, **shape), trace_width=2)  # type: ignore[arg-type]
+    parts = as_python(split_workspace)(work)
     for k, part in enumerate(parts):
         part[...] = k + 1
     assert all((part == k + 1).all() for k, part in enumerate(parts))
@@ -38,7 +40,7 @@ def test_a_copy_has_an_episode_of_its_own() -> None:
     obs = other.step([0.1])[0]
     assert bits(env.get_state()["state"]) == before
     assert bits(env.step([0.1])[0]) == bits(obs)
-    assert np.shares_memory(other.rows, other._workspace)
+    assert np.shares_memory(other.rows, other._workspace.vector)
 
 
 @pytest.mark.parametrize("n", [7, 10, 50])

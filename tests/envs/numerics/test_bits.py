@@ -15,22 +15,25 @@ from sideslip.envs.numerics import functions as noise
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
 from sideslip.envs.scenarios import steering as programme
+from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle
+from sideslip.envs.scenarios.road import make_path, transform_path
+from sideslip.envs.task import make_reference_params
 from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle import dynamics, tyres
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams
-from sideslip.envs.vehicle.tyres import TYRE_LAWS, TyreInputs
+from sideslip.envs.vehicle.tyres import TYRE_LAWS, PlantVariant, TyreInputs
 
 from ..helpers import FULL, IDS, LINEAR, bits, play, unwrapped
 
 pytestmark = pytest.mark.plain
 
 RNG = np.random.default_rng(7)
-N = 60
-CARS = {"coms": make_car(COMS), "passenger-car": make_car(PASSENGER_CAR)}
+N = 20
+CARS = {"coms": make_car(COMS.replace(relaxation=0.0)), "passenger-car": make_car(PASSENGER_CAR)}
 ROAD, PUSH = RoadParams(0.01, -5.0, 20.0, 0.5, -0.3), DisturbanceForces(50.0, -20.0, 30.0)
 LAWS = range(len(TYRE_LAWS))
 PLANTS = [(a, law, roll) for a in (0, 1) for law in LAWS for roll in (0, 1)]
-SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0, 0.3, 1.0])
+SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0, 0.3, 1.0, 0.1, 0.1])
 
 
 def motions() -> list[Motion]:
@@ -67,14 +70,16 @@ def agree(function: Any, lists: list[list[Any]], call: Callable[..., Any]) -> li
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize(("small_angle", "law", "roll"), PLANTS)
 def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
+    variant = PlantVariant(small_angle, law, roll)
+
     def load_of(function: Any, inputs: Any) -> Any:
         return function(inputs, CARS[car], small_angle)
 
     def derivative(function: Any, motion: Any, load: Any) -> Any:
-        return function(motion, load, PUSH, CARS[car], ROAD, small_angle, law, roll)
+        return function(motion, load, PUSH, CARS[car], ROAD, variant)
 
     def step(function: Any, motion: Any, a: Any, b: Any, c: Any) -> Any:
-        return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law, roll)
+        return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, variant)
 
     state = motions()
     load = agree(tyres.compute_tyre_load, [inputs()], load_of)
@@ -82,6 +87,13 @@ def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
     loads = [load, load[1:] + load[:1], load[2:] + load[:2]]
     for rule in (dynamics.kutta3, dynamics.rk4):
         agree(rule, [state, *loads], step)
+
+
+def test_driver() -> None:
+    track = transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, 1.0)
+    road, target = RoadParams(0.02, 0.0, 40.0), make_reference_params(COMS)
+    world = track, road, target, DriverParams(1.0, 1.0, 0.99, 1.0), 0.6
+    agree(compute_driver_angle, [motions()], lambda f, motion: f(0.01, motion, *world))
 
 
 @pytest.mark.parametrize("small_angle", [0, 1])
@@ -122,12 +134,23 @@ EPISODES: list[dict[str, Any]] = [
     {"scenario": FULL | {"acceleration": 1.0, "speed": 0.0}, "control_period": 33},
     {"vehicle": {"base": "passenger-car", "motor_lag": 0.0}, "scenario": "step-steer"},
 ]
+_PROGRAMMES: list[dict[str, Any]] = [
+    {"base": "double-lane-change", "onset": 0.05},
+    {"base": "curved-road-driver", "curve_start": -5.0, "speed_change": -1.0},
+    {"base": "stiffness-step", "tyre_change_time": (0.1, 0.3)},
+    {"base": "split-friction", "change_start": 0.1},
+    {"base": "sine-with-dwell", "onset": 0.0, "frequency": 4.0, "hold": 0.1},
+    {"base": "sine", "steering": "sweep", "onset": 0.1, "hold": 0.2, "frequency_2": 3.0},
+    {"base": "sine", "steering": "ramp", "onset": 0.1, "hold": 0.2},
+]
+EPISODES += [
+    dict[str, Any](scenario=each, reference="model", steering=True) for each in _PROGRAMMES
+]
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name", IDS)
-@pytest.mark.parametrize("arguments", EPISODES, ids=str)
-def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("arguments", "name"), [*zip(EPISODES, IDS * 4, strict=False)], ids=str)
+def test_whole_steps(arguments: dict[str, Any], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def episode() -> Any:
         env = unwrapped(name, **arguments)
         start = env.reset(seed=11)

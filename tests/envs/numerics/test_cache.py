@@ -1,41 +1,24 @@
 """Compiled kernels on disk: cached once, loaded bit for bit; their absence is no trouble."""
 
+import logging
+import math
 import os
 import subprocess
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
-from sideslip.envs.numerics import compiler
+from sideslip.envs.numerics import compiler, kernel_cache
 from sideslip.envs.numerics.compiler import _Kernel
 
 from .. import processes
 
-MODULE = '''
-"""Kernels in a folder named by the first argument."""
-
-import importlib.util
-import math
-import sys
-from pathlib import Path
-
-import numpy as np
-
-for name in ("sideslip", "sideslip.envs"):  # without what they import, which takes as long as numba
-    sys.modules[name] = importlib.util.module_from_spec(importlib.util.find_spec(name))
-
-from sideslip.envs.numerics.compiler import _Kernel
-
-FOLDER = Path(sys.argv[1])
-
-
-def kernel(function, apart=False):
-    return _Kernel(function, targetoptions={"nopython": True}, folder=FOLDER, apart=apart)
-
-
+KERNELS = """
 @kernel
 def halved(x):
     return 0.5 * math.sqrt(x)
@@ -84,7 +67,29 @@ def weight(car):
 @kernel
 def blend(target, share, vector):
     target[1:] = (1.0 - share) * vector[1:]
-'''
+"""
+MODULE = f"""
+\"\"\"Kernels in a folder named by the first argument.\"\"\"
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+for name in ("sideslip", "sideslip.envs"):  # without what they import, which takes as long as numba
+    sys.modules[name] = importlib.util.module_from_spec(importlib.util.find_spec(name))
+
+from sideslip.envs.numerics.compiler import _Kernel
+
+FOLDER = Path(sys.argv[1])
+
+
+def kernel(function, apart=False):
+    return _Kernel(function, targetoptions={{"nopython": True}}, folder=FOLDER, apart=apart)
+
+{KERNELS}"""
 USE = """
 print(total(np.arange(5.0), 0.5).hex())
 try:
@@ -134,7 +139,7 @@ def test_what_was_compiled_for_another_processor_is_not_loaded(folder: Path) -> 
     found, notices = run(folder)
     assert found == EXPECTED and "compiling" in notices
     assert len(list(folder.iterdir())) == 2 and generic.read_bytes() == before
-    assert run(folder) == run(folder, NUMBA_CPU_NAME="generic") == (EXPECTED, "")
+    assert run(folder, NUMBA_CPU_NAME="generic") == (EXPECTED, "")
 
 
 def test_machine_code_is_found_by_a_name_without_a_process_counts(folder: Path) -> None:
@@ -169,43 +174,52 @@ def test_a_damaged_file_is_compiled_again(
     assert loaded(4.0) == 12.0 and loaded.parts == {}
 
 
-def test_a_kernel_that_stands_apart_is_compiled_once_for_its_callers(folder: Path) -> None:
+def load_kernels(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The kernels, as in a process of its own."""
+    monkeypatch.setattr(compiler, "_libraries", {})
+    options: dict[str, Any] = {"targetoptions": {"nopython": True}, "folder": folder}
+    names: dict[str, Any] = {
+        "__name__": "tiny",
+        "math": math,
+        "kernel": partial(_Kernel, **options),
+    }
+    exec(KERNELS, names)
+    return SimpleNamespace(**names)
+
+
+def test_a_kernel_that_stands_apart_is_compiled_once_for_its_callers(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its file is needed by theirs, and comes back where it is missing; errors pass through."""
-    code = """
-print(first(4.0), second(4.0), halved.parts == {})
-try:
-    first(9.0)
-except ValueError as error:
-    print(error)
-"""
-    expected = ["0.0 1.0 False", "x is at most 8"]
-    assert run(folder, code)[0] == expected
+
+    def use() -> bool:
+        """Whether something was compiled."""
+        tiny = load_kernels(folder, monkeypatch)
+        assert (tiny.first(4.0), tiny.second(4.0)) == (0.0, 1.0)
+        with pytest.raises(ValueError, match="x is at most 8"):
+            tiny.first(9.0)
+        return bool(tiny.halved.parts)
+
+    assert use()
     files = {path.name.partition("-")[0]: path for path in folder.iterdir()}
     assert sorted(files) == ["tiny.first", "tiny.negative", "tiny.second"]
-    expected[0] = "0.0 1.0 True"  # nothing was compiled
-    assert run(folder, code) == (expected, "")
+    assert not use()
     files["tiny.negative"].unlink()
-    assert run(folder, code)[0][1:] == expected[1:]
-    assert run(folder, code) == (expected, "")
+    assert use() and not use()
 
 
 def test_processes_that_start_at_once(folder: Path) -> None:
-    """Each of them compiles, one file is left, and it is whole."""
-    for process in [start(folder) for _ in range(2)]:
-        printed = process.communicate(timeout=100)[0]
-        assert process.returncode == 0 and printed.splitlines() == EXPECTED
-    assert len(list(folder.iterdir())) == 1
-    assert run(folder) == (EXPECTED, "")
+    """Both compile one kernel, and each another signature: files are whole and their own.
 
-
-def test_signatures_compiled_at_once_do_not_take_each_others_files(folder: Path) -> None:
-    """numba's numbered files do: two processes both take the first number."""
-    floats = "print(halved(16.0))"
-    whole = "print(halved(36))"
-    started = [start(folder, code) for code in (floats, whole)]
-    assert [process.communicate(timeout=100)[0] for process in started] == ["2.0\n", "3.0\n"]
-    assert len(list(folder.iterdir())) == 2
-    assert run(folder, floats + "\n" + whole) == (["2.0", "3.0"], "")
+    numba's numbered files are not: two processes both take the first number.
+    """
+    calls = "print(halved(16.0))", "print(halved(36))"
+    for process in [start(folder, f"{USE}\n{call}") for call in calls]:
+        printed = process.communicate(timeout=100)[0].splitlines()
+        assert process.returncode == 0 and printed[:2] == EXPECTED
+        assert printed[2] in ("2.0", "3.0")
+    assert len(list(folder.iterdir())) == 3
+    assert run(folder, f"{USE}\n{calls[0]}\n{calls[1]}") == ([*EXPECTED, "2.0", "3.0"], "")
 
 
 @pytest.mark.parametrize("obstacle", ["missing", "file", "full"])
@@ -253,21 +267,37 @@ def test_a_function_compiled_by_numba_itself_may_call_a_kernel(apart: bool) -> N
     assert numba.njit(_caller(kernel))(1) == sum(3 * (x + 7 + 9) for x in (1, 7, 9))
 
 
-SETUP = "import logging; logging.basicConfig(level=logging.INFO, format='LOG %(message)s')\n"
-
-
-def test_a_line_says_that_kernels_are_compiled(folder: Path) -> None:
+def test_a_line_says_that_kernels_are_compiled(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """On standard error, or by the program's own logging; not with SIDESLIP_QUIET."""
-    call = "halved(2.0); halved(3)"
-    lines = run(folder, call)[1].splitlines()
+    records: list[logging.LogRecord] = []
+    handler = logging.Handler()
+    monkeypatch.setattr(handler, "emit", records.append)
+
+    def call(has_handlers: bool) -> list[str]:
+        monkeypatch.setattr(kernel_cache, "_reported", set())
+        monkeypatch.setattr(kernel_cache.logger, "hasHandlers", lambda: has_handlers)
+        for path in folder.iterdir():
+            path.unlink()
+        tiny = load_kernels(folder, monkeypatch)
+        tiny.halved(2.0)
+        tiny.halved(3)
+        return capsys.readouterr().err.splitlines()
+
+    monkeypatch.delenv("SIDESLIP_QUIET", raising=False)
+    lines = call(False)
     assert len(lines) == 1 and str(folder.parent) in lines[0]
-    for path in folder.iterdir():
-        path.unlink()
-    lines = run(folder, SETUP + call)[1].splitlines()
-    assert [line.split()[1] for line in lines] == ["sideslip:", "compiled", "compiled"]
-    for path in folder.iterdir():
-        path.unlink()
-    assert run(folder, call, SIDESLIP_QUIET="1")[1] == ""
+    monkeypatch.setattr(kernel_cache.logger, "handlers", [handler])
+    monkeypatch.setattr(kernel_cache.logger, "propagate", False)
+    kernel_cache.logger.setLevel(logging.INFO)
+    assert call(True) == []
+    assert [record.getMessage().split()[0] for record in records] == [
+        *("sideslip:", "compiled", "compiled"),
+    ]
+    kernel_cache.logger.setLevel(logging.NOTSET)
+    monkeypatch.setenv("SIDESLIP_QUIET", "1")
+    assert call(False) == []
 
 
 def test_workers_say_nothing(folder: Path) -> None:

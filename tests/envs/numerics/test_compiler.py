@@ -1,14 +1,19 @@
-"""The cache of compiled kernels follows the sources, and its absence is no trouble."""
+"""The compiler's decorators, plain numba in its place, and loads of eight neighbours."""
 
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
+import numba
+import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
 from sideslip.envs.numerics import jit, kernel_cache
+from sideslip.envs.numerics.simd8 import allocate_scratch, load8, mirror, store8
+from sideslip.envs.scenarios.road import TrackPath, compute_path_offset
 
 from .. import processes
 
@@ -64,11 +69,7 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = 0.25**2 * (3.0 - 2.0 * 0.25)
     assert float(run(SHIFT, copy, **variables)) == exact
-    kernels = sorted(cache.rglob("road.compute_path_offset*.kernel"))
-    assert len(kernels) == 1
-    assert float(run(SHIFT, copy, **variables)) == exact
-    again = sorted(cache.rglob("road.compute_path_offset*.kernel"))
-    assert again == kernels  # the second run compiled nothing
+    assert len(list(cache.rglob("road.compute_path_offset*.kernel"))) == 1
     source = copy / "envs" / "numerics" / "functions.py"
     text = source.read_text()
     changed = text.replace("return t * t * (3.0 - 2.0 * t)", "return t * t * (6.0 - 4.0 * t)")
@@ -79,13 +80,13 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
 def test_a_folder_that_cannot_be_written_costs_only_time(
-    variable: str, copy: Path, tmp_path: Path
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
-    printed = run(SHIFT, copy, **{variable: str(tmp_path / "file")})
-    assert float(printed) == 0.25**2 * (3.0 - 2.0 * 0.25)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv(variable, str(tmp_path / "file"))
+    assert kernel_folder("envs") is None
     assert (tmp_path / "file").read_text() == "not a folder"
-    assert not list(copy.rglob("*.nbc"))  # numba's own fallback would write beside the sources
 
 
 def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
@@ -127,7 +128,7 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
             assert not isinstance(callee, Dispatcher), f"{each.__name__} calls {name}"
             if hasattr(callee, "__code__") and callee.__name__ not in seen:
                 todo.append(callee)
-    assert {"kutta3", "compute_rates", "compute_slips", "sincos", "minimum", "floor"} <= seen
+    assert {"kutta3", "_compute_rates", "_compute_slips", "sincos", "minimum", "floor"} <= seen
     assert jit.as_python(kutta3) is not function
 
 
@@ -156,3 +157,79 @@ def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
     gone = [tmp_path / "gone"]
     monkeypatch.setattr(Path, "iterdir", lambda path: iter(gone))
     assert kernel_folder("envs") is not None
+
+
+def test_numba_by_itself_gives_the_same_bits_and_says_so(tmp_path: Path) -> None:
+    code = """
+from sideslip.envs.scenarios.road import TrackPath, compute_path_offset
+print(compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85).hex())
+import sys; print("sideslip.envs.numerics.compiler" in sys.modules)
+"""
+    variables = {"XDG_CACHE_HOME": str(tmp_path / "stock"), "SIDESLIP_STOCK_NUMBA": "1"}
+    stock, notices = processes.finish(processes.start(code, variables))
+    ours = compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85)
+    assert stock == [ours.hex(), "False"] and "sideslip.envs.numerics.compiler" in sys.modules
+    assert len(notices.splitlines()) == 1 and "SIDESLIP_STOCK_NUMBA is set" in notices
+    assert not (tmp_path / "stock").exists()  # nothing on disk
+
+
+@pytest.mark.parametrize("reason", ["0.99.1", "0.680.1", "JITCodeLibrary"])
+def test_a_numba_of_other_insides_compiles_by_itself(
+    reason: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(kernel_cache, "_reported", set())
+    monkeypatch.setattr(kernel_cache.logger, "hasHandlers", lambda: False)
+    monkeypatch.delenv("SIDESLIP_QUIET", raising=False)
+    if reason == "JITCodeLibrary":
+        monkeypatch.delattr(numba.core.codegen, reason)
+        monkeypatch.delitem(sys.modules, "sideslip.envs.numerics.compiler", raising=False)
+    else:
+        monkeypatch.setattr(numba, "__version__", reason)
+    assert jit._load_compiler.__wrapped__() is None
+    notices = capsys.readouterr().err
+    assert len(notices.splitlines()) == 1 and reason in notices
+
+
+@jit.jit
+def _product(a: Any, b: Any, c: Any) -> None:
+    work = allocate_scratch(a, 2, 8)
+    for i in range(len(a)):
+        store8(work, 0.0, 1, 0)
+        for k in range(len(b)):
+            store8(work, load8(work, 1, 0) + a[i, k] * load8(b, k, 8), 1, 0)
+        store8(c, load8(work, 1, 0), i, 8)
+
+
+@jit.jit
+def _mirror(a: Any, i: int, j: int) -> None:
+    mirror(a, i, j)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.plain
+def test_a_product_by_eights_is_that_of_single_numbers(rng: np.random.Generator) -> None:
+    a, b, c = rng.normal(size=(5, 7)), rng.normal(size=(7, 16)), np.zeros((5, 16))
+    _product(a, b, c)
+    for i in range(5):
+        for j in range(8, 16):
+            total = 0.0
+            for k in range(7):
+                total += a[i, k] * b[k, j]
+            assert c[i, j] == total
+    assert not c[:, :8].any()
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("j", [0, 8])
+def test_a_mirrored_block_is_the_transposed_one(rng: np.random.Generator, j: int) -> None:
+    before = rng.normal(size=(16, 16))
+    after = before.copy()
+    _mirror(after, 0, j)
+    above = np.triu_indices(8) if j == 0 else np.nonzero(np.ones((8, 8)))
+    for i, k in zip(*above, strict=True):
+        assert after[i, j + k] == before[i, j + k] == after[j + k, i]
+    np.testing.assert_array_equal(after[8:, 8:], before[8:, 8:])

@@ -95,8 +95,9 @@ print("after")
 """
 
 
-@pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"])
-@pytest.mark.parametrize("to", ["pipe", "file"])
+@pytest.mark.parametrize(
+    ("name", "to"), [("/dev/stdout", "file"), ("/dev/fd/1", "pipe"), ("/proc/self/fd/1", "file")]
+)
 def test_standard_output_is_written_where_it_goes(name: str, to: str, path: Path) -> None:
     """What is printed before and after stays, also where the shell sends it to a file."""
     command = [sys.executable, "-c", WRITE, name]

@@ -63,12 +63,12 @@ def test_what_disturbs_the_car_acts_to_the_left_in_newtons(model: str) -> None:
 def test_at_walking_pace_and_below_a_car_rolls_steers_and_gathers_speed(model: str) -> None:
     car = make_outside_vehicle()
     for speed in (0.05, 0.5):
-        rolling = driven(model, OutsideInputs(0.0), 0.1, speed).motion
+        rolling = driven(model, OutsideInputs(0.0), 0.06, speed).motion
         assert rolling.v_x == pytest.approx(speed, abs=0.02)  # the wheels settle by slip
-        steered = driven(model, OutsideInputs(0.05), 0.1, speed).motion
+        steered = driven(model, OutsideInputs(0.05), 0.06, speed).motion
         assert steered.psi == pytest.approx(0.05 / car.wheelbase * steered.X, rel=0.15)
-        pulled = driven(model, OutsideInputs(0.0, 40.0, 40.0), 0.1, speed).motion
-        expected = 0.1 * 80.0 / car.wheel_radius / car.mass
+        pulled = driven(model, OutsideInputs(0.0, 40.0, 40.0), 0.06, speed).motion
+        expected = 0.06 * 80.0 / car.wheel_radius / car.mass
         assert pulled.v_x - rolling.v_x == pytest.approx(expected, rel=0.1)
 
 

@@ -1,4 +1,4 @@
-"""A text table is read in the dialect of whoever wrote it, and what it was taken for is said."""
+"""A text table is read in the dialect of whoever wrote it; metres on the ellipsoid."""
 
 import csv
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, Log
-from sideslip.envs.recordings.dialect import _UNITS, find_unit
+from sideslip.envs.recordings.dialect import _UNITS, find_unit, to_degrees, to_metres
 from sideslip.envs.recordings.log_file import read_log, read_parts
 from sideslip.envs.recordings.tables import COLUMNS, read_quantities
 
@@ -165,3 +165,23 @@ def test_a_missing_column_is_told_with_the_option_that_names_it(tmp_path: Path) 
     with pytest.raises(ValueError, match=r"no column steer_rad; .*--map steer_rad=COLUMN"):
         read_log(path)
     assert read_log(path, {"steer_rad": "DELTA"}).record.fast[:, FAST.steer].any()
+
+
+def test_degrees_agree_with_the_earths_own_measures() -> None:
+    """At the equator a degree of longitude is 111.3195 km, one of latitude 110.574 km; at 45
+    degrees of latitude they are 78.847 km and 111.132 km (WGS 84)."""
+    for latitude, east, north in ((0.0, 111_319.5, 110_574.3), (45.0, 78_846.8, 111_131.8)):
+        up, right = to_degrees(np.array([east]), np.array([north]), (latitude, 0.0))
+        assert up[0] - latitude == pytest.approx(1.0, rel=1e-5)
+        assert right[0] == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("origin", [(48.0, 11.0), (-33.9, 18.4), (64.1, 179.999)])
+def test_metres_are_the_inverse_of_degrees_over_the_date_line_too(
+    origin: tuple[float, float],
+) -> None:
+    X, Y = np.random.default_rng(0).uniform(-1000.0, 1000.0, (2, 50))
+    latitude, longitude = to_degrees(X, Y, origin)
+    longitude = np.where(longitude > 180.0, longitude - 360.0, longitude)
+    east, north = to_metres(latitude, longitude, origin)
+    assert east == pytest.approx(X, abs=1e-6) and north == pytest.approx(Y, abs=1e-6)

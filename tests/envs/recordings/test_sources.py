@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.envs.recordings.nmea import Decoder, Epoch
-from sideslip.envs.recordings.sources import ByteSource, Connection, is_nmea, make_source, read_nmea
+from sideslip.envs.recordings.sources import ByteSource, is_nmea, make_source, read_nmea
 
 from .receiver import gga, rmc, sentence
 
@@ -115,15 +115,13 @@ def test_a_peer_that_only_closes_is_given_up() -> None:
 def test_a_line_is_opened_again_so_many_times_and_no_more() -> None:
     opened = []
 
-    def lost() -> bytes:
+    def reset() -> Iterator[bytes]:
+        opened.append(1)
+        yield b""
         raise ConnectionResetError("reset")
 
-    def connect() -> Connection:
-        opened.append(1)
-        return Connection(lost, lambda: None)
-
     with pytest.raises(ConnectionError, match="quiet: lost, and not back after 3 tries: reset"):
-        list(ByteSource("quiet", connect, tries=3, wait=0.0))
+        list(ByteSource("quiet", reset, tries=3, wait=0.0))
     assert len(opened) == 1 + 3
 
 

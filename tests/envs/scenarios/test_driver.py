@@ -9,9 +9,7 @@ import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.engine.layout import P
-from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.packed import read
-from sideslip.envs.numerics.primitives import ARRAYS
 from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle, compute_target_angle
 from sideslip.envs.scenarios.road import (
     compute_path_offset,
@@ -22,7 +20,7 @@ from sideslip.envs.scenarios.road import (
 from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
-from ..helpers import FULL, LINEAR, Moment, bits, play
+from ..helpers import FULL, LINEAR, Moment, play
 
 T = 1.0
 QUICK = DriverParams(T, 1.0, 0.0, 1.0)
@@ -93,21 +91,6 @@ def test_a_mirrored_world_is_steered_the_other_way() -> None:
     left = CLOTHOID._replace(curvature=-0.02)
     b = compute_driver_angle(-0.02, mirrored, other, left, TARGET, QUICK, 0.6)
     assert a == pytest.approx(-b, rel=1e-12)
-
-
-@pytest.mark.plain
-def test_compiled_plain_and_arrays_give_the_same_bits() -> None:
-    rows = np.random.default_rng(3).normal(size=(40, len(Motion._fields))) * 3.0
-    arms = QUICK._replace(rest=0.99)
-
-    def call(function: Any, state: Any) -> Any:
-        return function(0.01, state, TRACK, CLOTHOID, TARGET, arms, 0.6)
-
-    compiled = [call(compute_driver_angle, Motion(*row)) for row in rows.tolist()]
-    plain = as_python(compute_driver_angle)
-    assert [call(plain, Motion(*row)) for row in rows.tolist()] == compiled
-    arrays = call(as_python(compute_driver_angle, ARRAYS), Motion(*rows.T))
-    assert bits(arrays) == bits(np.array(compiled))
 
 
 def test_on_the_papers_plant_a_bend_is_driven_without_error() -> None:

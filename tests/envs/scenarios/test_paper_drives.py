@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.envs import SCENARIOS, StabilityEnv
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.scenarios.papers import ROAD_TESTS
+from sideslip.envs.scenarios.manoeuvres import ROAD_TESTS
 
 TWINS = [scenario.name for scenario in ROAD_TESTS]
 

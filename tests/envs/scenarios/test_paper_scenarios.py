@@ -9,7 +9,7 @@ import pytest
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
 from sideslip.envs.engine.layout import P
 from sideslip.envs.numerics.packed import read
-from sideslip.envs.scenarios.papers import ROAD_TESTS, SIMULATIONS
+from sideslip.envs.scenarios.manoeuvres import ROAD_TESTS, SIMULATIONS
 
 pytestmark = pytest.mark.plain
 

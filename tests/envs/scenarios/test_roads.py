@@ -113,7 +113,7 @@ def test_a_batch_in_lanes_has_the_bits_of_single_envs() -> None:
         one.reset(seed=row)
         for _ in range(50):
             one.step(np.zeros(1, np.float32))
-        np.testing.assert_array_equal(one.get_state()["state"], many.states[row])
+        np.testing.assert_array_equal(one.get_state()["state"], many.engine.arrays.states[row])
 
 
 def test_braking_cars_are_followed_at_the_speed_that_their_drivers_want() -> None:

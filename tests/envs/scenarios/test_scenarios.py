@@ -1,8 +1,10 @@
-"""Scenarios: draws within their ranges, round trips, and values that are refused."""
+"""Scenarios: draws within their ranges, files, what is refused, and the tiers."""
 
 import dataclasses
 import json
 import math
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ from scipy import stats
 
 from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, make_scenario
 from sideslip.envs.engine.config import make_car
-from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, _is_stable, draw_stable
+from sideslip.envs.scenarios.draws import DRAWS_WIDTH, KMH, Draws, _is_stable, draw_stable
+from sideslip.envs.scenarios.manoeuvres import TIERS
 
 from ..helpers import play
 
@@ -199,7 +202,7 @@ def test_round_trip_through_json(name: str) -> None:
         ({"front_stiffness": (-0.1, 1.0)}, "front_stiffness must be positive"),
         ({"noise": {"gyroscope": 1.0}}, "unknown noise gyroscope"),
         ({"noise": {"gyro": math.nan}}, "gyro nan is not finite"),
-        ({"tyres": "magic"}, "unknown tyres 'magic'; known: linear, fiala, dugoff"),
+        ({"tyres": "magic"}, "unknown tyres 'magic'; known: linear, fiala, dugoff, magic-formula"),
         ({"tier": "3"}, "unknown tier '3'; known: , 1, 2a, 2b, 2c"),
         ({"hdop_law": "squared"}, "unknown hdop_law 'squared'; known: constant, half, table"),
         ({"hdop_spread": 2.0}, "hdop_spread is 0 to 1, got 2.0"),
@@ -260,3 +263,122 @@ def test_unknown_scenario_and_field_are_refused() -> None:
 def test_a_scenario_is_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         SCENARIOS["sine"].duration = 3.0  # type: ignore[misc]
+
+
+ODD = Scenario(
+    name='a "name" \\ with\tall\x7f \u00e9\U0001f600',
+    steering="trace",
+    trace=(0.0, -1e-17, 0.1 + 0.2),
+    speed=(5.0, 6.0),
+    camera_heading=0.5,
+    mirror=True,
+    noise={"gyro": 1e-300},
+    vehicle={"mass": 400},
+)
+
+
+@pytest.mark.parametrize("ending", ["toml", "json"])
+def test_what_is_written_is_read_back(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"it.{ending}"
+    for scenario in (*SCENARIOS.values(), ODD):
+        scenario.write(path)
+        assert make_scenario(path) == make_scenario(str(path)) == scenario
+
+
+def test_a_file_starts_from_a_name_or_a_file_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "gust"\nspeed = [4.0, 5.0]\n')
+    (tmp_path / "other.json").write_text('{"base": "mine.toml", "friction": 0.5, "name": "o"}')
+    mine, other = (make_scenario(tmp_path / name) for name in ("mine.toml", "other.json"))
+    assert mine == SCENARIOS["gust"].replace(name="mine", speed=(4.0, 5.0))
+    assert other == mine.replace(name="o", friction=0.5)
+    env = StabilityEnv(scenario=str(tmp_path / "mine.toml"))
+    env.reset(seed=0, options={"scenario": tmp_path / "other.json"})
+    assert env.scenario == other
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "message"),
+    [
+        ("speed = ", ValueError, "expected TOML, but"),
+        ("speeed = 5.0", TypeError, "unknown scenario field 'speeed'; did you mean 'speed'"),
+        ('base = "gusts"', ValueError, "unknown scenario 'gusts'; did you mean 'gust'"),
+        ('steering = "driven"', ValueError, "unknown steering 'driven'; did you mean 'driver'"),
+        ("speed = -1.0", ValueError, "speed must not be negative"),
+        ('steering = "trace"', ValueError, "trace has 2 to 1000000 angles"),
+        ("trace = [0.1, 0.2]", ValueError, "trace has 2 to 1000000 angles"),
+        ('steering = "trace"\ntrace = [0.1, nan]', ValueError, "trace is angles in rad, finite"),
+        ('steering = "trace"\ntrace = [0, 1]\ntrace_step = 0', ValueError, "trace_step is 0.001"),
+        ('base = "bad.toml"', ValueError, "its base is the file itself"),
+        ('base = "good.toml"', ValueError, "its base is the file itself, or leads back to it"),
+        ("", ValueError, "holds nothing"),
+    ],
+)
+def test_a_bad_file_is_refused(
+    tmp_path: Path, content: str, error: type[Exception], message: str
+) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(content)
+    (tmp_path / "good.toml").write_text('base = "bad.toml"')
+    with pytest.raises(error, match=message) as caught:
+        make_scenario(path)
+    assert str(path) in str(caught.value)
+
+
+def test_what_is_no_scenario(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.toml: there is no such scenario file"):
+        make_scenario("nowhere.toml")
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.csv"):
+        make_scenario("nowhere.csv")
+    with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
+        make_scenario(tmp_path / "drive.txt")
+    with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
+        ODD.write(tmp_path / "it.yaml")
+    with pytest.raises(TypeError, match="a scenario is a name, the path of"):
+        make_scenario(5)  # type: ignore[arg-type]
+
+
+SPEEDS = {"1": (18.0, 28.0), "2a": (60.0, 80.0), "2b": (60.0, 80.0), "2c": (55.0, 85.0)}  # km/h
+FRICTIONS = {"1": (0.7, 1.0), "2a": (0.9, 1.0), "2b": (0.3, 1.0), "2c": (0.6, 1.0)}
+NAMES = [scenario.name for scenario in TIERS if scenario.tier]
+
+
+def vehicle_of(name: str) -> str:
+    """The preset that a tier's scenario is meant for."""
+    return "coms" if SCENARIOS[name].tier == "1" else "passenger-car"
+
+
+def test_every_tier_has_at_least_four_and_both_classes_five() -> None:
+    count = Counter(SCENARIOS[name].tier for name in NAMES)
+    assert min(count.values()) >= 4
+    assert count["1"] >= 5
+    assert count["2a"] == count["2b"] >= 5
+    assert {name for name, each in SCENARIOS.items() if each.tier} == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_table_of_actions_would_need_every_draw(name: str) -> None:
+    """Onset, side, speed, tyres and friction, and the manoeuvre's size and its pace."""
+    scenario = SCENARIOS[name]
+    low, high = scenario.get_draw_ranges()
+    drawn = {Draws._fields[i] for i in np.flatnonzero(low < high)}
+    assert {"gyro_bias", "accel_y_bias", "gps_latency", "bank"} <= drawn
+    assert {"onset", "side", "speed", "friction", "front_stiffness", "rear_stiffness"} <= drawn
+    size = {"path_speed"} if scenario.steering == "driver" else {"amplitude"}
+    pace = {"step": {"hold"}, "held-step": set(), "driver": set()}
+    assert size | pace.get(scenario.steering, {"frequency"}) <= drawn
+    for field, unit, ranges in (("speed", KMH, SPEEDS), ("friction", 1.0, FRICTIONS)):
+        least, most = scenario.range(field)
+        assert least >= ranges[scenario.tier][0] * unit - 1e-9
+        assert most <= ranges[scenario.tier][1] * unit + 1e-9
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("limit")])
+def test_a_car_without_control_mostly_gets_through(name: str) -> None:
+    """Otherwise survival alone would decide the score, not how well the car is kept."""
+    env = StabilityEnv("fusion", scenario=name, vehicle=vehicle_of(name), control_period=100)
+    ends = []
+    for seed in range(8):
+        env.reset(seed=seed)
+        ends.append(play(env, [0.0] * 200)[-1].terminated)
+    assert sum(ends) <= 2

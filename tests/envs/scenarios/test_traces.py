@@ -1,4 +1,4 @@
-"""A recorded steering trace is driven again: between samples, mirrored, alone and in a batch."""
+"""A recorded steering trace is driven again, and a driver wanders, alone and in a batch."""
 
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,24 @@ import pytest
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device import make_device_env
+from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved
-from .commands import commands
 
 VISION = "sideslip/YawVision-v0"
 TRACE: dict[str, Any] = {"steering": "trace", "trace": [0.0, 0.03, -0.02, 0.01], "duration": 0.2}
+
+
+def commands(env: StabilityEnv, seed: int = 0, **options: Any) -> Any:
+    """The driver's steering command at the ticks of an episode but the last, (T,)."""
+    env.reset(seed=seed, options=options)
+    rows, over = [env.record.fast[:, FAST.steer_command]], False
+    while not over:
+        _, _, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
+        rows.append(env.record.fast[:, FAST.steer_command])
+        over = terminated or truncated
+    return np.concatenate(rows)[1:]  # a row has what acted before it
 
 
 def test_a_log_is_driven_again(tmp_path: Path) -> None:
@@ -70,15 +81,6 @@ def test_the_last_angle_stays_and_a_mirrored_trace_is_its_negative() -> None:
     assert signs == {-1.0, 1.0}
 
 
-def test_rows_of_a_batch_are_the_environment_alone() -> None:
-    """Traces of several lengths beside a programme and a driver, over several episodes."""
-    longer = {**TRACE, "trace": [0.05 * np.sin(k) for k in range(30)], "mirror": True}
-    rows: list[Any] = [TRACE, {"base": "slalom", "duration": 0.3}, longer, "car-iso-3888-1"] * 6
-    together = gym.make_vec(VISION, len(rows), scenario=rows, control_period=7)
-    alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
-    drive_alike(together, alone, 100)
-
-
 def test_a_reset_option_may_bring_a_trace_and_take_it_away() -> None:
     env = StabilityEnv(scenario={"base": "slalom", "duration": 0.3})
     before = commands(env)
@@ -96,11 +98,53 @@ def test_a_reset_option_may_bring_a_trace_and_take_it_away() -> None:
     assert bits(cars.get_state()["params"]) == bits(snapshot["params"])
 
 
-def test_a_forecast_knows_the_trace_and_a_device_refuses_it() -> None:
-    env = StabilityEnv(scenario=TRACE)
+WANDER: dict[str, Any] = {"steering": "wander", "amplitude": 0.01, "frequency": 2.0}
+WANDER |= {"hold": 0.02, "duration": 0.5}
+
+
+def wander(n: int = 10, seed: int = 0, **changes: Any) -> Any:
+    return commands(StabilityEnv(scenario=WANDER | changes, control_period=n), seed)
+
+
+def test_the_angle_is_of_the_seed_alone_and_is_held() -> None:
+    angles = wander()
+    assert bits(wander(7)) == bits(angles)
+    assert bits(wander(1, vehicle={"mass": 500.0})) == bits(angles)
+    assert bits(wander(seed=1)) != bits(angles)
+    moved = 1 + np.flatnonzero(np.diff(angles))
+    np.testing.assert_array_equal(moved, np.arange(20, 500, 20))
+
+
+def test_it_is_stationary_and_forgets_at_its_rate() -> None:
+    """From the reset on: standard deviation, correlation of neighbours, white innovations."""
+    angles = np.array([wander(100, seed, duration=4.0)[::20] for seed in range(24)])
+    keep = np.exp(-2.0 * np.pi * 2.0 * 0.02)
+    fresh = (angles[:, 1:] - keep * angles[:, :-1]) / (0.01 * np.sqrt(1.0 - keep**2))
+    count = fresh.size
+    for numbers in (fresh, angles[:, ::20] / 0.01, angles[:, 0] / 0.01):
+        assert abs(np.mean(numbers)) < 3.0 / np.sqrt(numbers.size)
+        assert abs(np.mean(numbers**2) - 1.0) < 3.0 * np.sqrt(2.0 / numbers.size)
+    for lag in (1, 2, 5):  # white, across env-steps too
+        assert abs(np.mean(fresh[:, lag:] * fresh[:, :-lag])) < 3.0 / np.sqrt(count - 24 * lag)
+
+
+def test_rows_of_a_batch_are_the_environment_alone() -> None:
+    """Traces of several lengths and wanderers beside a programme and a driver, in lanes, too."""
+    longer = {**TRACE, "trace": [0.05 * np.sin(k) for k in range(30)], "mirror": True}
+    slalom = {"base": "slalom", "duration": 0.3}
+    rows: list[Any] = [TRACE, slalom, longer, "car-iso-3888-1", WANDER, WANDER | {"hold": 0.05}] * 4
+    together = gym.make_vec(VISION, len(rows), scenario=rows, control_period=7)
+    alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
+    drive_alike(together, alone, 100)
+
+
+@pytest.mark.parametrize("scenario", [TRACE, WANDER], ids=["trace", "wander"])
+def test_a_forecast_knows_the_angles_and_a_device_refuses_them(scenario: dict[str, Any]) -> None:
+    env = StabilityEnv(scenario=scenario)
     env.reset(seed=0)
     expected = np.interp(np.arange(200), 10 * np.arange(4), TRACE["trace"])
+    expected = wander() if scenario is WANDER else expected
     np.testing.assert_allclose(make_forecast(env).driver.ravel(), expected, rtol=0.0, atol=1e-15)
     pytest.importorskip("torch")
-    with pytest.raises(ValueError, match="'custom': no trace is driven on a device"):
-        make_device_env(VISION, scenario=TRACE)
+    with pytest.raises(ValueError, match=f"'custom': no {scenario['steering']} is driven on a dev"):
+        make_device_env(VISION, scenario=scenario)

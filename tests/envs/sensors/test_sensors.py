@@ -8,10 +8,19 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import COMS, StabilityEnv
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors.camera import sample_camera
-from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, _count_satellites, sample_gps
+from sideslip.envs.sensors.camera import FieldOfView, sample_camera
+from sideslip.envs.sensors.errors import IDEAL_SENSORS
 from sideslip.envs.sensors.inertial import Noise
+from sideslip.envs.sensors.slow import (
+    HDOP_LAWS,
+    OUTAGE_JUMP,
+    MeasurementContext,
+    SatelliteGeometry,
+    _count_satellites,
+    _sample_gps,
+)
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 from ..helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
@@ -75,7 +84,9 @@ def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
 def test_camera_sample_is_tie_vision_4_with_curvature() -> None:
     motion = Motion(7.0, 0.2, 0.1, 0.5, 30.0, 4.0, 31.0, 1.5, 0.44)
     for kappa, bend in ((0.0, 0.0), (0.02, 0.02)):
-        psi, y_l = sample_camera(motion, RoadParams(kappa, 0.0, 1.0), 5.135, QUIET, CALM)
+        psi, y_l = sample_camera(
+            motion, RoadParams(kappa, 0.0, 1.0), 5.135, QUIET, CALM, IDEAL_SENSORS
+        )
         assert psi == pytest.approx(0.06, abs=1e-15)
         # y_l = y_cg + l_pre psi - kappa l_pre^2 / 2
         assert y_l == pytest.approx(1.5 + 5.135 * 0.06 - bend * 5.135**2 / 2.0, abs=1e-14)
@@ -86,7 +97,7 @@ def test_y_l_is_where_the_road_is_seen_at_the_preview_distance() -> None:
     """On a circle the formula errs by the fourth order of the angles, geometry written out."""
     kappa, psi, y, l_pre = 0.01, 0.02, 0.5, 5.135
     motion = Motion(7.0, 0.0, 0.0, psi, 0.0, y, 0.0, y, 0.0)
-    _, y_l = sample_camera(motion, RoadParams(kappa, -1e3, 1.0), l_pre, QUIET, CALM)
+    _, y_l = sample_camera(motion, RoadParams(kappa, -1e3, 1.0), l_pre, QUIET, CALM, IDEAL_SENSORS)
     ahead = np.array([l_pre * math.cos(psi), y + l_pre * math.sin(psi)])
     left_of_road = 1.0 / kappa - math.hypot(ahead[0], ahead[1] - 1.0 / kappa)
     # kappa l^2/2 against the arc of (1 - kappa y): kappa^2 l^2 y / 2 = 7e-4, and l psi^3 / 6
@@ -95,9 +106,11 @@ def test_y_l_is_where_the_road_is_seen_at_the_preview_distance() -> None:
 
 def gps(motion: Motion, noise: Noise = QUIET, n: Any = CALM, **how: Any) -> Any:
     """A GPS sample; `how` changes ahead, left, hdop, weight or small_angle."""
-    place = how.get("ahead", 0.0), how.get("left", 0.0)
-    sky = how.get("hdop", 1.0), how.get("weight", 0.5)
-    return sample_gps(motion, *place, *sky, noise, n, how.get("small_angle", 0))
+    car = make_car(COMS)._replace(forward=how.get("ahead", 0.0), left=how.get("left", 0.0))
+    sky = SatelliteGeometry(0.0, 0.0, 0.0, 0.0, how.get("weight", 0.5))
+    parts = RoadParams(0.0, 0.0, 1.0), car, noise, sky, FieldOfView(1.0, 1.0), IDEAL_SENSORS
+    context = MeasurementContext(motion, *parts, how.get("small_angle", 0), 0, 0, 0)
+    return _sample_gps(context, how.get("hdop", 1.0), n)
 
 
 @pytest.mark.plain

@@ -10,10 +10,10 @@ from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
 from sideslip.envs.sensors.camera import (
     FieldOfView,
-    compute_lane_offset,
     compute_lane_quality,
     sample_camera,
 )
+from sideslip.envs.sensors.errors import IDEAL_SENSORS
 from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 from sideslip.estimators import make_estimator
@@ -47,10 +47,11 @@ def test_where_the_road_leads_changes_nothing_that_is_seen_of_it() -> None:
     seen = []
     for turned in (0.0, 0.7, -2.0):
         motion = Motion(*still, turned + 0.1, 0.0, 0.0, 0.0, 0.4, turned)
-        assert as_python(compute_lane_offset)(motion, road, 5.0) == pytest.approx(0.4 + 5.0 * 0.1)
         assert as_python(compute_lane_quality)(motion, FieldOfView(0.15, 1.0)) == 1.0
         seen.append(
-            as_python(sample_camera)(motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4)
+            as_python(sample_camera)(
+                motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4, IDEAL_SENSORS
+            )
         )
     np.testing.assert_allclose(seen, [(0.1, 0.9)] * 3)
 

@@ -90,20 +90,17 @@ def test_in_the_env_it_follows_the_record_tick_by_tick() -> None:
 
 @pytest.mark.parametrize("n", [1, 10, 33])
 def test_a_snapshot_carries_it_on_and_the_period_does_not_matter(n: int) -> None:
-    scenario = FULL | TURNING | {"noise": {}}
-    env, twin = (StabilityEnv("fusion", scenario, reference="lagged", control_period=n),) * 2
-    twin = StabilityEnv("fusion", scenario, reference="lagged", control_period=n)
-    env.reset(seed=3)
-    play(env, [0.2] * (330 // n))
-    twin.reset(seed=9)
+    def made(period: int, seed: int) -> StabilityEnv:
+        scenario = FULL | TURNING | {"noise": {}}
+        env = StabilityEnv("fusion", scenario, reference="lagged", control_period=period)
+        env.reset(seed=seed)
+        return env
+
+    env, twin, every = made(n, 3), made(n, 9), made(1, 3)
+    last = play(env, [0.2] * (330 // n))[-1].info
     twin.set_state(env.get_state())
     assert bits(play(env, [0.1] * 20)) == bits(play(twin, [0.1] * 20))
-    every = StabilityEnv("fusion", scenario, reference="lagged", control_period=1)
-    every.reset(seed=3)
     ticks = play(every, [0.2] * (330 // n * n))
     assert len(fast_rows(ticks)) == 330 // n * n
-    again = StabilityEnv("fusion", scenario, reference="lagged", control_period=n)
-    again.reset(seed=3)
-    last = play(again, [0.2] * (330 // n))[-1].info
     for name in ("beta_ref", "gamma_ref"):
         assert ticks[-1].info[name] == last[name]

@@ -66,7 +66,7 @@ def test_summary_is_last_mean_newest_age_and_fresh(name: str, n: int) -> None:
     seen: dict[str, tuple[float, Any]] = {}
     obs, info = env.reset(seed=1)
     compare(env, obs, expected(env, env.record, seen, info))
-    for moment in play(env, np.random.default_rng(0).uniform(-1.0, 1.0, 1500 // n)):
+    for moment in play(env, np.random.default_rng(0).uniform(-1.0, 1.0, 450 // n)):
         compare(env, moment.obs, expected(env, moment.record, seen, moment.info))
     assert seen
 

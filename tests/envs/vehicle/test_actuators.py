@@ -1,4 +1,4 @@
-"""Torque distribution in ISO axes, and lags that are exact exponentials."""
+"""Torque distribution, power limit, lags, and the load that drive moves between the axles."""
 
 import math
 from typing import Any
@@ -10,18 +10,32 @@ from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
 from sideslip.envs.engine.config import make_car
+from sideslip.envs.engine.tick import compute_motor_torques
 from sideslip.envs.record import FAST
-from sideslip.envs.ticks import TICK
+from sideslip.envs.scenarios.driver import SpeedProfile
+from sideslip.envs.ticks import FOREVER, TICK
 from sideslip.envs.vehicle.actuators import (
     Lag,
     allocate_torques,
     apply_lag,
+    compute_torque_limit,
     compute_yaw_moment,
     make_lag,
 )
+from sideslip.envs.vehicle.dynamics import CarParams, Motion
 from sideslip.envs.vehicle.linear import make_bicycle_model
+from sideslip.envs.vehicle.parameters import GRAVITY
+from sideslip.envs.vehicle.tyres import (
+    FIALA,
+    PlantVariant,
+    TyreInputs,
+    TyreLoad,
+    compute_tyre_forces,
+    compute_tyre_load,
+    has_load_shift,
+)
 
-from ..helpers import FULL, LINEAR, fast_rows, play
+from ..helpers import FULL, LINEAR, bits, fast_rows, play
 
 pytestmark = pytest.mark.plain
 
@@ -183,3 +197,140 @@ def test_lags_false_is_the_vehicle_without_lags() -> None:
     one = applied("coms", FULL | {"lags": False})
     np.testing.assert_array_equal(one, applied(bare, FULL | {"lags": True}))
     assert one[0, FAST.torque_right] == pytest.approx(100.0, rel=1e-15)
+
+
+WEAK = COMS.replace(motor_power=2000.0)
+POWER_CAR, FREE = make_car(WEAK), make_car(COMS)
+HOLD = SpeedProfile(speed=7.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
+speeds, either = st.floats(-40.0, 40.0), st.sampled_from([0.0, 1.0])
+
+
+@given(speeds, st.floats(-1e3, 1e3), st.floats(-20.0, 20.0), either, either)
+def test_no_wheel_takes_or_gives_more_than_its_power(
+    v: float, N_z: float, asked: float, hold: float, yaw_first: float
+) -> None:
+    """P = T omega, omega = v / r, whatever moment and acceleration are asked for."""
+    pace = HOLD._replace(speed=v + asked, hold=hold, acceleration=asked * (1.0 - hold))
+    T_l, T_r, _, _ = compute_motor_torques(N_z, 0.0, v, 0.0, pace, POWER_CAR, yaw_first)
+    for torque in (T_l, T_r):
+        assert abs(torque * v / WEAK.wheel_radius) <= 2000.0 * (1.0 + 1e-14)  # roundings
+        assert abs(torque) <= WEAK.motor_torque * (1.0 + 1e-14)
+    if abs(v) > 0.5:
+        most = 2000.0 * WEAK.rear_track / abs(v)
+        assert abs(compute_yaw_moment(T_l, T_r, POWER_CAR)) <= most * (1.0 + 1e-14)
+
+
+@given(speeds)
+def test_up_to_P_over_T_max_the_torque_is_what_limits(v: float) -> None:
+    corner = 2000.0 / 100.0 * 0.22  # m/s
+    expected = 100.0 if abs(v) <= corner else 2000.0 * 0.22 / abs(v)
+    assert compute_torque_limit(v, POWER_CAR) == pytest.approx(expected, rel=1e-15)
+    assert compute_torque_limit(v, FREE) == 100.0  # 0: no limit, bit for bit
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_env_delivers_no_more_moment_than_the_power_allows(sign: float) -> None:
+    power: dict[str, Any] = {"vehicle": {"motor_power": 2000.0}, "steering": "straight"}
+    env = StabilityEnv(scenario=FULL | power, control_period=1)
+    env.reset(seed=0)
+    assert env.vehicle.motor_power == 2000.0
+    moments = play(env, [sign] * 100)
+    for moment in moments[1:]:
+        row = moment.record.fast[0]
+        v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])  # noise-free, a tick later
+        most = 2000.0 * COMS.rear_track / v
+        assert sign * moment.info["yaw_moment"] == pytest.approx(most, rel=1e-3)
+        assert most < 0.8 * COMS.yaw_moment_limit
+
+
+def test_braking_is_limited_too() -> None:
+    """Both motors brake with 2 kW: the car loses at most 2 P / m v a second."""
+    power = {"vehicle": {"motor_power": 2000.0}, "acceleration": -5.0, "speed": 8.0}
+    env = StabilityEnv(scenario=FULL | power, control_period=10)
+    env.reset(seed=0)
+    before = env.motion.v_x
+    play(env, [0.0])
+    fall = (before - env.motion.v_x) / 0.01
+    assert fall == pytest.approx(2.0 * 2000.0 / (COMS.mass * 8.0), rel=2e-3)
+
+
+FLAT = (COMS, PASSENGER_CAR)
+HIGH = [car.replace(transfer_height=car.gravity_height) for car in FLAT]
+torques = st.floats(-3e3, 3e3)
+hundreds = st.integers(-30, 30).map(lambda each: 100.0 * each)
+cars = st.sampled_from(HIGH)
+
+
+def plain_shift(car: CarParams, T_l: float, T_r: float) -> float:
+    """F_x h / l in N, where F_x is what friction lets a standing car's rear wheels pass on."""
+    per_wheel = 0.5 * car.m * GRAVITY * car.l_f / (car.l_f + car.l_r)
+    limits = (car.mu * per_wheel, car.mu_r * per_wheel)
+    pairs = zip((T_l, T_r), limits, strict=True)
+    F_x = sum(min(max(torque / car.r, -limit), limit) for torque, limit in pairs)
+    return float(F_x * car.h_x / (car.l_f + car.l_r))
+
+
+@given(cars, torques, torques, st.floats(0.1, 1.2), st.floats(0.1, 1.2))
+def test_the_axles_exchange_F_x_h_over_l(
+    vehicle: Any, T_l: float, T_r: float, mu: float, mu_r: float
+) -> None:
+    car = make_car(vehicle)._replace(mu=mu, mu_r=mu_r)
+    still, load = (
+        compute_tyre_load(TyreInputs(0.0, *T), car, 0, 1) for T in ((0.0, 0.0), (T_l, T_r))
+    )
+    moved = plain_shift(car, T_l, T_r)
+    mean = 0.5 * (mu + mu_r)
+    for ours, theirs in (
+        (2.0 * (load.limit_f - still.limit_f) / mean, -moved),
+        (2.0 * (load.rear_l - still.rear_l) / mu, moved),
+        (2.0 * (load.rear_r - still.rear_r) / mu_r, moved),
+    ):
+        assert ours == pytest.approx(theirs, abs=1e-10)  # roundings of some 1e4 N
+    # what the ground bears is the car's weight
+    loads = 2.0 * load.limit_f / mean + load.rear_l / mu + load.rear_r / mu_r
+    assert loads == pytest.approx(car.m * GRAVITY, rel=1e-14)
+    assert min(load.limit_f, load.rear_l, load.rear_r) > 0.0
+
+
+def rear_force(car: CarParams, T: float, roll: int) -> float:
+    """N of the rear axle's lateral force at a large slip, both motors at T."""
+    load: TyreLoad = compute_tyre_load(
+        TyreInputs(0.0, T, T), car, 0, has_load_shift(0, FIALA, roll)
+    )
+    sliding = Motion(15.0, -6.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return float(compute_tyre_forces(sliding, load, car, 0.0, PlantVariant(0, FIALA, roll))[1])
+
+
+@pytest.mark.parametrize("roll", [0, 1])
+@pytest.mark.parametrize("vehicle", HIGH, ids=lambda car: str(car.name))
+def test_hard_braking_unloads_the_rear_and_driving_loads_it(vehicle: Any, roll: int) -> None:
+    flat = make_car(vehicle.replace(transfer_height=0.0))
+    T = 0.4 * vehicle.motor_torque
+    assert rear_force(flat, -T, roll) == rear_force(flat, T, roll)  # the friction circle alone
+    assert rear_force(make_car(vehicle), -T, roll) < 0.97 * rear_force(flat, -T, roll)
+    assert rear_force(make_car(vehicle), T, roll) > 1.01 * rear_force(flat, T, roll)
+
+
+@given(hundreds, hundreds, st.sampled_from([0, 1]), st.sampled_from([0, 1]))
+def test_without_a_height_and_at_small_angles_nothing_moves(
+    T_l: float, T_r: float, small_angle: int, shifting: int
+) -> None:
+    inputs = TyreInputs(0.03, T_l, T_r)
+    for flat, high in zip(FLAT, HIGH, strict=True):
+        none = compute_tyre_load(inputs, make_car(flat), small_angle, shifting)
+        some = compute_tyre_load(inputs, make_car(high), small_angle, shifting)
+        rests = small_angle or plain_shift(make_car(high), T_l, T_r) == 0.0
+        assert (bits(none) == bits(some)) == bool(rests)
+
+
+def test_a_car_that_brakes_in_a_turn_turns_in() -> None:
+    """The loaded front and the unloaded rear turn it more than the friction circle alone does."""
+    turning = {"steering": "step", "amplitude": 0.09, "onset": 0.0, "hold": 9.0, "friction": 0.5}
+    braking = {"speed_change": -4.0, "change_start": 1.0, "change_length": 1.5, "speed": 8.0}
+    rates = []
+    for height in (0.0, COMS.gravity_height):
+        scenario = FULL | turning | braking | {"vehicle": {"transfer_height": height}}
+        env = StabilityEnv(scenario=scenario, control_period=10)
+        env.reset(seed=0)
+        rates.append(max(moment.info["gamma"] for moment in play(env, [0.0] * 250)[100:]))
+    assert rates[1] > 1.02 * rates[0]

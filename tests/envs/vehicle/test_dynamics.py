@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.integrate
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,16 +23,19 @@ from sideslip.envs.vehicle.dynamics import (
 from sideslip.envs.vehicle.tyres import (
     FIALA,
     LINEAR,
+    MAGIC_FORMULA,
     TYRE_LAWS,
+    PlantVariant,
     Tyre,
     TyreInputs,
     compute_lateral_forces,
     compute_tyre_load,
+    has_load_shift,
 )
 
 pytestmark = pytest.mark.plain
 
-CAR = make_car(COMS)
+CAR = make_car(COMS)._replace(relaxation=0.0)  # slip acts at once; a test has it relax
 STRAIGHT, CIRCLE = RoadParams(0.0, 0.0, 1.0), RoadParams(0.02, -1e6, 1.0)
 CALM = DisturbanceForces(0.0, 0.0)
 PLANTS = [(small_angle, law) for small_angle in (0, 1) for law in range(len(TYRE_LAWS))]
@@ -47,7 +51,7 @@ def slope(state: Motion, steer: float = 0.0, T: Any = (0.0, 0.0), **how: Any) ->
     push, car, road = how.get("push", CALM), how.get("car", CAR), how.get("road", STRAIGHT)
     small_angle, law = how.get("small_angle", 0), how.get("law", FIALA)
     load = compute_tyre_load(TyreInputs(steer, *T), car, small_angle)
-    return derivative(state, load, push, car, road, small_angle, law)
+    return derivative(state, load, push, car, road, PlantVariant(small_angle, law))
 
 
 def drive(
@@ -56,7 +60,7 @@ def drive(
     load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 0)
     road, law, rule = how.get("road", STRAIGHT), how.get("law", FIALA), how.get("rule", kutta3)
     for _ in range(round(seconds / h)):
-        state = rule(state, (load, load, load), CALM, car, road, h, 0, law)
+        state = rule(state, (load, load, load), CALM, car, road, h, PlantVariant(0, law))
     return state
 
 
@@ -175,8 +179,9 @@ def test_mirrored_car_moves_as_the_mirror_image(
     one = slope(left, steer, (20.0, -5.0), push=DisturbanceForces(30.0, 4.0), **how)
     other = slope(right, -steer, (-5.0, 20.0), push=DisturbanceForces(-30.0, -4.0), **how)
     assert other == one._replace(
-        v_y=-one.v_y, gamma=-one.gamma, psi=-one.psi, Y=-one.Y, y=-one.y, theta=-one.theta
-    )
+        v_y=-one.v_y, gamma=-one.gamma, psi=-one.psi, Y=-one.Y, y=-one.y, theta=-one.theta,
+        slip_f=-one.slip_f, slip_r=-one.slip_r,
+    )  # fmt: skip
 
 
 @given(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), speeds, st.floats(-10.0, 10.0))
@@ -228,7 +233,112 @@ def test_any_speed_and_hardly_any_friction_stay_finite(speed: float, mu: float) 
     load = compute_tyre_load(TyreInputs(0.4, -100.0, 100.0), car, 0)
     state = motion(v_x=speed)
     for _ in range(3000):
-        state = kutta3(state, (load, load, load), CALM, car, CIRCLE, 1e-3, 0, FIALA)
+        state = kutta3(state, (load, load, load), CALM, car, CIRCLE, 1e-3, PlantVariant(0, FIALA))
     assert np.all(np.isfinite(state))
     if mu == 1e-9:  # ice: the car goes on as it went
         assert math.hypot(state.v_x, state.v_y) == pytest.approx(abs(speed), abs=1e-6)
+
+
+def relaxed_rates(t: float, x: Any, car: CarParams, steer: Any, roll: int) -> list[float]:
+    """The right-hand side of a car on four relaxing tyres, by Pacejka (2006), written out slowly.
+
+    x: v_x, v_y, gamma, phi, phi_dot and the slips of both axles; alike torques of 10 N m.
+    """
+    v_x, v_y, gamma, phi, phi_dot, slip_f, slip_r = x
+    delta, F_x, g = steer(t), 10.0 / car.r, 9.81
+    direct = (car.m * car.h - car.S) * v_x * gamma
+    moment = (car.K_x * phi + car.C_x * phi_dot + direct) * roll
+    axles = []
+    for slip, arm, track, C, drive in (
+        (slip_f, car.l_r, car.d_f, car.C_f, 0.0), (slip_r, car.l_f, car.d_r, car.C_r, F_x),
+    ):  # fmt: skip
+        F_z0 = car.m * g * arm / (2.0 * (car.l_f + car.l_r))
+        total = 0.0
+        for side in (-1.0, 1.0):  # the left wheel gives load to the right one
+            F_z = F_z0 * (1.0 + side * moment / (0.5 * car.m * g * track))
+            df_z = F_z / F_z0 - 1.0
+            D = math.sqrt((car.mu * F_z * (1.0 - 0.145 / 0.990 * df_z)) ** 2 - drive**2)
+            K = C * math.sin(2.0 * math.atan(F_z / (2.13 * F_z0)))
+            B = K / math.sin(2.0 * math.atan(1.0 / 2.13)) / (1.193 * D)
+            E = -1.003 - 0.537 * df_z
+            angle = math.atan(B * slip - E * (B * slip - math.atan(B * slip)))
+            total += D * math.sin(1.193 * angle)
+        axles.append(total)
+    s, c = math.sin(delta), math.cos(delta)
+    front = v_y + car.l_f * gamma
+    F_y = axles[0] * c + axles[1]
+    I_phi = car.I_x - car.S**2 / car.m
+    dphi_dot = car.S * (F_y / car.m + g * phi) - car.C_x * phi_dot - car.K_x * phi
+    dphi_dot *= roll / I_phi
+    return [
+        (2.0 * F_x - axles[0] * s) / car.m + v_y * gamma,
+        (F_y + car.S * dphi_dot) / car.m - v_x * gamma,
+        (car.l_f * axles[0] * c - car.l_r * axles[1]) / car.I,
+        roll * phi_dot,
+        dphi_dot,
+        ((v_x * s - front * c) - (v_x * c + front * s) * slip_f) / car.relaxation,
+        (car.l_r * gamma - v_y - v_x * slip_r) / car.relaxation,
+    ]
+
+
+@pytest.mark.parametrize("roll", [0, 1])
+@pytest.mark.parametrize(("vehicle", "V"), [(COMS, 9.0), (PASSENGER_CAR, 20.0)])
+def test_relaxing_tyres_by_an_independent_integration(vehicle: Any, V: float, roll: int) -> None:
+    """Three seconds of a sine steer near the limit by DOP853; mirrored bit for bit."""
+    car, variant = make_car(vehicle.replace(relaxation=0.3)), PlantVariant(0, MAGIC_FORMULA, roll)
+    shifts = has_load_shift(*variant)
+
+    def drive_sine(amplitude: float) -> Motion:
+        state = motion(v_x=V)
+        for k in range(3000):
+            angles = (amplitude * math.sin(3.0e-3 * (k + part)) for part in (0.0, 0.5, 1.0))
+            a, b, c = (
+                compute_tyre_load(TyreInputs(angle, 10.0, 10.0), car, 0, shifts) for angle in angles
+            )
+            state = kutta3(state, (a, b, c), CALM, car, STRAIGHT, 1e-3, variant)
+        return state
+
+    end = drive_sine(0.08)
+    names = ["v_x", "v_y", "gamma", "phi", "phi_dot", "slip_f", "slip_r"]
+    exact = scipy.integrate.solve_ivp(
+        relaxed_rates, (0.0, 3.0), [V, *[0.0] * 6], "DOP853", rtol=1e-11, atol=1e-11,
+        args=(car, lambda t: 0.08 * math.sin(3.0 * t), roll),
+    )  # fmt: skip
+    found = np.array([getattr(end, name) for name in names])
+    assert np.abs(found - exact.y[:, -1]).max() < 1e-5, np.abs(found - exact.y[:, -1])  # SI units
+    assert np.abs(exact.y[5:]).max() > 0.06  # rad of slip: far from linear
+    odd = ("v_y", "gamma", "psi", "Y", "y", "phi", "phi_dot", "slip_f", "slip_r")
+    mirror = {name: -getattr(end, name) for name in odd}
+    assert drive_sine(-0.08) == end._replace(**mirror)
+
+
+@pytest.mark.parametrize("small_angle", [0, 1])
+def test_a_step_in_slip_reaches_63_percent_after_the_relaxation_length(small_angle: int) -> None:
+    """Of a car that is too heavy to turn; without a length the force is there at once."""
+    V, delta, forces = 10.0, 0.01, []
+    for relaxation in (0.4, 0.0):
+        car = CAR._replace(m=1e12, I=1e12, relaxation=relaxation)
+        load = compute_tyre_load(TyreInputs(delta, 0.0, 0.0), car, small_angle)
+        variant, state = PlantVariant(small_angle, MAGIC_FORMULA), motion(v_x=V)
+        for _ in range(40):  # 0.4 m
+            state = kutta3(state, (load, load, load), CALM, car, STRAIGHT, 1e-3, variant)
+        forces.append(derivative(state, load, CALM, car, STRAIGHT, variant).gamma)
+        tangent = delta if small_angle else math.tan(delta)
+        along = 1.0 if small_angle else math.cos(delta)
+        assert state.slip_r == pytest.approx(0.0, abs=1e-9)
+        share = 1.0 - math.exp(-along) if relaxation else 0.0
+        assert state.slip_f == pytest.approx(share * tangent, rel=1e-6)
+    assert forces[0] / forces[1] == pytest.approx(1.0 - math.exp(-1.0), rel=1e-4)
+
+
+def test_relaxing_tyres_are_stable_at_a_standstill_and_backwards() -> None:
+    car = make_car(COMS.replace(relaxation=0.05))
+    load = compute_tyre_load(TyreInputs(0.5, 20.0, -20.0), car, 0, 1)
+    for V in (0.0, 0.01, -3.0, 30.0):
+        state = motion(v_x=V, v_y=0.3)._replace(slip_f=0.5, slip_r=-0.5)
+        for _ in range(3000):
+            state = kutta3(
+                state, (load, load, load), CALM, car, CIRCLE, 1e-3, PlantVariant(0, MAGIC_FORMULA)
+            )
+        assert np.all(np.isfinite(state))
+        assert max(abs(state.slip_f), abs(state.slip_r)) < 20.0

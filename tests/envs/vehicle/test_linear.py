@@ -10,9 +10,10 @@ from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
 from sideslip.envs.engine.config import make_car
-from sideslip.envs.sensors.camera import sample_camera
-from sideslip.envs.sensors.gps import sample_gps
+from sideslip.envs.sensors.camera import FieldOfView, sample_camera
+from sideslip.envs.sensors.errors import IDEAL_SENSORS
 from sideslip.envs.sensors.inertial import Noise
+from sideslip.envs.sensors.slow import MeasurementContext, SatelliteGeometry, _sample_gps
 from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.linear import (
@@ -23,7 +24,7 @@ from sideslip.envs.vehicle.linear import (
     make_velocity_roll_model,
     make_vision_model,
 )
-from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
+from sideslip.envs.vehicle.tyres import LINEAR, PlantVariant, TyreInputs, compute_tyre_load
 
 pytestmark = pytest.mark.plain
 
@@ -35,6 +36,7 @@ MODELS: dict[str, Callable[[Vehicle, float], LinearModel]] = {
     "vision": make_vision_model,
     "course": make_course_model,
 }
+CALM = DisturbanceForces(0.0, 0.0)
 SILENT = Noise()._replace(gyro=0.0, camera_psi=0.0, camera_y=0.0, course=0.0)
 
 
@@ -54,15 +56,18 @@ def seen(
     state = Motion(v_x, v_y, gamma, psi, 0.0, 0.0, 0.0, y_l - l_pre * psi + bend, 0.0)
     T = 0.5 * N_z * car.r / (0.5 * car.d_r)
     load = compute_tyre_load(TyreInputs(delta_f, -T, T), car, small_angle)
-    rate = derivative(state, load, DisturbanceForces(0.0, 0.0), car, road, small_angle, LINEAR)
+    rate = derivative(state, load, CALM, car, road, PlantVariant(small_angle, LINEAR))
     if small_angle:  # the held speed: tie-vision (1)
         dbeta = rate.v_y / v
     else:
         dbeta = (v_x * rate.v_y - v_y * rate.v_x) / (v_x**2 + v_y**2)
     dpsi = rate.psi - rate.theta
     dx = [dbeta, rate.gamma, dpsi, rate.y + l_pre * dpsi]
-    psi_seen, y_seen = sample_camera(state, road, l_pre, SILENT, (0.0, 0.0))
-    course_seen = sample_gps(state, 0.0, 0.0, 1.0, 0.0, SILENT, (0.0,) * 4, small_angle)[0]
+    psi_seen, y_seen = sample_camera(state, road, l_pre, SILENT, (0.0, 0.0), IDEAL_SENSORS)
+    sky, view = SatelliteGeometry(0.0, 0.0, 0.0, 0.0, 0.0), FieldOfView(1.0, 1.0)
+    parts = state, road, car, SILENT, sky, view, IDEAL_SENSORS
+    context = MeasurementContext(*parts, small_angle, 0, 0, 0)
+    course_seen = _sample_gps(context, 1.0, (0.0,) * 4)[0]
     outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
     names = MODELS[model](vehicle, v).outputs
     return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
@@ -201,7 +206,7 @@ def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:
     T = 0.5 * car.r * u[0]
     load = compute_tyre_load(TyreInputs(0.0, T, T), car, 1)
     road, push = RoadParams(0.0, 0.0, 1.0), DisturbanceForces(u[1], 0.0)
-    rate = derivative(state, load, push, car, road, 1, LINEAR, 1)
+    rate = derivative(state, load, push, car, road, PlantVariant(1, LINEAR, 1))
     a_x = rate.v_x - gamma * x[1]  # double-layer-gps (4)
     a_y = rate.v_y + gamma * x[0] + 9.81 * x[2]  # (5)
     return np.array([rate.v_x, rate.v_y, rate.phi, rate.phi_dot, a_x, a_y])

@@ -15,7 +15,7 @@ from sideslip.envs.io import write_document
 pytestmark = pytest.mark.plain
 
 NUMBERS = [entry.name for entry in dataclasses.fields(Vehicle) if entry.name != "name"]
-MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
+MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height", "relaxation")
 PLACES = ("antenna_ahead", "antenna_left")
 
 
@@ -57,6 +57,17 @@ def test_values_that_cannot_be_are_refused_by_name(name: str, value: float) -> N
     rule = "" if name in PLACES else rule
     with pytest.raises(ValueError, match=rf"Vehicle\.{name}: {value!r} .* is not {rule}finite"):
         COMS.replace(**{name: value})
+
+
+def test_a_relaxation_that_a_tick_cannot_follow_is_refused() -> None:
+    assert COMS.replace(relaxation=0.05).relaxation == 0.05
+    with pytest.raises(ValueError, match=r"Vehicle\.relaxation: 0\.01 m is neither 0 nor 0\.05"):
+        COMS.replace(relaxation=0.01)
+
+
+def test_a_complete_mapping_of_an_older_file_has_no_relaxation() -> None:
+    old = {key: value for key, value in COMS.to_dict().items() if key != "relaxation"}
+    assert make_vehicle(old) == COMS.replace(relaxation=0.0)
 
 
 @pytest.mark.parametrize("value", ["380", None, True, [380.0]])

@@ -29,6 +29,7 @@ from sideslip.envs.vehicle.tyres import (
     FIALA,
     LINEAR,
     TYRE_LAWS,
+    PlantVariant,
     TyreInputs,
     _compute_load_transfer,
     compute_tyre_forces,
@@ -40,8 +41,8 @@ from ..helpers import fast_rows, play, unwrapped
 
 pytestmark = pytest.mark.plain
 
-CAR = make_car(COMS)
-CARS = [CAR, make_car(PASSENGER_CAR)]
+CARS = [make_car(car)._replace(relaxation=0.0) for car in (COMS, PASSENGER_CAR)]
+CAR = CARS[0]
 FLAT = RoadParams(0.0, 0.0, 1.0)
 BANKED = RoadParams(0.0, -1e6, 1.0, 9.81 * math.sin(0.2), 9.81 * math.sin(-0.1))
 CALM = DisturbanceForces(0.0, 0.0)
@@ -60,7 +61,7 @@ def slope(
     load = compute_tyre_load(
         TyreInputs(how.get("steer", 0.0), *how.get("T", (0.0, 0.0))), car, small_angle
     )
-    return derivative(state, load, push, car, road, small_angle, law, 1)
+    return derivative(state, load, push, car, road, PlantVariant(small_angle, law, 1))
 
 
 @given(st.floats(3.0, 20.0), small, small, small, st.floats(-2.0, 2.0), small)
@@ -100,7 +101,7 @@ def test_both_laws_hold_on_every_plant_and_on_a_bank(
     # roundings of moments up to 1e5 N m
     assert body == pytest.approx(car.S * a_y + 25.0, abs=1e-9)
     load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, plant[0])
-    F_yf, F_yr, _, _ = compute_tyre_forces(state, load, car, felt[1], *plant, 1)
+    F_yf, F_yr, _, _ = compute_tyre_forces(state, load, car, felt[1], PlantVariant(*plant, 1))
     a = rate.v_y + 0.2 * 9.0 + felt[1]
     assert car.m * a - car.S * rate.phi_dot == pytest.approx(F_yf + F_yr + 70.0, abs=1e-8)
 
@@ -150,7 +151,7 @@ def test_an_undamped_body_on_tyres_without_force_keeps_its_energy() -> None:
 
     before, momentum = energy(state), car.m * state.v_y - car.S * state.phi_dot
     for _ in range(2000):
-        state = kutta3(state, (load, load, load), CALM, car, FLAT, 1e-3, 0, LINEAR, 1)
+        state = kutta3(state, (load, load, load), CALM, car, FLAT, 1e-3, PlantVariant(0, LINEAR, 1))
     # Kutta's own error: (w h)^4 / 12 of the energy a step, w = 15 / s
     assert energy(state) == pytest.approx(before, rel=2000 * 4.3e-9)
     assert car.m * state.v_y - car.S * state.phi_dot == pytest.approx(momentum, rel=1e-12)
@@ -182,7 +183,7 @@ def test_the_rules_have_their_orders_with_roll(
     def drive(h: float) -> np.ndarray:
         state = start
         for _ in range(round(0.8 / h)):
-            state = rule(state, (load, load, load), CALM, car, FLAT, h, 0, law, 1)
+            state = rule(state, (load, load, load), CALM, car, FLAT, h, PlantVariant(0, law, 1))
         return np.array(state)
 
     exact = drive(0.00025)
@@ -217,14 +218,16 @@ def test_load_transfer_costs_tyres_with_a_limit_grip_and_nothing_else() -> None:
     leaning = upright._replace(phi=0.15)
     for small_angle, law in PLANTS:
         load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CAR, small_angle)
-        flat = compute_tyre_forces(upright, load, CAR, 0.0, small_angle, law, 0)
-        held = compute_tyre_forces(upright, load, CAR, 0.0, small_angle, law, 1)
-        lost = compute_tyre_forces(leaning, load, CAR, 0.0, small_angle, law, 1)
+        flat = compute_tyre_forces(upright, load, CAR, 0.0, PlantVariant(small_angle, law))
+        held = compute_tyre_forces(upright, load, CAR, 0.0, PlantVariant(small_angle, law, 1))
+        lost = compute_tyre_forces(leaning, load, CAR, 0.0, PlantVariant(small_angle, law, 1))
         np.testing.assert_allclose(held, flat, rtol=1e-14, atol=0.0)
         if law != LINEAR and not small_angle:
             assert 0.0 < lost[0] < 0.99 * flat[0]
             assert 0.0 < lost[1] < 0.99 * flat[1]
-            mirror = compute_tyre_forces(leaning._replace(phi=-0.15), load, CAR, 0.0, 0, law, 1)
+            mirror = compute_tyre_forces(
+                leaning._replace(phi=-0.15), load, CAR, 0.0, PlantVariant(0, law, 1)
+            )
             np.testing.assert_allclose(mirror, lost, rtol=1e-14)
         else:
             assert lost == flat
@@ -237,7 +240,7 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
 ) -> None:
     state = Motion(8.0, 10.0 * v_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi)
     load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), CAR, 0)
-    _, F_yr, F_x, N_z = compute_tyre_forces(state, load, CAR, 0.0, 0, law, 1)
+    _, F_yr, F_x, N_z = compute_tyre_forces(state, load, CAR, 0.0, PlantVariant(0, law, 1))
     share = _compute_load_transfer(state, CAR, 0.0)[1]
     left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)
     F_l, F_r = 0.5 * F_x - N_z / CAR.d_r, 0.5 * F_x + N_z / CAR.d_r

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs import COMS, PASSENGER_CAR
+from sideslip.envs import COMS, PASSENGER_CAR, Vehicle
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.vehicle.dynamics import CarParams, Motion, compute_sideslip_angle
 from sideslip.envs.vehicle.parameters import GRAVITY
@@ -16,18 +16,25 @@ from sideslip.envs.vehicle.tyres import (
     DUGOFF,
     FIALA,
     LINEAR,
+    MAGIC_FORMULA,
     MIN_SPEED,
     TYRE_LAWS,
+    PlantVariant,
     Tyre,
     TyreInputs,
+    TyreLoad,
+    _compute_load_transfer,
+    _compute_slips,
     compute_lateral_forces,
-    compute_slips,
     compute_tyre_load,
+    compute_tyres,
+    fit_fiala,
+    has_load_shift,
 )
 
 pytestmark = pytest.mark.plain
 
-CARS = [make_car(COMS), make_car(PASSENGER_CAR)]
+CARS = [make_car(car)._replace(relaxation=0.0) for car in (COMS, PASSENGER_CAR)]  # it acts at once
 LAWS = range(len(TYRE_LAWS))
 LIMITED = [FIALA, DUGOFF]
 tangents = st.floats(-50.0, 50.0)
@@ -100,7 +107,9 @@ def test_all_laws_are_the_linear_one_at_small_slip(u: float, C: float, limit: fl
     for law in LAWS:
         for small_angle in (0, 1):
             force = lateral_force(t, limit, C / (3.0 * limit), law, small_angle)
-            off = {FIALA: abs(u) / 3.0, DUGOFF: 0.0, LINEAR: t * t / 3.0}[law]
+            curved = 0.17 * u * u  # ((1 + E) / 3 + C^2 / 6) (u / C)^2
+            laws = {FIALA: abs(u) / 3.0, DUGOFF: 0.0, LINEAR: t * t / 3.0, MAGIC_FORMULA: curved}
+            off = laws[law]
             assert force == pytest.approx(C * t, rel=1.01 * off + 1e-14, abs=1e-300)
 
 
@@ -126,6 +135,93 @@ def test_initial_slope_is_the_cornering_stiffness(car: CarParams, law: int) -> N
         h = 1e-9  # Fiala's F = C t (1 - z + ...) departs from its tangent by z = slope h
         force = lateral_force(h, limit, slope, law)
         assert force / h == pytest.approx(C, rel=2.0 * slope * h)
+
+
+def magic_formula(t: float, F_z: float, F_z0: float, C: float, mu: float, F_x: float) -> float:
+    """The formula as printed, with its set: Pacejka (2006), (4.E17)-(4.E26) and Table A3.1.
+
+    C and mu are those at F_z0; F_x leaves of D what the friction circle has.
+    """
+    p_Cy1, p_Dy1, p_Dy2, p_Ey1, p_Ey2, p_Ky1, p_Ky2 = (
+        1.193, -0.990, 0.145, -1.003, -0.537, -14.95, 2.130,
+    )  # fmt: skip
+    df_z = (F_z - F_z0) / F_z0
+    D, D_0 = (p_Dy1 + p_Dy2 * df_z) * F_z, p_Dy1 * F_z0
+    K, K_0 = (p_Ky1 * F_z0 * np.sin(2.0 * np.arctan(f / p_Ky2)) for f in (F_z / F_z0, 1.0))
+    D, K = mu * F_z0 * D / D_0, C * K / K_0  # scaled to the car's at the standing load
+    D = np.sqrt(max(D**2 - F_x**2, (0.05 * D) ** 2))
+    E, B = p_Ey1 + p_Ey2 * df_z, K / (p_Cy1 * D)
+    return float(D * np.sin(p_Cy1 * np.arctan(B * t - E * (B * t - np.arctan(B * t)))))
+
+
+@pytest.mark.parametrize("roll", [0, 1])
+@given(
+    st.sampled_from(CARS), st.floats(-0.1, 0.1), st.floats(-3.0, 3.0), st.floats(-0.5, 0.5),
+    st.floats(-200.0, 200.0), st.sampled_from([0.0, 0.4]),
+)  # fmt: skip
+def test_the_magic_formula_is_the_printed_one_at_every_load(
+    roll: int, car: CarParams, phi: float, v_y: float, steer: float, T: float, h_x: float
+) -> None:
+    """Of each of four tyres, on two frictions, with loads that roll and drive force shift."""
+    car = car._replace(mu_r=0.5, h_x=h_x)
+    state = motion(12.0, v_y, 0.3)._replace(phi=phi, phi_dot=-phi)
+    shifts = has_load_shift(0, MAGIC_FORMULA, roll)
+    load = compute_tyre_load(TyreInputs(steer, T, 50.0), car, 0, shifts)
+    found = compute_tyres(state, load, car, 0.0, PlantVariant(0, MAGIC_FORMULA, roll))
+    a, b, c, d, F_x, N_z = found
+    forces = compute_lateral_forces(a, b, c, d, MAGIC_FORMULA, 0)
+    weight, drive = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r)), (T + 50.0) / car.r
+    shift = drive * h_x / (2.0 * (car.l_f + car.l_r))
+    e_f, e_r = _compute_load_transfer(state, car, 0.0) if roll else (0.0, 0.0)
+    t_f, t_r = _compute_slips(state, load, car, 0)
+    mean, along = 0.5 * (car.mu + car.mu_r), 2.0 * N_z / car.d_r
+    for i, (t, arm, moved, mu, C, F_i) in enumerate([
+        (t_f, car.l_r, -shift * (1.0 - e_f) - weight * car.l_r * e_f, mean, car.C_f, 0.0),
+        (t_f, car.l_r, -shift * (1.0 + e_f) + weight * car.l_r * e_f, mean, car.C_f, 0.0),
+        (t_r, car.l_f, shift * (1.0 - e_r) - weight * car.l_f * e_r, car.mu, car.C_r,
+         0.5 * (F_x - along)),
+        (t_r, car.l_f, shift * (1.0 + e_r) + weight * car.l_f * e_r, car.mu_r, car.C_r,
+         0.5 * (F_x + along)),
+    ]):  # fmt: skip
+        printed = magic_formula(t, weight * arm + moved, weight * arm, C, mu, F_i)
+        assert forces[i] == pytest.approx(printed, rel=1e-11, abs=1e-9)
+
+
+@pytest.mark.parametrize("car", CARS)
+def test_the_magic_formula_peaks_at_mu_F_z(car: CarParams) -> None:
+    load: TyreLoad = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    for limit, slope in ((load.limit_f, load.slope_f), (load.limit_l, load.slope_l)):
+        slips = np.linspace(0.0, 3.0, 3001) / slope
+        forces = [lateral_force(t, limit, slope, MAGIC_FORMULA) for t in slips.tolist()]
+        assert max(forces) == pytest.approx(limit, rel=1e-6)
+        assert max(forces) <= limit * (1.0 + 1e-14)
+        # behind the peak a sliding tyre keeps sin(C pi / 2)
+        sliding = lateral_force(1e12, limit, slope, MAGIC_FORMULA)
+        assert sliding == pytest.approx(limit * math.sin(1.193 * math.pi / 2.0), rel=1e-6)
+        assert lateral_force(-0.1, limit, slope, MAGIC_FORMULA) == -lateral_force(
+            0.1, limit, slope, MAGIC_FORMULA
+        )
+
+
+@pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR])
+def test_fialas_law_fits_the_magic_formula_of_both_axles(vehicle: Vehicle) -> None:
+    """The least squares up to the peak among its neighbours, and within 2.5 % of mu F_z."""
+    fitted = fit_fiala(vehicle)
+    ours, true = (
+        compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), make_car(car), 0) for car in (fitted, vehicle)
+    )
+    for F, slope, F_0, slope_0 in (
+        (ours.limit_f, ours.slope_f, true.limit_f, true.slope_f),
+        (ours.limit_l, ours.slope_l, true.limit_l, true.slope_l),
+    ):
+        slips = (np.linspace(0.0, 3.01, 302) / (3.0 * slope_0)).tolist()  # C t over F_max
+        curve = np.array([lateral_force(t, F_0, slope_0, MAGIC_FORMULA) for t in slips])
+        errors = {
+            (a, b): np.array([lateral_force(t, b * F, a * slope, FIALA) for t in slips]) - curve
+            for a in (0.99, 1.0, 1.01) for b in (0.99, 1.0, 1.01)
+        }  # fmt: skip
+        assert np.abs(errors[1.0, 1.0]).max() < 0.025 * F_0
+        assert min(errors, key=lambda at: float(errors[at] @ errors[at])) == (1.0, 1.0)
 
 
 def test_linear_tyres_have_no_limit() -> None:
@@ -181,7 +277,7 @@ def test_slip_angles_are_those_of_the_wheels_velocities() -> None:
     front = steer - math.atan2(0.8 + car.l_f * 0.5, 6.0)
     rear = -math.atan2(0.8 - car.l_r * 0.5, 6.0)
     expected = math.tan(front), math.tan(rear)
-    assert compute_slips(state, load, car, 0) == pytest.approx(
+    assert _compute_slips(state, load, car, 0) == pytest.approx(
         expected, rel=1e-14
     )  # a few roundings
 
@@ -193,7 +289,7 @@ def test_nothing_divides_by_zero_at_any_speed(small_angle: int) -> None:
     for v_x in (-5.0, -MIN_SPEED, -1e-300, -0.0, 0.0, 1e-300, 1e-9, MIN_SPEED, 5.0):
         for v_y in (-3.0, 0.0, 1e-300, 3.0):
             state = motion(v_x, v_y, 0.7)
-            found = compute_slips(state, load, CARS[0], small_angle)
+            found = _compute_slips(state, load, CARS[0], small_angle)
             assert np.all(np.isfinite(found))
             for law in LAWS:
                 force = lateral_force(found[0], load.limit_f, load.slope_f, law, small_angle)

@@ -34,12 +34,13 @@ def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which: Any) -
     np.testing.assert_allclose(along[3000:4000], np.sqrt(P[3000:, 0, 0]), rtol=1e-10)
 
 
+@pytest.mark.long
 def test_the_exact_filters_error_is_its_covariance() -> None:
-    """100 seeds of tie-vision-fig7: within 3 % of the bound, and consistent."""
+    """40 seeds of tie-vision-fig7: within 3 % of the bound, and consistent."""
     sensors = {"camera": CAMERA}
     filter_ = make_estimator("exact-kf", vehicle=FIG7.truth, sensors=sensors, speed=FIG7.speed)
     errors, nees = [], []
-    for seed in range(100):
+    for seed in range(40):
         log = simulate(FIG7, sensors, seed)
         estimates = filter_.run(log)
         errors.append(error(estimates, log))

@@ -17,11 +17,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.Unobservabl
 
 PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "F_d": 50.0, "N_d": 20.0}
 PRIOR |= {"d1": 0.1, "d2": 1.0, "phi": 0.02, "phi_rate": 0.05}
-PRIOR |= {"bias": 0.01, "accel_bias": 0.2, "bank": 0.02}
+PRIOR |= {"bias": 0.01, "accel_bias": 0.2, "bank": 0.02, "camera_yaw": 0.005, "steer_offset": 0.002}
 INERTIAL = ("gyro", "accel_y", "roll_rate")
 HDOP = ((1.0, 1.0), (2.0, 1.5), (5.0, 4.0))
 EXACT = 1e-10  # of the posterior's standard deviation
-SCHEDULES = 20  # of each case
+SCHEDULES = 8  # of each case
 
 CAMERA = SlowSensor(0.035, (0.0, 0.050, 0.020), jitter=0.100)
 GPS = SlowSensor(0.050, (0.030,), jitter=0.120)
@@ -82,6 +82,7 @@ QUICK = {
     "gps": SlowSensor(0.011, (0.0,), 0, 0.03),
 }
 ACCEL: dict[str, Any] = {"fast": INERTIAL[:2]}
+MISALIGNED = {"camera_yaw_sd": 0.005, "steer_offset_sd": 0.002}
 BIASES = {"bias_sd": 0.01, "accel_bias_sd": 0.2, "bank_sd": 0.02}
 CASES = {
     "forces, camera and gps": Case("exact-kf", BOTH, 7.0),
@@ -95,6 +96,10 @@ CASES = {
     "walk, gps": Case("dakf", {"gps": GPS}, 7.0, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
     "accelerometer, roll rate, bias": Case(
         "exact-kf", BOTH, 7.0, options={"fast": INERTIAL} | BIASES
+    ),
+    "all that is misaligned": Case("exact-kf", BOTH, options=ACCEL | BIASES | MISALIGNED),
+    "misaligned, roll rate": Case(
+        "exact-kf", {"camera": CAMERA}, 7.0, options={"fast": INERTIAL} | MISALIGNED
     ),
     "accelerometer, measured speed": Case("exact-kf", {"camera": CAMERA}, options=dict(ACCEL)),
     "roll rate, gps": Case("exact-kf", {"gps": FAST_GPS}, 12.0, options={"fast": INERTIAL[::2]}),

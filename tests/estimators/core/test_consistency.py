@@ -17,7 +17,7 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.design.models import MEASUREMENTS, select_states
-from sideslip.estimators.design.options import DISTURBANCE, NOISE
+from sideslip.estimators.design.options import NOISE, FilterOptions
 from tests.estimators.drives import Drives, told
 from tests.estimators.riccati import riccati
 
@@ -120,8 +120,8 @@ COURSE = math.radians(0.14) * 60.0 / 25.0  # rad, at 25 km/h
 LIES: list[tuple[str, dict[str, Any]]] = [
     *(("camera", {key: NOISE[key] / 1.5}) for key in ("gyro_noise", "psi_noise", "y_l_noise")),
     ("gps", {"course_noise": COURSE / 1.5}),
-    *(("camera", {key: DISTURBANCE[key] / 1.5}) for key in ("force_sd", "moment_sd")),
-    ("gps", {"force_sd": DISTURBANCE["force_sd"] / 1.5}),
+    *(("camera", {key: getattr(FilterOptions, key) / 1.5}) for key in ("force_sd", "moment_sd")),
+    ("gps", {"force_sd": FilterOptions.force_sd / 1.5}),
     ("camera", {"delay": "ignore"}),
 ]
 

@@ -1,5 +1,6 @@
 """The rules for late samples that are not exact, written out slowly."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -28,10 +29,11 @@ def gaps(x: Any, other: Any) -> Any:
     return np.maximum(states, np.abs(x.std / other.std - 1.0).max(1))
 
 
+@pytest.mark.parametrize("options", [{}, {"camera_yaw_sd": 0.005, "steer_offset_sd": 0.002}])
 @pytest.mark.parametrize("fast", [("gyro",), ("gyro", "accel_y")])
 @pytest.mark.parametrize("delays", [(0.030,), (0.033,), (0.020, 0.0, 0.010, 0.031)])
 def test_larsen_is_optimal_when_its_one_sample_is_here(
-    fast: Any, delays: Any, monkeypatch: Any
+    fast: Any, delays: Any, options: Any, monkeypatch: Any
 ) -> None:
     row = FilterDefinition(
         slow=("camera",), fast=fast, gains="covariance", disturbances="forces", source=""
@@ -40,8 +42,8 @@ def test_larsen_is_optimal_when_its_one_sample_is_here(
     sensors = {"camera": SlowSensor(0.033, delays)}
     log = simulate(QUICK, sensors, 0)
     log.record.fast[:, FAST.accel_y] = np.random.default_rng(0).normal(0.0, 0.3, 601)
-    optimal = make_estimator("ours", sensors=sensors, speed=V).run(log)
-    larsen = make_estimator("ours", sensors=sensors, speed=V, delay="larsen").run(log)
+    built = functools.partial(make_estimator, "ours", sensors=sensors, speed=V, **options)
+    optimal, larsen = built().run(log), built(delay="larsen").run(log)
     captured, arrived = log.record.packets[:, [PACKET.captured, PACKET.arrived]].T.astype(int)
     under_way = np.zeros(601, bool)
     for c, a in zip(captured, arrived, strict=True):

@@ -94,12 +94,13 @@ def test_a_bias_that_wanders_keeps_its_deviation() -> None:
     assert built("exact-kf", log, **options).filters[0].decay[i] == 1.0
 
 
+@pytest.mark.long
 def test_on_a_strange_car_its_intervals_mean_something() -> None:
     """CommonRoad's multi-body BMW, told tyres that are 0.7 and 1.3 of its own."""
     noise = {"accel": 0.6, "gyro": 0.004, "gyro_bias": 0.003, "course": math.radians(0.5) * 25.0}
     scenario = {"base": "random-steering", "speed": 25.0, "amplitude": 0.005, "noise": noise}
     env: Any = gym.make("sideslip/Outside-v0", model="multi-body", sensors="gps", scenario=scenario)
-    log = rollout(env, seed=2, options={"duration": 12.0}).log
+    log = rollout(env, seed=2, options={"duration": 7.0}).log
     car, beta = env.unwrapped.nominal.scale_stiffness(0.7, 1.3), log.truth["beta"]
     nees = []
     for name in ("joint-robust", "joint"):

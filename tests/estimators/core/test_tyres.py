@@ -126,7 +126,7 @@ def test_the_factors_are_found() -> None:
 def test_a_bank_believes_a_change_sooner() -> None:
     """Whenever it comes between two members that begin anew."""
     for changed in (4.0, 4.3):
-        base, made = drives(6, **CHANGED | {"tyre_change_time": changed})
+        base, made = drives(4, **CHANGED | {"tyre_change_time": changed})
         late = round(1000 * changed) + 500
         single, bank = (
             [squares(built(base, log, members=count), log, late)[0] for log, _ in made]
@@ -178,7 +178,7 @@ def test_a_bank_costs_nothing_without_a_change() -> None:
 def test_a_bank_finds_the_level_of_the_disturbances(factor: float) -> None:
     """Beside the filter that knows it; alone and at another level its deviation is wrong."""
     force, moment = 50.0 * factor, 20.0 * factor
-    base, made = drives(8, disturbance_force=force, disturbance_moment=moment)
+    base, made = drives(4, disturbance_force=force, disturbance_moment=moment)
     found = np.array([
         [squares(built(base, log, **options), log)
          for options in ({}, {"levels": (0.5, 1.0, 2.0)}, {"force_sd": force, "moment_sd": moment})]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger import get_paper_tuning
+from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
@@ -116,7 +116,7 @@ def test_a_gyro_bias_drives_dakf_off() -> None:
     bias = np.radians(0.05)
     log = simulate(still, {"gps": GPS}, 0, gyro_bias=bias, disturbed=False, quiet=True)
     common: dict[str, Any] = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
-    tuned = {name: dict(get_paper_tuning(name)) for name in ("dakf", "course-kf")}
+    tuned = {name: PAPER_TUNINGS[name] for name in ("dakf", "course-kf")}
     tuned["dakf"]["q_psi"] = 1e-8  # psi is gamma's integral
     dakf, three = (
         make_estimator(name, **common, **options).run(log)["beta"]

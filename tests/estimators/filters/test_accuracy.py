@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger import get_paper_tuning
+from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
 from sideslip.estimators import make_estimator
 from tests.estimators.simulation import CAMERA, FIG6, FIG7, GPS, error, simulate
 
@@ -23,7 +23,7 @@ def fig6() -> Any:
 
 
 def rmse(name: Any, logs: Any, drive: Any, **options: Any) -> Any:
-    tuned = {**get_paper_tuning(name), **options}
+    tuned = {**PAPER_TUNINGS.get(name, {}), **options}
     filter_ = make_estimator(
         name, vehicle=drive.told, sensors=logs[0].slow, speed=drive.speed, **tuned
     )

@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import DualRate, make_estimator
-from sideslip.estimators.design.dual_rate import compute_shares, frame_map
+from sideslip.estimators.design.dual_rate import SampledSystem, frame_map
 from tests.estimators.simulation import FIG6, simulate
 
 from .literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh
@@ -208,7 +208,9 @@ def test_haras_error_map_is_the_single_rates(seed: Any) -> None:
     s = random_system(seed)
     A, _, C, Q = extended(s)
     r = s["ratio"]
-    held = frame_map(A, C, compute_shares("hold", "constant", None, A, Q, C, s["R"], r))
+    held = frame_map(
+        A, C, SampledSystem(A, Q, C, s["R"], r).compute_shares("hold", "constant", None)
+    )
     single = power(A, r) @ (np.eye(len(A)) - sampled(A, C, Q, s["R"], r) @ C)
     np.testing.assert_allclose(held, single, atol=1e-10)
 

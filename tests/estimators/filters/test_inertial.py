@@ -12,7 +12,7 @@ from sideslip.envs.engine.config import make_car
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.parameters import GRAVITY
-from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
+from sideslip.envs.vehicle.tyres import LINEAR, PlantVariant, TyreInputs, compute_tyre_load
 from sideslip.estimators import EstimateObservation, make_estimator, vector
 from tests.estimators.drives import Drives, told
 from tests.estimators.simulation import CAMERA, GPS
@@ -20,7 +20,11 @@ from tests.estimators.simulation import CAMERA, GPS
 FUSION = "sideslip/YawFusion-v0"
 INERTIAL = ["gyro", "accel_y", "roll_rate"]
 ALL: dict[str, Any] = {"slow": ["camera", "gps"], "fast": INERTIAL, "bias_sd": 0.01}
-STATES = ("beta", "gamma", "psi", "y_l", "phi", "phi_rate", "F_d", "N_d", "bias")
+ALL |= {"camera_yaw_sd": 0.005, "steer_offset_sd": 0.002}
+STATES = (
+    *("beta", "gamma", "psi", "y_l", "phi", "phi_rate", "F_d", "N_d"),
+    *("bias", "camera_yaw", "steer_offset"),
+)
 
 
 def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
@@ -29,9 +33,8 @@ def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
     car = make_car(vehicle)
     at = Motion(V, V * beta, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_rate)
     load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 1)
-    rate = derivative(
-        at, load, DisturbanceForces(F_d, 0.0), car, RoadParams(0.0, 0.0, 1.0), 1, LINEAR, 1
-    )
+    push, road = DisturbanceForces(F_d, 0.0), RoadParams(0.0, 0.0, 1.0)
+    rate = derivative(at, load, push, car, road, PlantVariant(1, LINEAR, 1))
     a_y = rate.v_y + V * gamma + GRAVITY * phi
     return np.array([rate.v_y / V, rate.gamma, rate.phi, rate.phi_dot, a_y])
 
@@ -39,16 +42,19 @@ def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
 @pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=lambda each: each.name)
 def test_body_and_accelerometer_are_the_plants_jacobian(vehicle: Any) -> None:
     V, sensors = 8.0, {"camera": CAMERA}
-    filter_ = make_estimator("exact-kf", vehicle=vehicle, sensors=sensors, speed=V, fast=INERTIAL)
-    f, rows = filter_.filters[0], [0, 1, 4, 5]
-    size = [0.01, 0.05, 0.01, 0.05, 0.01, 10.0]  # the four states, steering, F_d
-    found = np.zeros((5, 6))
-    for j in range(6):
-        step = np.eye(6)[j] * size[j]
-        found[:, j] = slope(step[:4], step[4], step[5], vehicle, V)
-    exact = np.zeros((5, 6))
+    filter_ = make_estimator(
+        "exact-kf", vehicle=vehicle, sensors=sensors, speed=V, fast=INERTIAL, steer_offset_sd=0.01
+    )
+    f, rows, offset = filter_.filters[0], [0, 1, 4, 5], filter_.names.index("steer_offset")
+    size = [0.01, 0.05, 0.01, 0.05, 0.01, 10.0, 0.01]  # the four states, steering, F_d, offset
+    found = np.zeros((5, 7))
+    for j in range(7):  # what acts is the measured angle less the offset
+        step = np.eye(7)[j] * size[j]
+        found[:, j] = slope(step[:4], step[4] - step[6], step[5], vehicle, V)
+    exact = np.zeros((5, 7))
+    exact[:4, 6], exact[4, 6] = f.B[rows, 4 + offset - f.dense], f.C_fast[1, offset]
     exact[:4, :4], exact[:4, 4], exact[:4, 5] = f.A[np.ix_(rows, rows)], f.B[rows, 0], f.B[rows, 4]
-    exact[4] = [*f.C_fast[1, rows], f.D_fast[1, 0], f.C_fast[1, filter_.names.index("F_d")]]
+    exact[4, :6] = [*f.C_fast[1, rows], f.D_fast[1, 0], f.C_fast[1, filter_.names.index("F_d")]]
     exact *= size
     np.testing.assert_allclose(found, exact, atol=1e-12 * np.abs(exact).max())
 
@@ -139,7 +145,7 @@ def test_all_states_are_outputs_and_a_row_has_the_bits_of_a_single_env() -> None
     many = vector.EstimateObservation(
         gym.make_vec(FUSION, 3), "exact-kf", outputs=STATES, options=ALL
     )
-    assert one.estimator.names == STATES and one.layout[-10].name == "bias_hat"
+    assert one.estimator.names == STATES and one.layout[-12].name == "steer_offset_hat"
     single, batch = one.reset(seed=5)[0], many.reset(seed=4)[0]
     for _ in range(40):
         np.testing.assert_array_equal(single, batch[1])

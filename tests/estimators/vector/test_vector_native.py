@@ -47,10 +47,10 @@ def test_members_that_interact_have_the_same_bits() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("env_id", "mode"), [*zip(IDS, itertools.cycle(MODES), strict=False)])
-def test_so_it_does_over_a_hundred_thousand_steps(env_id: str, mode: str) -> None:
+def test_so_it_does_over_many_episodes(env_id: str, mode: str) -> None:
     name = "course-kf" if env_id == "sideslip/YawGps-v0" else "multirate-kf"
     alone, together = wrapped(env_id, 5, mode, {"estimator": name})
-    assert drive_both(alone, together, 20_000, seed=1) > 200
+    assert drive_both(alone, together, 5_000, seed=1) > 50
 
 
 @pytest.mark.parametrize("mode", MODES)

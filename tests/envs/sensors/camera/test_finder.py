@@ -12,11 +12,12 @@ pytest.importorskip("cv2")
 import cv2
 
 from sideslip.envs.numerics.jit import as_python
-from sideslip.envs.sensors.camera import FieldOfView, compute_lane_offset
+from sideslip.envs.sensors.camera import FieldOfView
+from sideslip.envs.sensors.camera.analytic import compute_preview_offset
 from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _CameraMount, _search_starts
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.vehicle.dynamics import Motion, RoadParams
+from sideslip.envs.vehicle.dynamics import RoadParams, compute_curvature
 
 VIEW = FieldOfView(0.35, 4.0)  # of the scored scenarios
 CAMERA = Pinhole()
@@ -26,9 +27,8 @@ CLEAR = RoadRenderer(CAMERA, Appearance(), FINDER.rows)
 
 def truth(scene: RoadScene) -> tuple[float, float]:
     """(psi, y_l) as the analytic camera has them, without noise."""
-    still = (0.0,) * 3
-    motion = Motion(*still, scene.psi, 0.0, 0.0, scene.s, scene.y, 0.0)
-    return scene.psi, as_python(compute_lane_offset)(motion, scene.road, CAMERA.preview)
+    kappa = as_python(compute_curvature)(scene.road, scene.s)
+    return scene.psi, as_python(compute_preview_offset)(scene.y, scene.psi, kappa, CAMERA.preview)
 
 
 def errors(
@@ -56,19 +56,19 @@ def draws(count: int, bend: float = 0.0, view: FieldOfView = VIEW) -> list[RoadS
 
 
 def test_over_the_field_of_view_within_a_fifth_of_a_degree_and_two_centimetres() -> None:
-    headings, offsets = np.linspace(-1.0, 1.0, 7), np.linspace(-1.0, 1.0, 7)
+    headings = offsets = np.linspace(-1.0, 1.0, 5)
     grid = [
         RoadScene(psi=VIEW.heading * a, y=VIEW.offset * b, s=3.0 * k)
         for k, (a, b) in enumerate(product(headings, offsets))
     ]
-    for scenes in (grid, draws(60)):
+    for scenes in (grid, draws(25)):
         psi, y_l, lanes = errors(scenes)
         assert psi < 0.2 and y_l < 2.0
         assert min(lane.quality for lane in lanes) > 0.5
 
 
 def test_bends_are_found_with_their_curvature() -> None:
-    scenes = draws(60, 0.02, FieldOfView(0.15, 1.2))
+    scenes = draws(30, 0.02, FieldOfView(0.15, 1.2))
     psi, y_l, lanes = errors(scenes)
     assert psi < 0.2 and y_l < 2.0 and all(lane.quality > 0.5 for lane in lanes)
     kappa = [scene.road.curvature for scene in scenes]
@@ -84,7 +84,7 @@ def test_bends_are_found_with_their_curvature() -> None:
     ],
 )
 def test_it_degrades_gently(look: Appearance, psi: float, y_l: float) -> None:
-    found = errors(draws(40), RoadRenderer(CAMERA, look, FINDER.rows))
+    found = errors(draws(20), RoadRenderer(CAMERA, look, FINDER.rows))
     assert found[0] < psi and found[1] < y_l
     assert np.mean([lane.quality > 0.0 for lane in found[2]]) > 0.9
 
@@ -118,7 +118,7 @@ def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
 @pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
 def test_without_markings_the_lane_is_lost_and_no_number_is_wild(noise: float) -> None:
     bare = RoadRenderer(CAMERA, Appearance(wear=1.0, noise=noise, shadow=0.5), FINDER.rows)
-    for seed in range(5):
+    for seed in range(3):
         assert FINDER.find(bare.render_picture(RoadScene(psi=0.1), seed)) == Lane() == (0.0,) * 5
     assert FINDER.find(np.zeros((720, 1280), np.uint8)).quality == 0.0
     chance = np.random.default_rng(1).integers(0, 256, (720, 1280), np.uint8)
@@ -147,7 +147,7 @@ def scaled(width: int) -> Pinhole:
     return replace(CAMERA, K=tuple(map(tuple, K)), size=(width, round(scale * CAMERA.size[1])))
 
 
-@pytest.mark.parametrize("width", [320, 480, 640, 1920, 3840])
+@pytest.mark.parametrize("width", [320, 640, 3840])
 def test_one_working_scale_finds_the_same_lane_in_a_picture_of_any_size(width: int) -> None:
     finder = LaneFinder(scaled(width))
     way = cv2.INTER_AREA if width < 1280 else cv2.INTER_LINEAR

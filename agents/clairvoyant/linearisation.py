@@ -1,10 +1,6 @@
-"""Linearisation of an episode on CasADi's symbols, and the backward pass within limits.
-
-Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
-"""
+"""Linearisation of an episode's runs on CasADi's symbols."""
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,15 +10,16 @@ import numpy as np
 
 from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
 from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
-from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector
+from ...envs.numerics.jit import as_python
+from ...envs.numerics.primitives import Scalar
 from ...envs.record import Array
 from ...envs.scenarios.road import NOMINAL_PATH
 from ...envs.task import LAGGED, compute_cost_rate, compute_reference
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment, limit_angle
+from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment
 from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle, rk4
-from .preview import Forecast, PlanParams, PlanState, PreviewStep
+from ...envs.vehicle.tyres import MAGIC_FORMULA
+from .preview import PlanParams, PlanState, PreviewStep
 
 N_INPUTS = 2  # in a sweep: fractions of moment and added steering; the latter is 0 if unused
 _rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
@@ -44,6 +41,8 @@ def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
     active = {"v_x", "v_y", "gamma", *_TORQUES}
     if fixed.kind.roll:
         active |= {"phi", "phi_dot"}
+    if fixed.kind.law == MAGIC_FORMULA and fixed.car.relaxation:
+        active |= {"slip_f", "slip_r"}
     if fixed.speed_profile.hold and fixed.speed_profile.k_i:
         active |= {"integral"}
     if fixed.width > 1:
@@ -102,8 +101,7 @@ def _advance(
     )
     start = Motion(*x[: len(Motion._fields)])
     forces = DisturbanceForces(known.F_d, known.N_d, known.N_x)
-    variant = kind.small_angle, kind.law, kind.roll
-    motion = _rk4(start, loads, forces, car, road, q * TICK, *variant)
+    motion = _rk4(start, loads, forces, car, road, q * TICK, kind)
     effort = 0.0
     for tick in range(q):
         motor_tick, steering_tick = fixed.motor_tick, fixed.steering_tick
@@ -121,7 +119,7 @@ def _advance(
 
 def _get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
     """Get the SI unit of each state in the solver, in which all are of order one."""
-    small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
+    small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1, "slip_f": 0.1, "slip_r": 0.1}
     return [fixed.car.T_max if name in _TORQUES else small.get(name, 1.0) for name in names]
 
 
@@ -141,17 +139,6 @@ class Linearisation(NamedTuple):
     F: Array  # derivative of the state after each period, shape (K, size, n)
     g: Array  # gradient of the cost, shape (K + 1, n); the last one is of the episode's end
     H: Array  # Gauss-Newton's Hessian of the cost, shape (K + 1, n, n), likewise
-
-
-class Limits(NamedTuple):
-    """The limits of the inputs in every period."""
-
-    low: Array  # lower limits, shape (K, N_INPUTS)
-    high: Array  # upper limits, shape (K, N_INPUTS)
-    rate_low: Array  # lower limit of the steering by its rate, shape (K,)
-    rate_high: Array  # upper limit of the steering by its rate, shape (K,)
-    column: int  # scaled state that moves the rate's limits: the last command of added steering
-    slope: float  # rise of both rate limits per unit of the scaled state `column`
 
 
 @dataclass(frozen=True)
@@ -223,110 +210,3 @@ def linearise_run(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisa
     result.g[:, :n_used] = g.T
     result.H[:, :n_used, :n_used] = H.reshape(n_used, K + 1, n_used).transpose(1, 0, 2)
     return result
-
-
-def compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> Limits:
-    """Compute limits by full scale, the wheels' stop, and the steering's rate from a run's angle.
-
-    Args:
-        problem: Functions of the episode.
-        forecast: Forecast with the driver's command.
-        run: States and actions.
-
-    Returns:
-        Limits in fractions of full scale, shape (K, `N_INPUTS`), and those by the rate, (K,).
-    """
-    fixed, K = problem.fixed, problem.fixed.periods
-    low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
-    low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0
-    if fixed.width < N_INPUTS:
-        return Limits(low, high, zero, zero, 0, 0.0)
-    task, column = fixed.task, problem.names.index("slewing")
-    clip_angle = as_python(limit_angle, ARRAYS)
-    low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
-    high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
-    position = run.states[:K, PlanState._fields.index("slewing")] / task.authority
-    max_change = task.slew * fixed.ticks / task.authority
-    slope = problem.scale[column] / task.authority
-    return Limits(low, high, position - max_change, position + max_change, column, slope)
-
-
-@jit
-def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
-    """Minimise q'd + d'Qd / 2 with low <= d <= high: d, and whether each part is free of limits."""
-    det = Q[0, 0] * Q[1, 1] - Q[0, 1] * Q[0, 1]
-    x = (Q[0, 1] * q[1] - Q[1, 1] * q[0]) / det
-    y = (Q[0, 1] * q[0] - Q[0, 0] * q[1]) / det
-    if low[0] < x < high[0] and low[1] < y < high[1]:
-        return x, y, True, True
-    min_cost, best, free = math.inf, np.zeros(2), np.zeros(2, np.bool_)
-    d = np.zeros(2)
-    for i in range(2):
-        for side in range(2):
-            other = 1 - i
-            d[i] = high[i] if side else low[i]
-            interior = -(q[other] + Q[0, 1] * d[i]) / Q[other, other]
-            d[other] = min(max(interior, low[other]), high[other])
-            cost = q @ d + 0.5 * (d @ (Q @ d))
-            if cost < min_cost:
-                min_cost = cost
-                best[:], free[:] = d, False
-                free[other] = d[other] == interior
-    return best[0], best[1], free[0], free[1]
-
-
-@jit
-def run_backward_pass(
-    linearisation: Linearisation,
-    limits: Limits,
-    inputs: Matrix,
-    length: int,
-    damping: float,
-    d: Matrix,
-    G: Matrix,
-) -> None:
-    """Run the backward pass over a run's linearisation.
-
-    An input u of the run becomes u + d + G dx, with dx the scaled state less the run's;
-    G = -Quu^-1 Qux where both inputs are free. Where the rate limits the steering, the limit moves
-    with the last command: so does the gain.
-
-    Args:
-        linearisation: `Linearisation` of the run.
-        limits: `Limits` of the run.
-        inputs: Inputs of the run, shape (K, 2).
-        length: Periods of the run; later ones get zeros.
-        damping: Number added to the diagonal of Quu, the Hessian in the inputs.
-        d: Changes of the inputs, shape (K, 2), filled.
-        G: Gains on the state, shape (K, 2, size), filled.
-    """
-    # The cost to go from the next period's state is v'dx + dx'V dx / 2. With this period's cost,
-    # in the state and the inputs, it is q'(dx, du) + (dx, du)'Q (dx, du) / 2.
-    size = linearisation.F.shape[1]
-    V, v = linearisation.H[length][:size, :size].copy(), linearisation.g[length][:size].copy()
-    d[:], G[:] = 0.0, 0.0
-    low, high = np.empty(2), np.empty(2)
-    for k in range(length - 1, -1, -1):
-        F = linearisation.F[k]
-        q, Q = linearisation.g[k] + F.T @ v, linearisation.H[k] + F.T @ (V @ F)
-        Qxx, Qux, Quu = Q[:size, :size], Q[size:, :size].copy(), Q[size:, size:].copy()
-        low[:], high[:] = limits.low[k] - inputs[k], limits.high[k] - inputs[k]
-        low_1, high_1 = low[1], high[1]
-        if limits.slope > 0.0:  # the rate's limits, moved into the others
-            low[1] = min(max(limits.rate_low[k] - inputs[k, 1], low_1), high_1)
-            high[1] = max(min(limits.rate_high[k] - inputs[k, 1], high_1), low_1)
-        damped = Quu + damping * np.eye(2)
-        d[k, 0], d[k, 1], free_0, free_1 = _solve_input_qp(damped, q[size:], low, high)
-        gain = G[k]
-        if not free_1 and low_1 < d[k, 1] < high_1:
-            gain[1, limits.column] = limits.slope
-        if free_0 and free_1:
-            gain[:] = -np.linalg.solve(damped, Qux)
-        elif free_0:
-            gain[0] = -(Qux[0] + damped[0, 1] * gain[1]) / damped[0, 0]
-        elif free_1:
-            gain[1] = -(Qux[1] + damped[0, 1] * gain[0]) / damped[1, 1]
-        v = q[:size] + gain.T @ (Quu @ d[k] + q[size:]) + Qux.T @ d[k]
-        cross = gain.T @ Qux
-        V = Qxx + gain.T @ (Quu @ gain) + cross + cross.T
-        V = 0.5 * (V + V.T)

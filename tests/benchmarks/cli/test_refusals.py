@@ -1,0 +1,121 @@
+"""Each way to type a command wrong: one line that names the mistake, and no file."""
+
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from sideslip.benchmarks.tuning import estimator as tuning
+from tests.benchmarks.conftest import Run
+
+LQR = ("run", "--agent", "lqr", "--estimator", "exact-kf")
+SCENARIO = "tie-vision-fig8"
+TUNE = ("tune", "estimator", "--seeds", 1, "--test-seeds", 2, "--jobs", 1)
+FIG8 = (*TUNE, "bicycle-kf", "--scenario", SCENARIO)
+DRIVES = cache(tuning._simulate_case)  # each is driven once for all tests
+NEEDS = {"train": "stable_baselines3", "train-estimator": "torch", "tune": "optuna"}
+MISTAKES: list[tuple[tuple[object, ...], str]] = [
+    (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
+    (("run", "--beside", "none"), "'none' can only drive beside in a film: --video"),
+    (("enjoy", "ppo-yaw-vision", "--video", "film.avi"), "a film ends in .mp4 or .gif"),
+    (("run", "--scenario", "moon"), "unknown scenario 'moon'"),
+    (("run", "--agent", "pid"), "unknown agent 'pid'"),
+    (("run", "sideslip/YawVision-v0", "--estimator", "dakf"), "dakf needs the slow sensor gps"),
+    (("run", "--agent", "two-dof"), "add --estimator, for example --estimator exact-kf"),
+    (("run", "--agent", "lqr"), "lqr works on an estimate: add --estimator"),
+    (("run", "--agent", "lqrr"), "unknown agent 'lqrr'; did you mean 'lqr'"),
+    (("run", "YawVison-v0"), "did you mean 'sideslip/YawVision-v0'"),
+    (("run", "--scenario", "gusts"), "unknown scenario 'gusts'; did you mean 'gust'"),
+    (("run", "--scenario", "nowhere.toml"), "nowhere.toml: there is no such scenario file"),
+    (("run", "--vehicle", "comms"), "unknown vehicle 'comms'; did you mean 'coms'"),
+    (("run", "--vehicle", "nowhere.toml"), "nowhere.toml: there is no such vehicle file"),
+    (("run", "--option", "reverence=model"), "'reverence'; did you mean 'reference'?"),
+    (("run", "--option", "reference"), "an option is NAME=VALUE, got 'reference'"),
+    ((*LQR, "--agent-option", "grib=1"), "lqr: unknown option 'grib'; did you mean 'grip'"),
+    ((*LQR, "--estimator-option", "q_bta=1"), "unknown option 'q_bta'; did you mean 'q_beta'"),
+    (("run", "--estimator-option", "q_beta=1"), "--estimator-option needs --estimator"),
+    (("run", "--plot", "drive.txt"), "drive.txt: expected a file that ends in .png or"),
+    (("bench", "--html", "report.json"), "report.json: expected a file that ends in .html"),
+    (("calibrate", "costs.toml"), "costs.toml: expected a file that ends in .json"),
+    (("train", "--env", "YawVison-v0"), "did you mean 'sideslip/YawVision-v0'"),
+    (("run", "--scenario", "gust.txt"), "gust.txt: the file of a scenario ends in .toml or"),
+    (("list", "scenario"), "unknown kind of name 'scenario'; did you mean 'scenarios'"),
+    (("bench", "weather"), "unknown suite 'weather'; known: estimation"),
+    (("enjoy", "ppo-yaw-vision", "--parquet", "rows.txt"), "a file that ends in .parquet"),
+    (("replay", "nowhere.csv", "--parquet", "rows.txt"), "a file that ends in .parquet"),
+    (("replay", "nowhere.csv"), "nowhere.csv"),
+    (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),
+    (("replay", "nowhere.csv", "--kml", "a.kml"), "--kml are for a receiver's log"),
+    (("bench", "--log", "nowhere.csv"), "nowhere.csv"),
+    (("calibrate", "--contest", "moon"), "unknown contest 'moon'"),
+    (("calibrate", "--seeds", "1"), "two seeds or more, got 1"),
+    (("calibrate", "nowhere/mine.json"), "cannot write nowhere/mine.json"),
+    (("live",), "name an ESTIMATOR, or --simulate, --relay or --replay"),
+    (("live", "exact-kff", "--port", "0"), "did you mean 'exact-kf'?"),
+    (("live", "exact-kf", "--port", "0", "--agent", "lqrr"), "did you mean 'lqr'?"),
+    (("live", "exact-kf", "--publish", "nowhere"), "HOST:PORT"),
+    (("live", "exact-kf", "--host", "192.0.2.1"), "is none"),
+    (("live", "exact-kf", "--json", "a.txt"), "ends in .json"),
+    (("live", "--simulate", "--env", "sideslip/YawVison-v0"), "did you mean"),
+    (("live", "--relay", "no-such-file"), "no-such-file"),
+    (("live", "exact-kf", "--port", "0", "--gps", "tcp:nowhere"), "expected tcp:HOST:PORT"),
+    (("live", "--replay", "no-such-file"), "no-such-file"),
+    (("live", "--replay", __file__), "is no session"),
+    (("live", "exact-kf", "--port", "0", "--record", __file__), "exists"),
+    (("train", "--algo", "dqn"), "unknown algorithm 'dqn'; known: ppo"),
+    (("train", "--env", "sideslip/Yaw-v0"), "Yaw"),
+    (("train", "--env", "Pendulum-v1"), "Pendulum-v1 has no native vector env"),
+    (("train", "--estimator", "dakf"), "dakf needs the slow sensor gps"),
+    (("train", "--option", "scenario=moon"), "unknown scenario 'moon'"),
+    (("train", "--resume"), "holds no training to go on with"),
+    (("train", "--resume", "--varied", 2), "varied 2 is for a new training"),
+    (("train", "--device", "moon"), "cpu, cuda or another of torch's, or auto, got 'moon'"),
+    (("train", "--steps", "0"), "steps is at least 1, got 0"),
+    (("train", "--num-envs", "0"), "greater than or equal to 1"),
+    (("train", "--seed", "-1"), "seed is at least 0, got -1"),
+    (("train", "--scenarios", "moon"), "scenario 0 of the mixture: unknown scenario 'moon'"),
+    (("train-estimator", "mine", "--base", "magic"), "unknown estimator 'magic'"),
+    (("train-estimator", "mine", "--base", "multirate-kf"), "a correction's base is course-kf"),
+    (("train-estimator", "mine", "--scenarios", "moon"), "unknown scenario 'moon'"),
+    (("train-estimator", "mine", "--option", "depth=3"), "unknown option"),
+    (("train-estimator", "mine", "--episodes", "0"), " 0 episodes"),
+    (("train-estimator", "mine", "--out", "a.zip"), "a.zip: expected a file that ends in .safe"),
+    ((*TUNE, "kalman", "--scenario", SCENARIO), "unknown estimator 'kalman'"),
+    ((*TUNE, "dafk", "--scenario", SCENARIO), "did you mean 'dakf'"),
+    ((*TUNE, "dakf", "--scenario", "moon"), "unknown scenario 'moon'"),
+    ((*TUNE, "dakf", "--scenario", "sine", "--env", "sideslip/YawVision-v0"), "slow sensor gps"),
+    ((*TUNE, "dakf", "--scenario", "sine", "--env", "sideslip/Nowhere-v0"), "Nowhere"),
+    ((*FIG8, "--trials", "0"), "trials must be at least 1, got 0"),
+    ((*FIG8, "--seeds", "0"), "seeds must be at least 1, got 0"),
+    ((*FIG8, "--test-seeds", "0"), "test seeds are 1 to 1000, got 0"),
+    ((*FIG8, "--target", "phi"), "bicycle-kf has no phi; a target is one of beta, gamma"),
+    ((*FIG8, "--sampler", "grid"), "unknown sampler 'grid'; known: cma, tpe"),
+    ((*FIG8, "--option", "q_beta"), "an option is NAME=VALUE, got 'q_beta'"),
+    ((*FIG8, "--option", "colour=red"), "bicycle-kf: unknown option 'colour'"),
+    ((*FIG8, "--search", "q_psi"), "bicycle-kf: unknown option 'q_psi'"),
+    ((*FIG8, "--search", "q_beta=1"), "NAME or NAME=LOW:HIGH, got 'q_beta=1'"),
+    ((*FIG8, "--search", "q_beta=2:1"), "0 < LOW < HIGH, got 2.0:1.0"),
+    ((*FIG8, "--option", "q_beta=1", "--search", "q_beta"), "both held and searched"),
+    ((*FIG8, "--noise", "gyro_noise", "--write"), "--out writes the others"),
+    ((*FIG8, "--storage", "sqlite:////nowhere/at/all.db"), "unable to open database file"),
+    ((*FIG8, "--storage", "moon://user:secret@host/x"), "failed (moon://user:***@host/x"),
+    ((*FIG8, "--out", "nowhere/found.toml"), "nowhere/found.toml"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "said"), MISTAKES)
+def test_a_mistake_is_one_line_that_names_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...],
+    said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tuning, "_simulate_case", DRIVES)
+    if (needed := NEEDS.get(str(arguments[0]))) and find_spec(needed) is None:
+        pytest.skip(f"needs {needed}")
+    status, out, err = run(*arguments)
+    assert status == 2
+    assert said in " ".join(err.split()) and "secret" not in err and "Traceback" not in out + err
+    left = {path.suffix for path in tmp_path.rglob("*") if path.is_file()}
+    assert not left & {".safetensors", ".toml", ".json", ".csv", ".png", ".html"}
+    assert arguments[0] != "tune" or err.count("\n") == 1

@@ -1,0 +1,111 @@
+"""What sensors can see: by the definition, by the filter's covariance, and the key statements."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs.vehicle.parameters import COMS
+from sideslip.estimators import make_estimator
+from sideslip.estimators.analysis.observability import (
+    GPS_SPEED,
+    UNKNOWNS,
+    WHEELS,
+    find_unobservable_subspace,
+    make_observability_table,
+)
+from sideslip.estimators.design.kalman import transition_matrix
+from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+GYRO, ACCEL = ("gyro",), ("gyro", "accel_y")
+BOTH = ("camera", "gps")
+ASKEW = ("camera_yaw", "steer_offset", "bank")  # which together hide behind each other
+
+
+def is_together(sensors: Any, *unknowns: str) -> bool:
+    """Whether a set of sensors sees all of some unknowns at once, straight on."""
+    return not find_unobservable_subspace(sensors, unknowns).basis.size
+
+
+def test_every_pair_but_one_is_seen_straight_on() -> None:
+    """A gyro's bias beside the camera's yaw too: a yaw lets y_l drift where no heading does."""
+    for fast, slow in itertools.product((GYRO, ACCEL), (("camera",), ("gps",), BOTH)):
+        sensors = (*fast, *slow)
+        for pair in itertools.combinations([name for name in UNKNOWNS if name != WHEELS], 2):
+            if ("camera_yaw" in pair and slow == ("gps",)) or (
+                "accel_bias" in pair and fast == GYRO
+            ):
+                continue
+            hidden = sensors == ("gyro", "gps") and set(pair) == {"steer_offset", "bank"}
+            assert is_together(sensors, *pair) != hidden, (sensors, pair)
+
+
+def test_camera_s_yaw_steering_s_offset_and_bank_hide_behind_each_other() -> None:
+    """A car that is held askew by the bank and the wheels goes straight: beta = -psi, yaw = -psi.
+    The accelerometer feels the bank's force, unless it has a bias of its own."""
+    for slow in (("camera",), BOTH):
+        names, basis = find_unobservable_subspace((*GYRO, *slow), ASKEW)
+        v = dict(zip(names, basis[:, 0] / basis[names.index("beta"), 0], strict=True))
+        assert basis.shape[1] == 1
+        assert v["camera_yaw"] == pytest.approx(1.0) and v["psi"] == pytest.approx(-1.0)
+        assert v["y_l"] == pytest.approx(-COMS.preview)
+        assert is_together((*ACCEL, *slow), *ASKEW)
+        assert not is_together((*ACCEL, *slow), *ASKEW, "accel_bias")
+
+
+def test_a_constant_moment_and_force_are_an_offset_of_the_steering() -> None:
+    """Disturbances that walk instead of forgetting leave nothing of it."""
+    for walk in (False, True):
+        filter_ = make_estimator(
+            "exact-kf", sensors={"camera": CAMERA}, speed=7.0, steer_offset_sd=0.01,
+            disturbances="walk" if walk else "forces",
+        )  # fmt: skip
+        assert any("steer_offset" in direction for direction in filter_.unobservable) == walk
+
+
+def test_wheels_show_in_turns_and_to_the_gps_s_speed() -> None:
+    table = {(line["sensors"], line["drive"]): line for line in make_observability_table()}
+    for (sensors, drive), line in table.items():
+        if drive == "straight":
+            assert line[WHEELS] == ("yes" if GPS_SPEED in sensors else "no")
+        else:
+            assert line[WHEELS] != "no"
+        assert line["bias"] != "no" and line["bank"] == "alone"
+        assert (line["accel_bias"] == "") == ("accel_y" not in sensors)
+        assert (line["camera_yaw"] == "") == ("camera" not in sensors)
+    assert len(table) == 16
+
+
+@pytest.mark.parametrize("fast", [GYRO, ACCEL])
+def test_the_filter_learns_nothing_of_what_is_unobservable(fast: Any) -> None:
+    """By the definition, C F^k v = 0, and by the filter itself: the information v^T P^-1 v never
+    exceeds the prior's; along any of its states alone it does."""
+    unknowns = [name for name in UNKNOWNS if name != WHEELS]
+    if fast == GYRO:
+        unknowns.remove("accel_bias")
+    log = simulate(FIG7, {"camera": CAMERA, "gps": GPS}, 0)
+    filter_ = make_estimator(
+        "exact-kf", sensors=log.slow, slow=list(BOTH), fast=list(fast), speed=7.0,
+        **{f"{name}_sd": UNKNOWNS[name] for name in unknowns},
+    )  # fmt: skip
+    names, basis = find_unobservable_subspace((*fast, *BOTH), tuple(unknowns))
+    (v,), f, n = basis.T, filter_.filters[0], len(filter_.names)
+    assert names == filter_.names
+    F, C = transition_matrix(f, f.G[: f.dense, :n]), [f.C_fast[: f.fasts, :n], *f.C[:, :, :n]]
+    size, v = np.sqrt(np.diag(f.prior)[:n]), v / np.abs(v).max()
+    prior = v @ np.linalg.solve(f.prior[:n, :n], v)
+    for k in range(3000):
+        assert all(np.abs(rows @ v).max() < 1e-9 for rows in C), k
+        v = F @ v
+
+    def inform(P: Any, direction: Any) -> Any:
+        scaled = direction / size
+        return scaled @ np.linalg.solve(P / np.outer(size, size), scaled)
+
+    filter_.run(log)
+    assert inform(filter_.P, v) <= prior * (1.0 + 1e-6)
+    for name in unknowns:
+        alone = np.eye(n)[names.index(name)]
+        assert inform(filter_.P, alone) > 3.0 / UNKNOWNS[name] ** 2
