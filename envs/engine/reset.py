@@ -81,7 +81,9 @@ def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
     )  # fmt: skip
     write(p, errors, P.errors)
     write(p, (d.friction_wave, 2.0 * PI / d.friction_length, 3.0 * turn), P.friction_wave)
-    p[P.road.wave], p[P.road.wave_rate] = GRAVITY * sincos(d.bank_wave)[0], 2.0 * PI / d.bank_length
+    p[P.road.wave], rate = GRAVITY * sincos(d.bank_wave)[0], 2.0 * PI / d.bank_length
+    # tensors compute a wave of zero amplitude too: far away its sine overflows
+    p[P.road.wave_rate] = select(d.bank_wave != 0.0, rate, 0.0)
     p[P.road.wave_phase] = 5.0 * turn
     p[P.task.torque_slew] = d.torque_rate * p[P.car.T_max] * TICK
     p[P.car.relaxation] = p[P.car.relaxation] * d.relaxation
