@@ -13,18 +13,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..numerics.functions import atan, compute_arctan, compute_sine, sincos
+from ..numerics.functions import atan, compute_arctan, sincos
 from ..numerics.jit import as_python, inline, jit
-from ..numerics.primitives import (
-    ARRAYS,
-    Scalar,
-    absolute,
-    any_lane,
-    maximum,
-    minimum,
-    select,
-    sqrt,
-)
+from ..numerics.primitives import ARRAYS, Scalar, absolute, any_lane, maximum, minimum, select, sqrt
 from .parameters import GRAVITY, Vehicle
 
 Car: TypeAlias = Any  # `CarParams` of `dynamics`, which imports this file
@@ -198,11 +189,16 @@ def _dugoff(tyre: Tyre) -> Scalar:
 def _apply_magic_formula(tyre: Tyre) -> Scalar:
     """Lateral force (N) F_max sin(C atan(B t - E (B t - atan B t))), B C F_max = slope at zero."""
     # Pacejka (2006), (4.E19)-(4.E26)
-    Bt = absolute((3.0 / _P_CY1) * (tyre.slope * tyre.tangent))
+    x = (3.0 / _P_CY1) * (tyre.slope * tyre.tangent)
     E = (_P_EY1 - _P_EY2) + _P_EY2 * tyre.load
-    angle = _P_CY1 * compute_arctan(Bt - E * (Bt - compute_arctan(Bt)))
-    force = tyre.limit * compute_sine(angle)
-    return select(tyre.tangent < 0.0, 0.0 - force, force)
+    y = (1.0 - E) * x + E * compute_arctan(x)
+    z = 1.0 + y * y  # sin(C atan y) / y to 3e-13, as in `compute_arctan`
+    s = sqrt(z)
+    above = (0.95439677509688102 * z + 1.8352163560088414) * z + 0.042236923574876198
+    above = above + s * (2.3193336981700569 * z + 0.52958079101713026)
+    below = (2.0569790286145251 * z + 0.31982684439427181) * z - 0.00010492429988359089
+    below = below + s * ((z + 1.3669130170659188) * z + 0.018133346771509709)
+    return tyre.limit * y * (above / below)
 
 
 @inline

@@ -75,7 +75,7 @@ def _uniform(x: Any, y: Any) -> Any:
 @jit
 def _turned(x: Any, y: Any) -> Any:
     s, c = sincos(x)
-    near = compute_arctan(absolute(x)), compute_sine(minimum(maximum(y, -1.9), 1.9))
+    near = compute_arctan(x), compute_sine(y)
     return s, c, atan(x), atan2(y, x), exp(minimum(absolute(x), 7.0)), wrap(x), *near
 
 
