@@ -6,7 +6,7 @@ it serve outside plants too.
 
 from typing import Any, NamedTuple
 
-from ..numerics.functions import sincos
+from ..numerics.functions import compute_sine
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
@@ -45,6 +45,7 @@ from ..vehicle.dynamics import (
     Motion,
     RoadParams,
     compute_car_curvature,
+    compute_gravity,
     kutta3,
 )
 from ..vehicle.linear import Bicycle
@@ -238,7 +239,7 @@ def _apply_due_change(
 def _apply_friction_wave(params: StepParams, state: StepState, variant: StepVariant) -> StepState:
     """Change the friction under the car to that of its place, held over the tick."""
     wave, car = params.friction_wave, state.car
-    factor = 1.0 + wave.share * sincos(wave.rate * state.motion.s + wave.phase)[0]
+    factor = 1.0 + wave.share * compute_sine(wave.rate * state.motion.s + wave.phase)
     left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
     car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
     return StepState(
@@ -286,7 +287,8 @@ def compute_inputs(
     T_l, T_r, a_x, integral = compute_motor_torques(
         inputs.N_z, tick, state.motion.v_x, drive.integral, profile, car, task.yaw_first
     )
-    curvature, errors = compute_car_curvature(state.motion, params.road), state.errors
+    motion, road, errors, g_x, g_y = state.motion, params.road, state.errors, 0.0, 0.0
+    curvature = compute_car_curvature(motion, road)
     if variant.has_errors:
         limited_l, limited_r = (
             limit_rate(drive.command_l, T_l, task.torque_slew),
@@ -294,7 +296,10 @@ def compute_inputs(
         )
         T_l = select(task.torque_slew > 0.0, limited_l, T_l)
         T_r = select(task.torque_slew > 0.0, limited_r, T_r)
-        errors = advance_errors(errors, params.errors, curvature, state.motion.s, draws.vibration)
+        errors = advance_errors(errors, params.errors, curvature, motion.s, draws.vibration)
+        none = (0.0 * road.wave,)
+        wave = RoadParams(*(road[:3] + none + none + road[5:]))  # without fields 3 and 4
+        g_x, g_y = compute_gravity(motion, wave, variant.small_angle, 0.5 * TICK)
     F_w, N_w, N_x = compute_wind(tick, params.wind)
     left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
     moment = compute_yaw_moment(left, right, car)
@@ -311,8 +316,8 @@ def compute_inputs(
         apply_lag(limited_steer, drive.added, steering.end), T_l, T_r,
     )  # fmt: skip
     return _PlantInputs(
-        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x), applied,
-        next_drive,
+        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x, g_x, g_y),
+        applied, next_drive,
     )  # fmt: skip
 
 
@@ -410,11 +415,14 @@ def integrate_tick(
         params, nominal_motion = _follow_nominal_path(params, state, tick)
     plant = compute_inputs(params, inputs, state, tick, variant)
     loads = _compute_loads(params, plant, state, variant)
-    before, car, road = state.motion, state.car, params.road
-    motion = kutta3(before, loads, plant.disturbance, car, road, TICK, variant)
+    before, car, road, push = state.motion, state.car, params.road, plant.disturbance
+    if variant.has_errors:  # `push` has its wave, which costs too much to be evaluated thrice
+        none = (0.0 * road.wave,)  # field 6
+        road = RoadParams(*(road[:6] + none + road[7:]))
+    motion = kutta3(before, loads, push, car, road, TICK, variant)
     accel = compute_specific_force(before, motion, road, variant.small_angle, variant.roll)
     if variant.has_errors:
-        accel = compute_shifted_force(accel, before, motion, params.errors)
+        accel = compute_shifted_force(accel, before, motion, push[3:], params.errors)
     driver, measured = measure_tick(
         params, motion, accel, plant.applied, state.refs, inputs, variant
     )
