@@ -105,23 +105,23 @@ def atan(x: Scalar) -> Scalar:
 
 
 @jit
-def compute_arctan(x: Scalar) -> Scalar:
-    """Compute arctan x for |x| < 1e60, relative error below 1e-13, in a third of `atan`'s time.
+def compute_arctan_gap(x: Scalar) -> Scalar:
+    """Compute 1 - arctan(x) / x for |x| < 1e30, error below 3e-11 (1 + |x|), with one quotient.
 
     Args:
         x: Tangent of the angle.
 
     Returns:
-        The angle (rad).
+        The gap, 0 to 1.
     """
-    # arctan(x) / x is smooth in s = sqrt(1 + x^2): a quotient, whose even powers wait for no root
-    z = 1.0 + x * x
-    s = sqrt(z)
-    above = (1.570796326794747 * z + 1.5205661463365736) * z + 0.012186065013096025
-    above = above + s * (2.7578073932196015 * z + 0.28352980813690229)
-    below = (2.3922944872492396 * z + 0.67627939894958539) * z + 0.0021974134101932536
-    below = below + s * ((z + 1.991004446909405) * z + 0.083109992982497142)
-    return x * (above / below)
+    s, z = absolute(x), x * x
+    q = z * z  # short chains: a plant's stage waits for them
+    above = 5.586100468508 * z + 1.012690968234 + q * (0.9999999939284 * z + 5.579042025092)
+    above = above + s * (6.684892346813 * z + 3.117870231206 + q * 3.109211234682)
+    below = 18.58102408883 * z + 3.038072752758 + q * (q + (11.93039565170 * z + 26.57710829909))
+    odd = 25.66798879711 * z + 9.353617561616 + q * (4.680007034254 * z + 20.74487056689)
+    below = below + s * odd
+    return z * above / below
 
 
 @jit
