@@ -287,8 +287,7 @@ def compute_inputs(
     T_l, T_r, a_x, integral = compute_motor_torques(
         inputs.N_z, tick, state.motion.v_x, drive.integral, profile, car, task.yaw_first
     )
-    motion, road, errors, g_x, g_y = state.motion, params.road, state.errors, 0.0, 0.0
-    curvature = compute_car_curvature(motion, road)
+    curvature, errors = compute_car_curvature(state.motion, params.road), state.errors
     if variant.has_errors:
         limited_l, limited_r = (
             limit_rate(drive.command_l, T_l, task.torque_slew),
@@ -296,10 +295,7 @@ def compute_inputs(
         )
         T_l = select(task.torque_slew > 0.0, limited_l, T_l)
         T_r = select(task.torque_slew > 0.0, limited_r, T_r)
-        errors = advance_errors(errors, params.errors, curvature, motion.s, draws.vibration)
-        none = (0.0 * road.wave,)
-        wave = RoadParams(*(road[:3] + none + none + road[5:]))  # without fields 3 and 4
-        g_x, g_y = compute_gravity(motion, wave, variant.small_angle, 0.5 * TICK)
+        errors = advance_errors(errors, params.errors, curvature, state.motion.s, draws.vibration)
     F_w, N_w, N_x = compute_wind(tick, params.wind)
     left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
     moment = compute_yaw_moment(left, right, car)
@@ -316,8 +312,8 @@ def compute_inputs(
         apply_lag(limited_steer, drive.added, steering.end), T_l, T_r,
     )  # fmt: skip
     return _PlantInputs(
-        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x, g_x, g_y),
-        applied, next_drive,
+        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x), applied,
+        next_drive,
     )  # fmt: skip
 
 
@@ -415,14 +411,15 @@ def integrate_tick(
         params, nominal_motion = _follow_nominal_path(params, state, tick)
     plant = compute_inputs(params, inputs, state, tick, variant)
     loads = _compute_loads(params, plant, state, variant)
-    before, car, road, push = state.motion, state.car, params.road, plant.disturbance
-    if variant.has_errors:  # `push` has its wave, which costs too much to be evaluated thrice
-        none = (0.0 * road.wave,)  # field 6
+    before, car, road, none = state.motion, state.car, params.road, (0.0 * params.road.wave,)
+    motion = kutta3(before, loads, plant.disturbance, car, road, TICK, variant)
+    if variant.has_errors:  # its wave (field 6) is felt as in the plant, in the tick's middle
         road = RoadParams(*(road[:6] + none + road[7:]))
-    motion = kutta3(before, loads, push, car, road, TICK, variant)
     accel = compute_specific_force(before, motion, road, variant.small_angle, variant.roll)
     if variant.has_errors:
-        accel = compute_shifted_force(accel, before, motion, push[3:], params.errors)
+        wave = RoadParams(*(params.road[:3] + none + none + params.road[5:]))
+        gravity = compute_gravity(before, wave, variant.small_angle, 0.5 * TICK)
+        accel = compute_shifted_force(accel, before, motion, gravity, params.errors)
     driver, measured = measure_tick(
         params, motion, accel, plant.applied, state.refs, inputs, variant
     )

@@ -150,7 +150,7 @@ class PlantEnv(StabilityEnv):
             inputs = _compute_inputs(params, tick_inputs, state, tick, variant)
             # not the product of `compute_inputs`: all drives so far have a quotient's rounding
             applied = inputs.applied._replace(effort=inputs.applied.moment / task.yaw_scale)
-            forces = (applied.steer, applied.T_l, applied.T_r, *inputs.disturbance[:3])
+            forces = (applied.steer, applied.T_l, applied.T_r, *inputs.disturbance)
             plant.step(OutsideInputs(*forces), TICK)
             motion, force = state.motion, (0.0, 0.0)
             if plant.is_finite:

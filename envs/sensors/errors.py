@@ -83,10 +83,10 @@ def compute_shifted_force(
     """Compute the specific force at an accelerometer ahead of the centre of gravity.
 
     Args:
-        accel: (a_x, a_y) at the centre of gravity without gravity (m/s2).
+        accel: (a_x, a_y) at the centre of gravity without the wave of bank (m/s2).
         before: `Motion` at the start of the tick.
         after: `Motion` at its end.
-        gravity: Measured gravity (x, y) that the plant felt (m/s2).
+        gravity: Measured gravity (x, y) of that wave (m/s2).
         errors: `SensorErrors`.
 
     Returns:

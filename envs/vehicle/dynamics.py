@@ -158,13 +158,11 @@ def compute_gravity(
 
 
 class DisturbanceForces(NamedTuple):
-    """Force, moments and gravity that disturb the car during a tick."""
+    """Force and moments that disturb the car during a tick."""
 
     F_d: Scalar  # N, lateral force at the centre of gravity
     N_d: Scalar  # N m, yaw moment
     N_x: Scalar = 0.0  # N m, roll moment on the body
-    g_x: Scalar = 0.0  # m/s2, measured gravity besides the road's
-    g_y: Scalar = 0.0
 
 
 class Velocity(NamedTuple):
@@ -260,7 +258,7 @@ def derivative(
     Returns:
         The derivative as a `Motion`.
     """
-    gravity = compute_gravity(motion, road, variant.small_angle)
+    gravity = compute_gravity(motion, road, variant.small_angle, 0.0)
     rate = _compute_rates(motion, load, disturbance, car, gravity, variant)
     course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, variant.small_angle)
     return Motion(*(rate[:3] + (motion.gamma,) + course + rate[3:]))  # noqa: RUF005
@@ -330,13 +328,12 @@ def _average_two(a: Velocity, b: Velocity) -> Velocity:
 
 @inline
 def _compute_mid_gravity(
-    motion: Motion, road: RoadParams, push: DisturbanceForces, h: Scalar, small_angle: int
+    motion: Motion, road: RoadParams, h: Scalar, small_angle: int
 ) -> tuple[Scalar, Scalar]:
     """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0) | (road.wave != 0.0)):
-        return push.g_x, push.g_y
-    g_x, g_y = compute_gravity(motion, road, small_angle, 0.5 * h)
-    return g_x + push.g_x, g_y + push.g_y
+        return 0.0, 0.0
+    return compute_gravity(motion, road, small_angle, 0.5 * h)
 
 
 @inline
@@ -402,7 +399,7 @@ def _integrate_stages(
     car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
 ) -> Motion:  # fmt: skip
     """`kutta3` of one law or of several."""
-    gravity = _compute_mid_gravity(motion, road, disturbance, h, variant.small_angle)
+    gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)
     a = _compute_rates(start, load[0], disturbance, car, gravity, variant)
     middle = _step_euler(start, 0.5 * h, a)
@@ -433,7 +430,7 @@ def rk4(
     Returns:
         The `Motion` at the end.
     """
-    gravity = _compute_mid_gravity(motion, road, disturbance, h, variant.small_angle)
+    gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)
     a = _compute_rates(start, load[0], disturbance, car, gravity, variant)
     first = _step_euler(start, 0.5 * h, a)
