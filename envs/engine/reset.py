@@ -139,7 +139,7 @@ def compute_first_row(
     """
     road = params.road
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))
-    g_x, g_y = compute_gravity(motion, road, variant.small_angle)
+    g_x, g_y = compute_gravity(motion, road, variant.small_angle, 0.0)
     accel = (g_x, g_y + GRAVITY * motion.phi)
     row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
     if variant.has_errors:

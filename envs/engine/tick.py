@@ -6,7 +6,7 @@ it serve outside plants too.
 
 from typing import Any, NamedTuple
 
-from ..numerics.functions import sincos
+from ..numerics.functions import compute_sine
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
@@ -45,6 +45,7 @@ from ..vehicle.dynamics import (
     Motion,
     RoadParams,
     compute_car_curvature,
+    compute_gravity,
     kutta3,
 )
 from ..vehicle.linear import Bicycle
@@ -238,7 +239,7 @@ def _apply_due_change(
 def _apply_friction_wave(params: StepParams, state: StepState, variant: StepVariant) -> StepState:
     """Change the friction under the car to that of its place, held over the tick."""
     wave, car = params.friction_wave, state.car
-    factor = 1.0 + wave.share * sincos(wave.rate * state.motion.s + wave.phase)[0]
+    factor = 1.0 + wave.share * compute_sine(wave.rate * state.motion.s + wave.phase)
     left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
     car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
     return StepState(
@@ -410,11 +411,15 @@ def integrate_tick(
         params, nominal_motion = _follow_nominal_path(params, state, tick)
     plant = compute_inputs(params, inputs, state, tick, variant)
     loads = _compute_loads(params, plant, state, variant)
-    before, car, road = state.motion, state.car, params.road
+    before, car, road, none = state.motion, state.car, params.road, (0.0 * params.road.wave,)
     motion = kutta3(before, loads, plant.disturbance, car, road, TICK, variant)
+    if variant.has_errors:  # its wave (field 6) is felt as in the plant, in the tick's middle
+        road = RoadParams(*(road[:6] + none + road[7:]))
     accel = compute_specific_force(before, motion, road, variant.small_angle, variant.roll)
     if variant.has_errors:
-        accel = compute_shifted_force(accel, before, motion, params.errors)
+        wave = RoadParams(*(params.road[:3] + none + none + params.road[5:]))
+        gravity = compute_gravity(before, wave, variant.small_angle, 0.5 * TICK)
+        accel = compute_shifted_force(accel, before, motion, gravity, params.errors)
     driver, measured = measure_tick(
         params, motion, accel, plant.applied, state.refs, inputs, variant
     )

@@ -28,7 +28,6 @@ _ELEMENTARY: dict[str, Callable[..., Any]] = {
     "sincos": lambda x: (ca.sin(x), ca.cos(x)),
     "atan": ca.atan,
     "atan2": ca.atan2,
-    "compute_arctan": ca.atan,
     "compute_sine": ca.sin,
 }
 """CasADi's own functions, which agree to 1e-15 and have shorter derivatives than polynomials."""

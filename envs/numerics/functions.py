@@ -105,36 +105,28 @@ def atan(x: Scalar) -> Scalar:
 
 
 @jit
-def compute_arctan(x: Scalar) -> Scalar:
-    """Compute arctan x for x >= 0, error below 3e-16: one quotient, no root; a third of `atan`.
+def compute_arctan_gap(x: Scalar) -> Scalar:
+    """Compute 1 - arctan(x) / x for |x| < 1e30, error below 3e-11 (1 + |x|), with one quotient.
 
     Args:
-        x: Tangent of the angle, zero or more.
+        x: Tangent of the angle.
 
     Returns:
-        The angle (rad).
+        The gap, 0 to 1.
     """
-    steep, middle = x > 2.414213562373095, x > 0.41421356237309503  # tan of 3 pi/8 and pi/8
-    far = select(steep, x, select(middle, x + 1.0, 1.0))
-    t = select(steep, -1.0, select(middle, x - 1.0, x)) / far
-    z = t * t
-    p = 1.62858201153657823623e-02  # fdlibm, s_atan.c
-    p = p * z - 3.65315727442169155270e-02
-    p = p * z + 4.97687799461593236017e-02
-    p = p * z - 5.83357013379057348645e-02
-    p = p * z + 6.66107313738753120669e-02
-    p = p * z - 7.69187620504482999495e-02
-    p = p * z + 9.09088713343650656196e-02
-    p = p * z - 1.11111104054623557880e-01
-    p = p * z + 1.42857142725034663711e-01
-    p = p * z - 1.99999999998764832476e-01
-    p = p * z + 3.33333333333329318027e-01
-    return select(steep, 0.5 * PI, select(middle, 0.25 * PI, 0.0)) + (t - t * (z * p))
+    s, z = absolute(x), x * x
+    q = z * z  # short chains: a plant's stage waits for them
+    above = 5.586100468508 * z + 1.012690968234 + q * (0.9999999939284 * z + 5.579042025092)
+    above = above + s * (6.684892346813 * z + 3.117870231206 + q * 3.109211234682)
+    below = 18.58102408883 * z + 3.038072752758 + q * (q + (11.93039565170 * z + 26.57710829909))
+    odd = 25.66798879711 * z + 9.353617561616 + q * (4.680007034254 * z + 20.74487056689)
+    below = below + s * odd
+    return z * above / below
 
 
 @jit
 def compute_sine(x: Scalar) -> Scalar:
-    """Compute sin x for |x| < 1.9 rad, error below 2e-14, as 2 sin(x / 2) cos(x / 2).
+    """Compute sin x, error below 1e-13 + 2e-16 |x| for |x| < 1e6 rad, in half of `sincos`' time.
 
     Args:
         x: Angle (rad).
@@ -142,7 +134,17 @@ def compute_sine(x: Scalar) -> Scalar:
     Returns:
         Its sine.
     """
-    return 2.0 * _sin_kernel(0.5 * x) * _cos_kernel(0.5 * x)
+    k = floor(x * (0.5 * _TWO_OVER_PI) + 0.5)
+    r = (x - k * (2.0 * _PI_2_HIGH)) - k * (2.0 * _PI_2_LOW)
+    z = r * r
+    p = 1.5409520412048905e-10
+    p = p * z - 2.5030196307617753e-8
+    p = p * z + 2.7556953094702609e-6
+    p = p * z - 1.9841266729487837e-4
+    p = p * z + 8.3333333210858298e-3
+    p = p * z - 1.6666666666504574e-1
+    s = r + r * (z * p)
+    return s - 2.0 * s * (k - 2.0 * floor(0.5 * k))
 
 
 @jit

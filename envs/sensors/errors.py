@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from ..numerics.functions import sincos
+from ..numerics.functions import compute_sine
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, Vector
 from ..ticks import TICK
@@ -68,7 +68,7 @@ def advance_errors(
     Returns:
         The next `ErrorState`.
     """
-    wave, _ = sincos(errors.map_rate * s + errors.map_phase)
+    wave = compute_sine(errors.map_rate * s + errors.map_phase)
     return ErrorState(
         _VIBRATION_REST * state.vibration + _VIBRATION_GAIN * errors.vibration * normal,
         apply_lag(curvature + errors.map_error * wave, state.curvature, errors.map_rest),
@@ -78,14 +78,15 @@ def advance_errors(
 
 @inline
 def compute_shifted_force(
-    accel: Vector, before: Motion, after: Motion, errors: SensorErrors
+    accel: Vector, before: Motion, after: Motion, gravity: Vector, errors: SensorErrors
 ) -> tuple[Scalar, Scalar]:
     """Compute the specific force at an accelerometer ahead of the centre of gravity.
 
     Args:
-        accel: (a_x, a_y) at the centre of gravity (m/s2).
+        accel: (a_x, a_y) at the centre of gravity without the wave of bank (m/s2).
         before: `Motion` at the start of the tick.
         after: `Motion` at its end.
+        gravity: Measured gravity (x, y) of that wave (m/s2).
         errors: `SensorErrors`.
 
     Returns:
@@ -94,7 +95,8 @@ def compute_shifted_force(
     x = errors.accel_ahead
     turning = 0.5 * (before.gamma + after.gamma)
     gamma_dot = (after.gamma - before.gamma) * (1.0 / TICK)
-    return accel[0] - x * turning * turning, accel[1] + x * gamma_dot
+    a_x, a_y = accel[0] + gravity[0], accel[1] + gravity[1]
+    return a_x - x * turning * turning, a_y + x * gamma_dot
 
 
 @inline
@@ -169,4 +171,5 @@ def compute_course_error(tick: Scalar, speed: Scalar, errors: SensorErrors) -> S
     Returns:
         Error (rad).
     """
-    return errors.course_error / speed * sincos(errors.course_rate * tick + errors.course_phase)[0]
+    wave = compute_sine(errors.course_rate * tick + errors.course_phase)
+    return errors.course_error / speed * wave

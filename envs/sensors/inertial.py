@@ -43,8 +43,8 @@ def compute_specific_force(
     if roll:
         a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
     if any_lane((road.longitudinal != 0.0) | (road.lateral != 0.0) | (road.wave != 0.0)):
-        first = compute_gravity(before, road, small_angle)
-        last = compute_gravity(after, road, small_angle)
+        first = compute_gravity(before, road, small_angle, 0.0)
+        last = compute_gravity(after, road, small_angle, 0.0)
         a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])
     return a_x, a_y
 

@@ -8,7 +8,7 @@ on values; the integers `small_angle`, `law` and `roll` choose the text that is 
 
 from typing import NamedTuple
 
-from ..numerics.functions import atan2, sincos
+from ..numerics.functions import atan2, compute_sine, sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from .parameters import GRAVITY
@@ -130,26 +130,31 @@ def _rotate_gravity(
     ramp = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * ramp, road.lateral * ramp  # along the road, to its left
     if any_lane(road.wave != 0.0):
-        g_n = g_n + road.wave * sincos(road.wave_rate * s + road.wave_phase)[0]
+        g_n = g_n + road.wave * compute_sine(road.wave_rate * s + road.wave_phase)
     return g_s * cos_r + g_n * sin_r, g_n * cos_r - g_s * sin_r
 
 
 @jit
-def compute_gravity(motion: Motion, road: RoadParams, small_angle: int) -> tuple[Scalar, Scalar]:
+def compute_gravity(
+    motion: Motion, road: RoadParams, small_angle: int, ahead: Scalar = 0.0
+) -> tuple[Scalar, Scalar]:
     """Compute the gravity that accelerometers measure in a car without roll.
 
     Args:
         motion: `Motion` of the car.
         road: `RoadParams`.
         small_angle: 1 for the small-angle plant, else 0.
+        ahead: Time (s) by which place and heading are extrapolated.
 
     Returns:
         (x, y) in the car's axes (m/s2).
     """
+    s = motion.s + ahead * motion.v_x
     if small_angle:
-        return _rotate_gravity(road, motion.s, 0.0, 1.0)
-    sin_r, cos_r = sincos(motion.psi - motion.theta)
-    return _rotate_gravity(road, motion.s, sin_r, cos_r)
+        return _rotate_gravity(road, s, 0.0, 1.0)
+    turn_rate = motion.gamma - motion.v_x * compute_curvature(road, s) - road.turn
+    sin_r, cos_r = sincos(motion.psi - motion.theta + ahead * turn_rate)
+    return _rotate_gravity(road, s, sin_r, cos_r)
 
 
 class DisturbanceForces(NamedTuple):
@@ -253,7 +258,7 @@ def derivative(
     Returns:
         The derivative as a `Motion`.
     """
-    gravity = compute_gravity(motion, road, variant.small_angle)
+    gravity = compute_gravity(motion, road, variant.small_angle, 0.0)
     rate = _compute_rates(motion, load, disturbance, car, gravity, variant)
     course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, variant.small_angle)
     return Motion(*(rate[:3] + (motion.gamma,) + course + rate[3:]))  # noqa: RUF005
@@ -326,14 +331,9 @@ def _compute_mid_gravity(
     motion: Motion, road: RoadParams, h: Scalar, small_angle: int
 ) -> tuple[Scalar, Scalar]:
     """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
-    s_mid = motion.s + 0.5 * h * motion.v_x
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0) | (road.wave != 0.0)):
         return 0.0, 0.0
-    if small_angle:
-        return _rotate_gravity(road, s_mid, 0.0, 1.0)
-    mid_turn_rate = motion.gamma - motion.v_x * compute_curvature(road, s_mid) - road.turn
-    sin_r, cos_r = sincos(motion.psi - motion.theta + 0.5 * h * mid_turn_rate)
-    return _rotate_gravity(road, s_mid, sin_r, cos_r)
+    return compute_gravity(motion, road, small_angle, 0.5 * h)
 
 
 @inline
@@ -395,14 +395,9 @@ def kutta3(
 
 @inline
 def _integrate_stages(
-    motion: Motion,
-    load: tuple[TyreLoad, TyreLoad, TyreLoad],
-    disturbance: DisturbanceForces,
-    car: CarParams,
-    road: RoadParams,
-    h: Scalar,
-    variant: Variant,
-) -> Motion:
+    motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
+    car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
+) -> Motion:  # fmt: skip
     """`kutta3` of one law or of several."""
     gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)

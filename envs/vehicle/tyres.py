@@ -13,18 +13,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..numerics.functions import atan, compute_arctan, compute_sine, sincos
+from ..numerics.functions import atan, compute_arctan_gap, sincos
 from ..numerics.jit import as_python, inline, jit
-from ..numerics.primitives import (
-    ARRAYS,
-    Scalar,
-    absolute,
-    any_lane,
-    maximum,
-    minimum,
-    select,
-    sqrt,
-)
+from ..numerics.primitives import ARRAYS, Scalar, absolute, any_lane, maximum, minimum, select, sqrt
 from .parameters import GRAVITY, Vehicle
 
 Car: TypeAlias = Any  # `CarParams` of `dynamics`, which imports this file
@@ -198,11 +189,16 @@ def _dugoff(tyre: Tyre) -> Scalar:
 def _apply_magic_formula(tyre: Tyre) -> Scalar:
     """Lateral force (N) F_max sin(C atan(B t - E (B t - atan B t))), B C F_max = slope at zero."""
     # Pacejka (2006), (4.E19)-(4.E26)
-    Bt = absolute((3.0 / _P_CY1) * (tyre.slope * tyre.tangent))
+    x = tyre.slope * ((3.0 / _P_CY1) * tyre.tangent)
     E = (_P_EY1 - _P_EY2) + _P_EY2 * tyre.load
-    angle = _P_CY1 * compute_arctan(Bt - E * (Bt - compute_arctan(Bt)))
-    force = tyre.limit * compute_sine(angle)
-    return select(tyre.tangent < 0.0, 0.0 - force, force)
+    y = x - (E * x) * compute_arctan_gap(x)
+    z = 1.0 + y * y  # sin(C atan y) / y is smooth in its root; even powers do not wait for that
+    s = sqrt(z)
+    above = (0.95439677509688102 * z + 1.8352163560088414) * z + 0.042236923574876198
+    above = above + s * (2.3193336981700569 * z + 0.52958079101713026)
+    below = (2.0569790286145251 * z + 0.31982684439427181) * z - 0.00010492429988359089
+    below = below + s * ((z + 1.3669130170659188) * z + 0.018133346771509709)
+    return tyre.limit * y * (above / below)
 
 
 @inline
@@ -371,8 +367,8 @@ def _compute_shifted_tyres(
     rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
     F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
     F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
-    square_l = _compute_squared_capacity(rear_l, F_l)
-    square_r = _compute_squared_capacity(rear_r, F_r)
+    square_l = _compute_squared_capacity(rear_l, load.F_l)
+    square_r = _compute_squared_capacity(rear_r, load.F_r)
     left, right = sqrt(square_l), sqrt(square_r)
     sides, squares = relieved * burdened, square_l * square_r
     inv_product = 1.0 / (along_f * along_r * (sides * squares))
@@ -406,21 +402,21 @@ def _compute_magic_tyres(
     rear_l, rear_r = load.rear_l * (1.0 - e_r) * mu_c, load.rear_r * (1.0 + e_r) * mu_d
     F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
     F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
-    square_l = _compute_squared_capacity(rear_l, F_l)
-    square_r = _compute_squared_capacity(rear_r, F_r)
+    square_l = _compute_squared_capacity(rear_l, load.F_l)
+    square_r = _compute_squared_capacity(rear_r, load.F_r)
     left, right = sqrt(square_l), sqrt(square_r)
     p2 = _P_KY2 * _P_KY2
     per_a, per_b = mu_a * (p2 + a * a), mu_b * (p2 + b * b)
     per_c, per_d = square_l * (p2 + c * c), square_r * (p2 + d * d)
     fronts, rears = per_a * per_b, per_c * per_d
     inv_product = (p2 + 1.0) / (fronts * rears)
-    front = load.slope_f * load.load_f * (rears * inv_product)
-    rear = car.C_r * (1.0 / 3.0) * (fronts * inv_product)
+    front, rear = rears * inv_product, fronts * inv_product
+    C_f, C_r = load.slope_f * load.load_f, car.C_r * (1.0 / 3.0)
     return (
-        Tyre(t_f, load.limit_f * (1.0 - e_f) * mu_a, front * per_b, a),
-        Tyre(t_f, load.limit_f * (1.0 + e_f) * mu_b, front * per_a, b),
-        Tyre(t_r, left, rear * per_d * c * left, c),
-        Tyre(t_r, right, rear * per_c * d * right, d),
+        Tyre(t_f, load.limit_f * (1.0 - e_f) * mu_a, C_f * per_b * front, a),
+        Tyre(t_f, load.limit_f * (1.0 + e_f) * mu_b, C_f * per_a * front, b),
+        Tyre(t_r, left, C_r * per_d * c * left * rear, c),
+        Tyre(t_r, right, C_r * per_c * d * right * rear, d),
         F_l + F_r,
         0.5 * car.d_r * (F_r - F_l),
     )

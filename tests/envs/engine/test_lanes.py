@@ -11,7 +11,7 @@ from sideslip.envs.numerics import functions as noise
 from sideslip.envs.numerics.functions import (
     atan,
     atan2,
-    compute_arctan,
+    compute_arctan_gap,
     compute_sine,
     draw_normals,
     draw_uniforms,
@@ -75,7 +75,7 @@ def _uniform(x: Any, y: Any) -> Any:
 @jit
 def _turned(x: Any, y: Any) -> Any:
     s, c = sincos(x)
-    near = compute_arctan(absolute(x)), compute_sine(minimum(maximum(y, -1.9), 1.9))
+    near = compute_arctan_gap(x), compute_sine(y)
     return s, c, atan(x), atan2(y, x), exp(minimum(absolute(x), 7.0)), wrap(x), *near
 
 

@@ -73,6 +73,17 @@ def test_atan_errs_less_than_stated() -> None:
     assert worst(on_arrays(functions.atan)(x), np.arctan(x.astype(np.longdouble))) < 5e-16
 
 
+def test_arctan_gap_and_sine_err_less_than_stated() -> None:
+    x = np.sinh(RNG.uniform(-70.0, 70.0, N))
+    exact = (1.0 - np.arctan(x.astype(np.longdouble)) / x) / (1.0 + np.abs(x))
+    found = on_arrays(functions.compute_arctan_gap)(x) / (1.0 + np.abs(x))
+    assert worst(found, exact) < 3e-11
+    for reach in (1.0, 10.0, 1e6):
+        x = RNG.uniform(-reach, reach, N)
+        exact = np.sin(x.astype(np.longdouble))
+        assert worst(on_arrays(functions.compute_sine)(x), exact) < 1e-13 + 2e-16 * reach
+
+
 def test_atan2_errs_less_than_stated_in_all_quadrants() -> None:
     y, x = np.sinh(RNG.uniform(-20.0, 20.0, (2, N)))
     exact = np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble))
