@@ -15,9 +15,13 @@ from typing import Any
 
 import gymnasium as gym
 
+from ..envs.scenarios.draws import get_range
 from ..envs.scenarios.scenario import Scenario
+from ..envs.scenarios.world import IDEAL, World
+from ..envs.sensors.inertial import Noise
 from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice
+from ..envs.vehicle.parameters import GRAVITY
 from ..estimators.vector import estimate as vector
 from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
@@ -47,23 +51,32 @@ STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
+_ACCELERATION = 2.0  # m/s2 to the side, of a manoeuvre
+_BANK_TIME = 10.0  # s within which a wavy road forgets its bank
+_WAVE = math.sqrt(0.5)  # root mean square of a wave, or of two axles' spreads, over its amplitude
 FILE = Path(__file__).with_name("tuned.toml")
 PARTS = ("filter", "controller")
 Options = dict[str, dict[str, Any]]
 """Options of the filter and of the controller, by `PARTS`."""
 
 
-def make_noise_options(scenario: Scenario) -> dict[str, Any]:
+def make_noise_options(
+    scenario: Scenario, world: World = IDEAL, has_tyres: bool = False
+) -> dict[str, Any]:
     """Make options of `exact-kf` from the noise and the disturbances of a scenario.
 
     The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
-    is read where the body rolls, as the filter then assumes.
+    is read where the body rolls, as the filter then assumes. In a world that is not ideal, what can
+    be seen of its errors has states, and the rest counts as noise: what is unknown of the tyres as
+    forces, a late map as noise of the heading, a late GPS as noise of the course.
 
     Args:
         scenario: Scenario whose noise the filter knows.
+        world: Errors of car and sensors, of which it knows the ranges.
+        has_tyres: Whether the filter knows the tyres or has states for them.
 
     Returns:
-        Options by name.
+        Options by name; `camera_yaw_sd` needs a camera.
     """
     noise, share = scenario.noise, HDOP_LAWS[scenario.hdop_law]
     options = {
@@ -77,20 +90,52 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
         options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
     options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
     options["bank_sd"] = compute_range_rms(scenario, "bank")
-    return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
+    options |= {option: noise[key] for key, option in _NOISE.items() if key in noise}
+    return options if world.is_ideal else _add_errors(options, scenario, world, has_tyres)
 
 
-def compute_range_rms(scenario: Scenario, name: str) -> float:
+def _add_errors(
+    options: dict[str, Any], scenario: Scenario, world: World, has_tyres: bool
+) -> dict[str, Any]:
+    """Add the errors of a world to a scenario's options."""
+
+    def rms(name: str) -> float:
+        return compute_range_rms(world, name)
+
+    plain, speed = Noise()._asdict() | dict(scenario.noise), 0.5 * sum(scenario.range("speed"))
+    turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
+    lag = rms("map_lag") * turning  # rad, error of the road's direction
+    course = plain["course"], _WAVE * rms("course_error"), rms("gps_stamp") * _ACCELERATION
+    options |= {
+        "camera_yaw_sd": rms("camera_yaw"),
+        "steer_offset_sd": rms("steer_offset"),
+        "psi_noise": math.hypot(plain["camera_psi"], lag),
+        "q_psi": lag * turning,
+        "course_noise": math.hypot(*course) / speed,
+    }
+    if wave := rms("bank_wave"):
+        options |= {"bank_sd": math.hypot(options["bank_sd"], wave), "bank_time": _BANK_TIME}
+    if scenario.roll:
+        options["accel_y_noise"] = math.hypot(plain["accel"], rms("vibration"))
+    if not has_tyres:
+        spreads = [compute_range_rms(scenario, name, 1.0) for name in STIFFNESSES]
+        options["force_share"] = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
+        options["moment_share"] = 0.5 * options["force_share"]
+    return options
+
+
+def compute_range_rms(source: Scenario | World, name: str, ideal: float = 0.0) -> float:
     """Compute the root mean square of a quantity that is uniform over its range.
 
     Args:
-        scenario: Scenario that holds the range.
+        source: Scenario or world that holds the range.
         name: Name of the quantity, whose unit the result has.
+        ideal: Value from which it counts.
 
     Returns:
         Root mean square, in the quantity's unit.
     """
-    low, high = scenario.range(name)
+    low, high = (end - ideal for end in get_range(getattr(source, name)))
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
 
@@ -157,10 +202,11 @@ def make_oracle(
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
     """Add a filter on all slow sensors, with the true tyres where it knows them."""
-    levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
+    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
+    levels = make_noise_options(base.scenario, base.config.world, knows_tyres)
+    levels |= {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]
-    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
     if has_tyre_filter:
         levels |= _TYRE_FILTER_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
