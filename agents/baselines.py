@@ -6,6 +6,7 @@ better of the two that know state, disturbances and car: "Cost and score" of doc
 disturbances and its reference, such as "coms-model" or "car-steering".
 """
 
+import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
@@ -27,7 +28,7 @@ from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller
-from .controllers.lqr import Lqr
+from .controllers.lqr import TOLD, Lqr
 from .controllers.nmpc import Nmpc
 
 NOMINAL = "nominal"
@@ -51,6 +52,11 @@ STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
+_CONSTANTS = (
+    *("camera_yaw", "camera_pitch", "camera_height", "gyro_scale", "gyro_drift", "accel_scale"),
+    *("accel_roll", "accel_ahead", "gps_stamp", "map_lag"),
+)
+"""Constant errors of sensors from which no reference is made; who knows them subtracts them."""
 _ACCELERATION = 2.0  # m/s2 to the side, of a manoeuvre
 _BANK_TIME = 10.0  # s within which a wavy road forgets its bank
 _WAVE = math.sqrt(0.5)  # root mean square of a wave, or of two axles' spreads, over its amplitude
@@ -149,6 +155,12 @@ def make_oracle(
 ) -> tuple[Any, Controller]:
     """Make an oracle and the env whose observation it needs.
 
+    In a world, those that know more than nominal get the drawn car, with gains of its own, and
+    readings of steering, wheels and motors that are calibrated. References are made from the env's
+    own readings, as for everybody: so the sensors of these err in its env too. Other constant
+    errors, of which no reference is made, are absent from the env of an oracle of parameters, as
+    biases are.
+
     Args:
         name: Name in `ORACLES`.
         env_id: Id of the env.
@@ -157,7 +169,7 @@ def make_oracle(
         options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
             sensors of the id, `make_noise_options` of the scenario, a grip limit.
         env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
-            true car may differ between episodes; its other parameters are the env's.
+            true car may differ between episodes, in a world its other parameters too.
 
     Returns:
         The env and the agent.
@@ -171,12 +183,14 @@ def make_oracle(
     if len(chosen) != 2:
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
     single_env: Any = gym.make(env_id, **env_kwargs)
+    world: World = single_env.unwrapped.config.world
     if name in PARAMETER_ORACLES:
         # no biases: a filter that knows them would subtract them
         scenario: Scenario = single_env.unwrapped.scenario
+        world = dataclasses.replace(world, **{key: getattr(IDEAL, key) for key in _CONSTANTS})
         noise = {key: sd for key, sd in scenario.noise.items() if not key.endswith("_bias")}
         unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
-        env_kwargs |= {"scenario": unbiased.to_dict()}
+        env_kwargs |= {"scenario": unbiased.to_dict(), "world": world.to_dict()}
         single_env = gym.make(env_id, **env_kwargs)
     base: Any = single_env.unwrapped
     env = single_env
@@ -187,7 +201,7 @@ def make_oracle(
     if name != NOMINAL:
         truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
         states = () if name in PARAMETER_ORACLES else STATES
-        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
+        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_")) if world.is_ideal else TOLD
         env = truth_wrapper(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
     is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
@@ -195,15 +209,22 @@ def make_oracle(
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings["vehicle"] = base.vehicle
-        settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
+        if world.is_ideal:
+            settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
+        else:
+            settings["told"] = True
     controller_class = Nmpc if is_predictive else Lqr
     return env, controller_class(env, **settings | dict(chosen["controller"]))
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
     """Add a filter on all slow sensors, with the true tyres where it knows them."""
-    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
-    levels = make_noise_options(base.scenario, base.config.world, knows_tyres)
+    world: World = base.config.world
+    law = world.tyres or base.scenario.tyres
+    has_tyre_filter = knows_tyres and law in ("fiala", "magic-formula")
+    if knows_tyres:  # and how the steering sensor errs
+        world = dataclasses.replace(world, steer_offset=IDEAL.steer_offset)
+    levels = make_noise_options(base.scenario, world, knows_tyres)
     levels |= {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]

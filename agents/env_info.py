@@ -205,10 +205,11 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
     """
     if isinstance(env, EnvView):
         return env.plants
-    scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
-    return frozenset(
-        PlantKind(x.tyres, x.small_angle, x.roll, x.lags, yaw_first) for x, yaw_first in scenarios
-    )
+    kinds = set()
+    for config in list_configs(env):
+        x, tyres = config.scenario, config.world.tyres or config.scenario.tyres
+        kinds.add(PlantKind(tyres, x.small_angle, x.roll, x.lags, config.yaw_first))
+    return frozenset(kinds)
 
 
 def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:

@@ -1,5 +1,6 @@
 """LQR: the yaw moment, and steering where there is some, that minimise the env's own cost."""
 
+import copy
 import math
 from collections import namedtuple
 from collections.abc import Sequence
@@ -26,6 +27,12 @@ Inputs = namedtuple(
 )
 """Columns of the law's inputs; beta_ref stands in for those that `Lqr` does without."""
 IN = Inputs(*range(14))
+TOLD = (
+    *("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness"),
+    *("friction", "motor_left", "motor_right"),
+)
+"""Parameters of the true car, of which the observation has true_<name>; the last are its motors."""
+_MAX_CARS = 1024  # for which the gains are kept
 
 
 @jit
@@ -100,6 +107,8 @@ class Lqr(Controller):
         knots: Knots of each stiffness axis; the table is designed once.
         steer_weight: Factor on the cost of added steering, whose rate limit the design lacks.
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
+        told: Whether the observation tells each row's car (`TOLD`), for which gains are designed,
+            and whose motors' commands are corrected.
 
     Raises:
         ValueError: An entry is missing, or an option is out of range.
@@ -117,6 +126,7 @@ class Lqr(Controller):
         knots: int = 7,
         steer_weight: float = 1.0,
         grip: float | None = None,
+        told: bool = False,
     ) -> None:
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
@@ -133,6 +143,10 @@ class Lqr(Controller):
             *(stiffness or substitutes),
             *self._list_extra_entries(names),
         )
+        self._told = slice(len(self.needs), len(self.needs) + len(TOLD)) if told else None
+        self._redesigned: dict[bytes, Lqr] = {}
+        if told:
+            self.needs += tuple(f"true_{name}" for name in TOLD)
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
         self.memory = 1 if self.width == 2 else 0
@@ -149,13 +163,19 @@ class Lqr(Controller):
             tuple((nominal_stiffness * np.geomspace(*span, knots)).tolist()) if stiffness else ()
             for nominal_stiffness in (car.front_stiffness, car.rear_stiffness)
         )
+        self._design_gains(car, fronts, rears)
+
+    def _design_gains(
+        self, car: Vehicle, fronts: Sequence[float] = (), rears: Sequence[float] = ()
+    ) -> None:
+        """Design the gains for a car, on knots of the stiffnesses (N/rad) or for its own."""
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle = car
-        speeds = SPEEDS[::2] if stiffness else SPEEDS
+        speeds = SPEEDS[::2] if fronts or self._told else SPEEDS
         self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
-        self.scheduled = len(stiffness) == 2
+        self.scheduled = bool(fronts)
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
@@ -207,7 +227,39 @@ class Lqr(Controller):
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
+    def _redesign(self, car: Vehicle) -> "Lqr":
+        """Make the same controller for another car."""
+        other = copy.copy(self)
+        other.__dict__.pop("_car", None)  # a cached property
+        other._design_gains(car)
+        return other
+
+    def _get_redesigned(self, numbers: Array) -> "Lqr":
+        """Get the controller for the car of some numbers, shape (len(TOLD),)."""
+        key = numbers.tobytes()
+        if key not in self._redesigned:
+            if len(self._redesigned) >= _MAX_CARS:
+                self._redesigned.clear()
+            parameters = dict(zip(TOLD[:-2], numbers.tolist(), strict=False))
+            self._redesigned[key] = self._redesign(self.vehicle.replace(**parameters))
+        return self._redesigned[key]
+
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        if self._told is None:
+            self._decide(inputs, state, action)
+            return
+        for i in range(len(inputs)):
+            x, numbers, row = inputs[i], inputs[i, self._told], slice(i, i + 1)
+            if not numbers.all():  # a row whose inputs are not finite
+                continue
+            self._get_redesigned(numbers)._decide(inputs[row], state[row], action[row])
+            left, right = numbers[-2:]
+            drive = 0.5 * (x[IN.torque_left] / left + x[IN.torque_right] / right)  # N m, commanded
+            uneven = self.share * (right - left) * drive
+            action[i, 0] = (action[i, 0] - uneven) / (0.5 * (left + right))
+
+    def _decide(self, inputs: Array, state: Array, action: Array) -> None:
+        """Compute what `_law` does with gains of one car for all rows."""
         limits = self._compute_max_moment(inputs), self._compute_sliding_slip(inputs)
         _lqr_law(inputs, state, action, *limits, self._design)
 

@@ -20,7 +20,7 @@ from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_refere
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ...envs.vehicle.tyres import MIN_SPEED
+from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
 from ..design.prediction import (
     PredictionModel,
@@ -212,6 +212,7 @@ class Nmpc(Lqr):
         knots: Knots of each stiffness axis, as for `Lqr`.
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
+        told: Whether each row's car is told, as for `Lqr`.
 
     Raises:
         ValueError: An entry is missing, an option is out of range, or rows have different plants.
@@ -232,8 +233,9 @@ class Nmpc(Lqr):
         knots: int = 7,
         steer_weight: float = 10.0,
         grip: float | None = None,
+        told: bool = False,
     ) -> None:
-        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip
+        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, told
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
@@ -247,18 +249,29 @@ class Nmpc(Lqr):
             raise ValueError(
                 "the rows of a vector env share one prediction, but their plants differ"
             )
-        self.design = Design(
-            make_prediction_model(self.vehicle, plant, spec, target, self.authority),
-            target,
-            np.ascontiguousarray(self.table[..., : -self.width]),
-            self._terminal,
-            self.axes,
-            blocks,
-            int(self.scheduled),
-            ("none", "forces", "rates").index(spec.disturbances),
-            self.control_period / spec.period,
-            iterations,
-        )
+        self._plant = plant
+        disturbed = ("none", "forces", "rates").index(spec.disturbances)
+        lasting = target, blocks, disturbed, self.control_period / spec.period, iterations
+        self.design = self._make_design(*lasting)
+
+    def _make_design(
+        self, target: ReferenceParams, blocks: Array, disturbed: int, steps: float, iterations: int
+    ) -> Design:
+        """Make the parts of all decisions from the gains and what lasts when these change."""
+        spec, tables = self.design_spec, (self.table[..., : -self.width], self._terminal)
+        model = make_prediction_model(self.vehicle, self._plant, spec, target, self.authority)
+        gains, terminal = map(np.ascontiguousarray, tables)
+        scheduled = int(self.scheduled)
+        shared = self.axes, blocks, scheduled, disturbed, steps, iterations
+        return Design(model, target, gains, terminal, *shared)
+
+    def _redesign(self, car: Vehicle) -> "Nmpc":
+        fitted = fit_fiala(car) if self._plant.tyres == "magic-formula" else car
+        other, last = super()._redesign(fitted), self.design
+        assert isinstance(other, Nmpc)
+        lasting = last.target, last.blocks, last.disturbed, last.steps, last.iterations
+        other.design = other._make_design(*lasting)
+        return other
 
     def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
         rolling = ("phi_hat", "phi_rate_hat")
@@ -279,7 +292,7 @@ class Nmpc(Lqr):
         """
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+    def _decide(self, inputs: Array, state: Array, action: Array) -> None:
         rolls = np.full((len(inputs), 2), np.nan)
         if self._rolling:
             rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])
