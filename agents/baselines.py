@@ -28,7 +28,7 @@ from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller
-from .controllers.lqr import TOLD, Lqr
+from .controllers.lqr import TRUE_PARAMETERS, Lqr
 from .controllers.nmpc import Nmpc
 
 NOMINAL = "nominal"
@@ -97,36 +97,39 @@ def make_noise_options(
     options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
     options["bank_sd"] = compute_range_rms(scenario, "bank")
     options |= {option: noise[key] for key, option in _NOISE.items() if key in noise}
-    return options if world.is_ideal else _add_errors(options, scenario, world, has_tyres)
+    if world.is_ideal:
+        return options
+    errors = _make_error_options(scenario, world)
+    unused = set() if scenario.roll else {"accel_y_noise"}
+    unused |= {"force_share", "moment_share"} if has_tyres else set()
+    return options | {key: value for key, value in errors.items() if key not in unused}
 
 
-def _add_errors(
-    options: dict[str, Any], scenario: Scenario, world: World, has_tyres: bool
-) -> dict[str, Any]:
-    """Add the errors of a world to a scenario's options."""
+def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
+    """Make the options of `exact-kf` that a world adds or changes."""
 
-    def rms(name: str) -> float:
+    def get_rms(name: str) -> float:
         return compute_range_rms(world, name)
 
     plain, speed = Noise()._asdict() | dict(scenario.noise), 0.5 * sum(scenario.range("speed"))
     turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
-    lag = rms("map_lag") * turning  # rad, error of the road's direction
-    course = plain["course"], _WAVE * rms("course_error"), rms("gps_stamp") * _ACCELERATION
-    options |= {
-        "camera_yaw_sd": rms("camera_yaw"),
-        "steer_offset_sd": rms("steer_offset"),
+    lag = get_rms("map_lag") * turning  # rad, error of the road's direction
+    course = plain["course"], _WAVE * get_rms("course_error"), get_rms("gps_stamp") * _ACCELERATION
+    spreads = [compute_range_rms(scenario, name, 1.0) for name in STIFFNESSES]
+    force_share = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
+    options = {
+        "camera_yaw_sd": get_rms("camera_yaw"),
+        "steer_offset_sd": get_rms("steer_offset"),
         "psi_noise": math.hypot(plain["camera_psi"], lag),
         "q_psi": lag * turning,
         "course_noise": math.hypot(*course) / speed,
+        "accel_y_noise": math.hypot(plain["accel"], get_rms("vibration")),
+        "force_share": force_share,
+        "moment_share": 0.5 * force_share,
     }
-    if wave := rms("bank_wave"):
-        options |= {"bank_sd": math.hypot(options["bank_sd"], wave), "bank_time": _BANK_TIME}
-    if scenario.roll:
-        options["accel_y_noise"] = math.hypot(plain["accel"], rms("vibration"))
-    if not has_tyres:
-        spreads = [compute_range_rms(scenario, name, 1.0) for name in STIFFNESSES]
-        options["force_share"] = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
-        options["moment_share"] = 0.5 * options["force_share"]
+    if wave := get_rms("bank_wave"):
+        options["bank_sd"] = math.hypot(compute_range_rms(scenario, "bank"), wave)
+        options["bank_time"] = _BANK_TIME
     return options
 
 
@@ -201,7 +204,9 @@ def make_oracle(
     if name != NOMINAL:
         truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
         states = () if name in PARAMETER_ORACLES else STATES
-        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_")) if world.is_ideal else TOLD
+        parameters = (
+            (*STIFFNESSES, FRICTION.removeprefix("true_")) if world.is_ideal else TRUE_PARAMETERS
+        )
         env = truth_wrapper(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
     is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
@@ -212,7 +217,7 @@ def make_oracle(
         if world.is_ideal:
             settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
         else:
-            settings["told"] = True
+            settings["knows_car"] = True
     controller_class = Nmpc if is_predictive else Lqr
     return env, controller_class(env, **settings | dict(chosen["controller"]))
 

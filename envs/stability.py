@@ -16,7 +16,7 @@ from .engine.config import EnvConfig
 from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
-from .engine.views import Episode, Told, compute_true_states
+from .engine.views import CarTruth, Episode, compute_true_states
 from .engine.workspace import Workspace
 from .numerics.jit import compile_call
 from .numerics.packed import read
@@ -314,9 +314,9 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         return self._get_episode().vehicle
 
     @property
-    def told(self) -> Told:
+    def car_truth(self) -> CarTruth:
         """What an oracle is told of the episode; no sensor measures these."""
-        return self._get_episode().told
+        return self._get_episode().car_truth
 
     @property
     def motion(self) -> Motion:

@@ -12,7 +12,7 @@ from .engine.batch import IntArray, NumbaEngine
 from .engine.batch_env import BatchEnv, Infos
 from .engine.config import EnvConfig
 from .engine.layout import Z
-from .engine.views import Episode, Told, compute_true_states
+from .engine.views import CarTruth, Episode, compute_true_states
 from .record import Array, Record
 from .rendering.renderer import VectorRenderMixin
 from .scenarios.scenario import Scenario
@@ -271,9 +271,9 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         return self._map_episodes(lambda episode: episode.vehicle)
 
     @property
-    def told(self) -> Sequence[Told]:
+    def car_truth(self) -> Sequence[CarTruth]:
         """What an oracle is told of each row's episode."""
-        return self._map_episodes(lambda episode: episode.told)
+        return self._map_episodes(lambda episode: episode.car_truth)
 
     @property
     def nominal(self) -> Sequence[Vehicle]:

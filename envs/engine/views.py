@@ -21,7 +21,7 @@ from .config import EpisodeConfig
 from .layout import FLAGS, P, Z
 
 
-class Told(NamedTuple):
+class CarTruth(NamedTuple):
     """What an oracle is told of an episode's constants."""
 
     vehicle: Vehicle  # the true one
@@ -67,18 +67,18 @@ class Episode(NamedTuple):
         )
 
     @property
-    def told(self) -> Told:
+    def car_truth(self) -> CarTruth:
         """What an oracle is told; a calibrated reading is (reading - offset) / scale."""
         car, errors, vehicle = read(self.params, P.car), read(self.params, P.errors), self.vehicle
         calibration = np.array([[0.0], [1.0]]).repeat(FAST_WIDTH, axis=1)
         if not car.m > 0.0:  # not reset yet
-            return Told(vehicle, vehicle, 1.0, 1.0, calibration)
+            return CarTruth(vehicle, vehicle, 1.0, 1.0, calibration)
         angles, wheels = [FAST.steer, FAST.steer_command], [FAST.wheel_left, FAST.wheel_right]
         calibration[:, angles] = [[errors.steer_offset], [errors.steer_scale]]
         calibration[1, wheels] = errors.wheel_left, errors.wheel_right
         calibration[1, [FAST.torque_left, FAST.torque_right]] = 1.0 / car.k_l, 1.0 / car.k_r
         fiala = fit_fiala(vehicle) if self.switches[FLAGS.law] == MAGIC_FORMULA else vehicle
-        return Told(vehicle, fiala, float(car.k_l), float(car.k_r), calibration)
+        return CarTruth(vehicle, fiala, float(car.k_l), float(car.k_r), calibration)
 
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:

@@ -170,10 +170,10 @@ class EstimateObservation(VectorObservation):
         """Make the specs of some rows' estimators."""
         specs = self._records.make_specs(rows)
         if self._arguments.is_told_truth:
-            told = self._get_told(rows)
-            self._calibration[rows] = [each.calibration for each in told]
-            pairs = zip(specs, told, strict=True)
-            return [spec._replace(vehicle=each.fiala) for spec, each in pairs]
+            truths = self._get_truths(rows)
+            self._calibration[rows] = [item.calibration for item in truths]
+            pairs = zip(specs, truths, strict=True)
+            return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
         if self._arguments.vehicle is None:
             return specs
         return [spec._replace(vehicle=self._arguments.vehicle) for spec in specs]

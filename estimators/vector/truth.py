@@ -53,14 +53,15 @@ class TruthObservation(VectorObservation):
             raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
         self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
         self._places, self._columns = find_readings(env.layout)
-        self._calibration = np.ones((env.num_envs, 2, len(self._columns)), np.float32)
+        shape = env.num_envs, 2, len(self._columns)
+        self._calibration: Observations = np.ones(shape, np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
 
     def _begin(self, mask: Mask) -> None:
         rows = np.flatnonzero(mask)
-        for i, told in zip(rows, self._get_told(rows.tolist()), strict=True):
-            self._values[i] = read_parameters(told, self._parameters)
-            self._calibration[i] = told.calibration[:, self._columns]
+        for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
+            self._values[i] = read_parameters(truth, self._parameters)
+            self._calibration[i] = truth.calibration[:, self._columns]
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
         for i in np.flatnonzero(ended):
@@ -79,14 +80,14 @@ class TruthObservation(VectorObservation):
             else:
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
             parts.append(read_states(true_states, self._states))
-        appended = np.hstack(parts)
+        appended: Observations = np.hstack(parts)
         appended[:, self._places] = calibrate(appended[:, self._places], self._calibration)
         return appended
 
     def get_state(self) -> dict[str, Any]:
         """Return a snapshot for `set_state`; TypeError where the env makes none."""
-        told = {"values": self._values.copy(), "calibration": self._calibration.copy()}
-        return super().get_state() | told
+        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
+        return super().get_state() | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.

@@ -286,15 +286,15 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         base, arguments, previous = self._base, self._arguments, self._estimator_spec
         spec, car = make_spec(base), arguments.vehicle
         if arguments.is_told_truth:
-            told = base.told
-            car, self._calibration = told.fiala, told.calibration
+            truth = base.car_truth
+            car, self._calibration = truth.fiala, truth.calibration
             if previous is not None:
-                car = choose_vehicle(self.estimator, previous.vehicle, told.fiala)
+                car = choose_vehicle(self.estimator, previous.vehicle, truth.fiala)
         spec = spec if car is None else spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
             self.estimator, self._estimator_spec = self._build_estimator(spec), spec
         if arguments.is_told_truth:
-            set_stiffness(self.estimator, told.fiala)
+            set_stiffness(self.estimator, truth.fiala)
         return self.estimator
 
     def _build_estimator(self, spec: EstimatorSpec) -> AnyEstimator:

@@ -4,14 +4,14 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
-from ...envs.engine.views import TRUE_STATE, Told
+from ...envs.engine.views import TRUE_STATE, CarTruth
 from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import Vehicle
@@ -19,6 +19,7 @@ from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
 _Floats = npt.NDArray[np.float32]
+Readings = TypeVar("Readings", Array, _Floats)
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 _MOTORS = {"motor_left": "-", "motor_right": "-"}
@@ -39,7 +40,7 @@ def make_truth_entries(
     """Make the entries of true parameters and states behind those of an observation.
 
     Args:
-        parameters: Parameters of a `Vehicle` or motors of `Told`, each as `true_<parameter>`.
+        parameters: Parameters of a `Vehicle` or motors of `CarTruth`, each as `true_<parameter>`.
         states: States of a `TrueState`, each as `<state>_hat`.
         inner: Entries of the observation.
 
@@ -70,17 +71,17 @@ def make_truth_entries(
     return (*inner, *entries)
 
 
-def read_parameters(told: Told, parameters: Sequence[str]) -> list[float]:
+def read_parameters(truth: CarTruth, parameters: Sequence[str]) -> list[float]:
     """Read parameters of the true car.
 
     Args:
-        told: What is told of the episode.
-        parameters: Names of a `Vehicle`'s parameters or of `Told`'s motors.
+        truth: What is told of the episode.
+        parameters: Names of a `Vehicle`'s parameters or of `CarTruth`'s motors.
 
     Returns:
         Values in SI units.
     """
-    return [getattr(told if name in _MOTORS else told.vehicle, name) for name in parameters]
+    return [getattr(truth if name in _MOTORS else truth.vehicle, name) for name in parameters]
 
 
 def find_readings(layout: Sequence[ObservationEntry]) -> tuple[list[int], list[int]]:
@@ -97,7 +98,7 @@ def find_readings(layout: Sequence[ObservationEntry]) -> tuple[list[int], list[i
     return places, [FAST._fields.index(stems[i]) for i in places]
 
 
-def calibrate(readings: Any, calibration: Any) -> Any:
+def calibrate(readings: Readings, calibration: Readings) -> Readings:
     """Correct readings by what is told of their sensors.
 
     Args:
@@ -204,9 +205,9 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        told = base.told
-        self._values[:] = read_parameters(told, self._parameters)
-        self._calibration = told.calibration[:, self._columns].astype(np.float32)
+        truth = base.car_truth
+        self._values[:] = read_parameters(truth, self._parameters)
+        self._calibration = truth.calibration[:, self._columns].astype(np.float32)
         return self.observation(obs), info
 
     def observation(self, observation: _Floats) -> _Floats:
@@ -226,8 +227,8 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
 
     def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the parameters for `set_state`."""
-        told = {"values": self._values.copy(), "calibration": self._calibration.copy()}
-        return {"env": self.env.get_wrapper_attr("get_state")()} | told
+        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
+        return {"env": self.env.get_wrapper_attr("get_state")()} | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.

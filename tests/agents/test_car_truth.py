@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.baselines import make_oracle
-from sideslip.agents.controllers.lqr import TOLD, Lqr
+from sideslip.agents.controllers.lqr import TRUE_PARAMETERS, Lqr
 from sideslip.agents.controllers.nmpc import Nmpc
 from sideslip.agents.design.sampled_model import SPEEDS, make_design_model
 from sideslip.agents.rollout import evaluate_costs
@@ -68,7 +68,7 @@ def test_what_is_constant_of_a_sensor_costs_an_oracle_nothing() -> None:
     assert bits(costs[0]) == bits(costs[1])
 
 
-real = views.Told
+real = views.CarTruth
 
 
 def drive_uneven(world: dict[str, Any]) -> np.ndarray:
@@ -84,7 +84,9 @@ def test_motors_that_pull_unevenly_are_commanded_accordingly(
 ) -> None:
     even, uneven = drive_uneven({}), {"torque_scale": 0.5, "torque_left": 1.3}
     np.testing.assert_allclose(drive_uneven(uneven), even, 0.004)
-    monkeypatch.setattr(views, "Told", lambda *facts: real(facts[0], facts[1], 1.0, 1.0, facts[-1]))
+    monkeypatch.setattr(
+        views, "CarTruth", lambda *facts: real(facts[0], facts[1], 1.0, 1.0, facts[-1])
+    )
     assert np.abs(drive_uneven(uneven) / even - 1.0).max() > 0.02  # who does not know it
 
 
@@ -95,9 +97,9 @@ def test_gains_are_designed_for_each_rows_car(kind: str) -> None:
     assert isinstance(agent, Lqr)
     car = agent.vehicle.replace(mass=1800.0, yaw_inertia=2100.0, front_arm=1.2, rear_arm=1.5)
     car = car.scale_stiffness(0.8, 1.2)
-    numbers = np.array([*(getattr(car, name) for name in TOLD[:-2]), 1.0, 1.0])
-    other, speed = agent._get_redesigned(numbers), SPEEDS[30]
-    assert agent._get_redesigned(numbers.copy()) is other
+    numbers = np.array([*(getattr(car, name) for name in TRUE_PARAMETERS[:-2]), 1.0, 1.0])
+    other, speed = agent._get_for_car(numbers), SPEEDS[30]
+    assert agent._get_for_car(numbers.copy()) is other
     assert other.vehicle == (fit_fiala(car) if kind == "nmpc" else car)
     wanted = make_design_model(other.vehicle, speed, agent.design_spec).solve()[0]
     np.testing.assert_allclose(other.gains(speed), wanted, 1e-9)
