@@ -6,6 +6,7 @@ better of the two that know state, disturbances and car: "Cost and score" of doc
 disturbances and its reference, such as "coms-model" or "car-steering".
 """
 
+import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
@@ -15,15 +16,19 @@ from typing import Any
 
 import gymnasium as gym
 
+from ..envs.scenarios.draws import get_range
 from ..envs.scenarios.scenario import Scenario
+from ..envs.scenarios.world import IDEAL, World
+from ..envs.sensors.inertial import Noise
 from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice
+from ..envs.vehicle.parameters import GRAVITY
 from ..estimators.vector import estimate as vector
 from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller
-from .controllers.lqr import Lqr
+from .controllers.lqr import TRUE_PARAMETERS, Lqr
 from .controllers.nmpc import Nmpc
 
 NOMINAL = "nominal"
@@ -47,23 +52,37 @@ STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
+_CONSTANTS = (
+    *("camera_yaw", "camera_pitch", "camera_height", "gyro_scale", "gyro_drift", "accel_scale"),
+    *("accel_roll", "accel_ahead", "gps_stamp", "map_lag"),
+)
+"""Constant errors of sensors from which no reference is made; who knows them subtracts them."""
+_ACCELERATION = 2.0  # m/s2 to the side, of a manoeuvre
+_BANK_TIME = 10.0  # s within which a wavy road forgets its bank
+_WAVE = math.sqrt(0.5)  # root mean square of a wave, or of two axles' spreads, over its amplitude
 FILE = Path(__file__).with_name("tuned.toml")
 PARTS = ("filter", "controller")
 Options = dict[str, dict[str, Any]]
 """Options of the filter and of the controller, by `PARTS`."""
 
 
-def make_noise_options(scenario: Scenario) -> dict[str, Any]:
+def make_noise_options(
+    scenario: Scenario, world: World = IDEAL, has_tyres: bool = False
+) -> dict[str, Any]:
     """Make options of `exact-kf` from the noise and the disturbances of a scenario.
 
     The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
-    is read where the body rolls, as the filter then assumes.
+    is read where the body rolls, as the filter then assumes. In a world that is not ideal, what can
+    be seen of its errors has states, and the rest counts as noise: what is unknown of the tyres as
+    forces, a late map as noise of the heading, a late GPS as noise of the course.
 
     Args:
         scenario: Scenario whose noise the filter knows.
+        world: Errors of car and sensors, of which it knows the ranges.
+        has_tyres: Whether the filter knows the tyres or has states for them.
 
     Returns:
-        Options by name.
+        Options by name; `camera_yaw_sd` needs a camera.
     """
     noise, share = scenario.noise, HDOP_LAWS[scenario.hdop_law]
     options = {
@@ -77,20 +96,55 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
         options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
     options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
     options["bank_sd"] = compute_range_rms(scenario, "bank")
-    return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
+    options |= {option: noise[key] for key, option in _NOISE.items() if key in noise}
+    if world.is_ideal:
+        return options
+    errors = _make_error_options(scenario, world)
+    unused = set() if scenario.roll else {"accel_y_noise"}
+    unused |= {"force_share", "moment_share"} if has_tyres else set()
+    return options | {key: value for key, value in errors.items() if key not in unused}
 
 
-def compute_range_rms(scenario: Scenario, name: str) -> float:
+def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
+    """Make the options of `exact-kf` that a world adds or changes."""
+
+    def get_rms(name: str) -> float:
+        return compute_range_rms(world, name)
+
+    plain, speed = Noise()._asdict() | dict(scenario.noise), 0.5 * sum(scenario.range("speed"))
+    turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
+    lag = get_rms("map_lag") * turning  # rad, error of the road's direction
+    course = plain["course"], _WAVE * get_rms("course_error"), get_rms("gps_stamp") * _ACCELERATION
+    spreads = [compute_range_rms(scenario, name, 1.0) for name in STIFFNESSES]
+    force_share = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
+    options = {
+        "camera_yaw_sd": get_rms("camera_yaw"),
+        "steer_offset_sd": get_rms("steer_offset"),
+        "psi_noise": math.hypot(plain["camera_psi"], lag),
+        "q_psi": lag * turning,
+        "course_noise": math.hypot(*course) / speed,
+        "accel_y_noise": math.hypot(plain["accel"], get_rms("vibration")),
+        "force_share": force_share,
+        "moment_share": 0.5 * force_share,
+    }
+    if wave := get_rms("bank_wave"):
+        options["bank_sd"] = math.hypot(compute_range_rms(scenario, "bank"), wave)
+        options["bank_time"] = _BANK_TIME
+    return options
+
+
+def compute_range_rms(source: Scenario | World, name: str, ideal: float = 0.0) -> float:
     """Compute the root mean square of a quantity that is uniform over its range.
 
     Args:
-        scenario: Scenario that holds the range.
+        source: Scenario or world that holds the range.
         name: Name of the quantity, whose unit the result has.
+        ideal: Value from which it counts.
 
     Returns:
         Root mean square, in the quantity's unit.
     """
-    low, high = scenario.range(name)
+    low, high = (end - ideal for end in get_range(getattr(source, name)))
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
 
@@ -104,6 +158,12 @@ def make_oracle(
 ) -> tuple[Any, Controller]:
     """Make an oracle and the env whose observation it needs.
 
+    In a world, those that know more than nominal get the drawn car, with gains of its own, and
+    readings of steering, wheels and motors that are calibrated. References are made from the env's
+    own readings, as for everybody: so the sensors of these err in its env too. Other constant
+    errors, of which no reference is made, are absent from the env of an oracle of parameters, as
+    biases are.
+
     Args:
         name: Name in `ORACLES`.
         env_id: Id of the env.
@@ -112,7 +172,7 @@ def make_oracle(
         options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
             sensors of the id, `make_noise_options` of the scenario, a grip limit.
         env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
-            true car may differ between episodes; its other parameters are the env's.
+            true car may differ between episodes, in a world its other parameters too.
 
     Returns:
         The env and the agent.
@@ -126,12 +186,14 @@ def make_oracle(
     if len(chosen) != 2:
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
     single_env: Any = gym.make(env_id, **env_kwargs)
+    world: World = single_env.unwrapped.config.world
     if name in PARAMETER_ORACLES:
         # no biases: a filter that knows them would subtract them
         scenario: Scenario = single_env.unwrapped.scenario
+        world = dataclasses.replace(world, **{key: getattr(IDEAL, key) for key in _CONSTANTS})
         noise = {key: sd for key, sd in scenario.noise.items() if not key.endswith("_bias")}
         unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
-        env_kwargs |= {"scenario": unbiased.to_dict()}
+        env_kwargs |= {"scenario": unbiased.to_dict(), "world": world.to_dict()}
         single_env = gym.make(env_id, **env_kwargs)
     base: Any = single_env.unwrapped
     env = single_env
@@ -142,7 +204,9 @@ def make_oracle(
     if name != NOMINAL:
         truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
         states = () if name in PARAMETER_ORACLES else STATES
-        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
+        parameters = (
+            (*STIFFNESSES, FRICTION.removeprefix("true_")) if world.is_ideal else TRUE_PARAMETERS
+        )
         env = truth_wrapper(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
     is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
@@ -150,17 +214,25 @@ def make_oracle(
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings["vehicle"] = base.vehicle
-        settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
+        if world.is_ideal:
+            settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
+        else:
+            settings["knows_car"] = True
     controller_class = Nmpc if is_predictive else Lqr
     return env, controller_class(env, **settings | dict(chosen["controller"]))
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
     """Add a filter on all slow sensors, with the true tyres where it knows them."""
-    levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
+    world: World = base.config.world
+    law = world.tyres or base.scenario.tyres
+    has_tyre_filter = knows_tyres and law in ("fiala", "magic-formula")
+    if knows_tyres:  # and how the steering sensor errs
+        world = dataclasses.replace(world, steer_offset=IDEAL.steer_offset)
+    levels = make_noise_options(base.scenario, world, knows_tyres)
+    levels |= {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]
-    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
     if has_tyre_filter:
         levels |= _TYRE_FILTER_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation

@@ -53,6 +53,7 @@ class EnvFacts:
     control_period: int  # ticks between two decisions
     reference: str  # name in `envs.task.REFERENCES`
     width: int  # number of entries of an action
+    moment_rate: float  # s2, weight of the yaw moment's rate in the cost
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -191,7 +192,10 @@ def _collect_facts(env: Any) -> EnvFacts:
                 f"the rows of a vector env share one design, but row {i} has another nominal "
                 "vehicle or other limits than row 0: make an agent for each kind of car"
             )
-    return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
+    rates = {config.world.moment_rate for config in list_configs(env)}
+    if len(rates) != 1:
+        raise ValueError("the rows of a vector env share one design, but not one moment_rate")
+    return EnvFacts(layout, nominals[0], *limits[0], period, kind, width, *rates)
 
 
 def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
@@ -205,10 +209,11 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
     """
     if isinstance(env, EnvView):
         return env.plants
-    scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
-    return frozenset(
-        PlantKind(x.tyres, x.small_angle, x.roll, x.lags, yaw_first) for x, yaw_first in scenarios
-    )
+    kinds = set()
+    for config in list_configs(env):
+        x, tyres = config.scenario, config.world.tyres or config.scenario.tyres
+        kinds.add(PlantKind(tyres, x.small_angle, x.roll, x.lags, config.yaw_first))
+    return frozenset(kinds)
 
 
 def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:

@@ -32,7 +32,8 @@ _ROW_ATTRIBUTES = (  # each is a sequence in the vector env, with an item for ea
     "estimator", "np_random", "np_random_seed",
 )  # fmt: skip
 _SHARED_ATTRIBUTES = (  # each is the same for all rows
-    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
+    "layout", "control_period", "reference", "dt", "setting", "config", "spec", "render_mode",
+    "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
 _METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")

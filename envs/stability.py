@@ -16,7 +16,7 @@ from .engine.config import EnvConfig
 from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
-from .engine.views import Episode, compute_true_states
+from .engine.views import CarTruth, Episode, compute_true_states
 from .engine.workspace import Workspace
 from .numerics.jit import compile_call
 from .numerics.packed import read
@@ -312,6 +312,11 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def vehicle(self) -> Vehicle:
         """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
         return self._get_episode().vehicle
+
+    @property
+    def car_truth(self) -> CarTruth:
+        """What an oracle is told of the episode; no sensor measures these."""
+        return self._get_episode().car_truth
 
     @property
     def motion(self) -> Motion:

@@ -12,7 +12,7 @@ from .engine.batch import IntArray, NumbaEngine
 from .engine.batch_env import BatchEnv, Infos
 from .engine.config import EnvConfig
 from .engine.layout import Z
-from .engine.views import Episode, compute_true_states
+from .engine.views import CarTruth, Episode, compute_true_states
 from .record import Array, Record
 from .rendering.renderer import VectorRenderMixin
 from .scenarios.scenario import Scenario
@@ -269,6 +269,11 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
     def vehicle(self) -> Sequence[Vehicle]:
         """The true vehicle of each row's episode, with what its seed drew."""
         return self._map_episodes(lambda episode: episode.vehicle)
+
+    @property
+    def car_truth(self) -> Sequence[CarTruth]:
+        """What an oracle is told of each row's episode."""
+        return self._map_episodes(lambda episode: episode.car_truth)
 
     @property
     def nominal(self) -> Sequence[Vehicle]:

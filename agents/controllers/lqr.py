@@ -1,5 +1,6 @@
 """LQR: the yaw moment, and steering where there is some, that minimise the env's own cost."""
 
+import copy
 import math
 from collections import namedtuple
 from collections.abc import Sequence
@@ -26,6 +27,12 @@ Inputs = namedtuple(
 )
 """Columns of the law's inputs; beta_ref stands in for those that `Lqr` does without."""
 IN = Inputs(*range(14))
+TRUE_PARAMETERS = (
+    *("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness"),
+    *("friction", "motor_left", "motor_right"),
+)
+"""Parameters of the true car, of which the observation has true_<name>; the last are its motors."""
+_MAX_CARS = 1024  # for which the gains are kept
 
 
 @jit
@@ -52,24 +59,30 @@ def _lqr_law(
     sliding_slip: Vector,
     design: tuple[Any, ...],
 ) -> None:
-    """Compute the actions of LQR within the limits; state: steering last added (rad)."""
+    """Compute the actions of LQR within the limits, and the next `Lqr.memory`."""
     # sliding_slip: slip angle at which the front tyres slide (rad), max_share: largest yaw moment
     # as a fraction of full scale; both (N,)
     table, axes, scheduled, share, authority, slew, front_arm = design
     m, n = table.shape[3], table.shape[4] - table.shape[3]
-    KS, z = np.empty((m, n + m)), np.empty(n)
+    KS, z, first = np.empty((m, n + m)), np.empty(n), m - 1
+    remembers = state.shape[1] > first
     for row in range(len(x)):
         v = 0.5 * (x[row, IN.wheel_left] + x[row, IN.wheel_right])
         front = x[row, IN.front_stiffness] if scheduled else 0.0
         rear = x[row, IN.rear_stiffness] if scheduled else 0.0
         interpolate_gains(table, axes, v, front, rear, KS)
         make_design_state(x[row], share, z)
+        if remembers:
+            copy_into(state[row, first:], z[n - 2 :])
+            state[row, first] = z[2]
         u, w = 0.0, 0.0
         for j in range(n):
             u -= KS[0, j] * z[j]
             w -= KS[m - 1, j] * z[j]
         if m == 1:
             action[row, 0] = _clip(u, -max_share[row], max_share[row])
+            if remembers:
+                state[row, first + 1] = action[row, 0]
             continue
         low, high = max(state[row, 0] - slew, -authority), min(state[row, 0] + slew, authority)
         # added steering at which the front tyres have no slip angle
@@ -79,6 +92,8 @@ def _lqr_law(
         low, high = _clip(min_w, low, high), _clip(max_w, low, high)
         u, w = _solve_box_qp(KS, n, u, w, max_share[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
+        if remembers:
+            state[row, first + 1] = u
 
 
 class Lqr(Controller):
@@ -89,7 +104,7 @@ class Lqr(Controller):
     or d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is
     LQG. Where the env steers, an input may pass its limit, or the steering its rate. Both inputs
     are then optimal within these limits, if none were met later. The memory is the steering last
-    added.
+    added and, where the yaw moment's rate costs, its fraction at the last decision and its command.
 
     Args:
         env: Env of the controller.
@@ -100,6 +115,8 @@ class Lqr(Controller):
         knots: Knots of each stiffness axis; the table is designed once.
         steer_weight: Factor on the cost of added steering, whose rate limit the design lacks.
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
+        knows_car: Whether the observation has each row's `TRUE_PARAMETERS`: gains are designed for
+            that car, and commands corrected for its motors.
 
     Raises:
         ValueError: An entry is missing, or an option is out of range.
@@ -117,6 +134,7 @@ class Lqr(Controller):
         knots: int = 7,
         steer_weight: float = 1.0,
         grip: float | None = None,
+        knows_car: bool = False,
     ) -> None:
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
@@ -133,9 +151,17 @@ class Lqr(Controller):
             *(stiffness or substitutes),
             *self._list_extra_entries(names),
         )
+        self._car_columns = (
+            slice(len(self.needs), len(self.needs) + len(TRUE_PARAMETERS)) if knows_car else None
+        )
+        self._by_car: dict[bytes, Lqr] = {}
+        if knows_car:
+            self.needs += tuple(f"true_{name}" for name in TRUE_PARAMETERS)
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
-        self.memory = 1 if self.width == 2 else 0
+        rate = get_env_facts(env).moment_rate
+        self.remembered = 2 if rate > 0.0 else 0  # numbers at the end of the memory
+        self.memory = self.width - 1 + self.remembered
         self.design_spec = DesignSpec(
             max(self.control_period, self.min_period),
             self.full_scale,
@@ -144,18 +170,25 @@ class Lqr(Controller):
             kind,
             check_positive("disturbance_time", disturbance_time),
             check_positive("steer_weight", steer_weight),
+            rate,
         )
         fronts, rears = (
             tuple((nominal_stiffness * np.geomspace(*span, knots)).tolist()) if stiffness else ()
             for nominal_stiffness in (car.front_stiffness, car.rear_stiffness)
         )
+        self._design_gains(car, fronts, rears)
+
+    def _design_gains(
+        self, car: Vehicle, fronts: Sequence[float] = (), rears: Sequence[float] = ()
+    ) -> None:
+        """Design the gains for a car, on knots of the stiffnesses (N/rad) or for its own."""
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle = car
-        speeds = SPEEDS[::2] if stiffness else SPEEDS
+        speeds = SPEEDS[::2] if fronts or self._car_columns else SPEEDS
         self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
-        self.scheduled = len(stiffness) == 2
+        self.scheduled = bool(fronts)
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
@@ -198,7 +231,7 @@ class Lqr(Controller):
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
-        """Note the added steering, from which the rate limit counts.
+        """Note the added steering, from which the rate limit counts, and the moment.
 
         Args:
             state: Memory, shape (N, memory), updated.
@@ -206,8 +239,42 @@ class Lqr(Controller):
         """
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
+        if self.remembered:
+            state[:, -1] = action[:, 0]
+
+    def _design_anew(self, car: Vehicle) -> "Lqr":
+        """Make the same controller for another car."""
+        other = copy.copy(self)
+        other.__dict__.pop("_car", None)  # a cached property
+        other._design_gains(car)
+        return other
+
+    def _get_for_car(self, numbers: Array) -> "Lqr":
+        """Get the controller for the car of some numbers, shape (len(TRUE_PARAMETERS),)."""
+        key = numbers.tobytes()
+        if key not in self._by_car:
+            if len(self._by_car) >= _MAX_CARS:
+                self._by_car.clear()
+            parameters = dict(zip(TRUE_PARAMETERS[:-2], numbers.tolist(), strict=False))
+            self._by_car[key] = self._design_anew(self.vehicle.replace(**parameters))
+        return self._by_car[key]
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        if self._car_columns is None:
+            self._compute_actions(inputs, state, action)
+            return
+        for i in range(len(inputs)):
+            x, numbers, row = inputs[i], inputs[i, self._car_columns], slice(i, i + 1)
+            if not numbers.all():  # a row whose inputs are not finite
+                continue
+            self._get_for_car(numbers)._compute_actions(inputs[row], state[row], action[row])
+            left, right = numbers[-2:]
+            drive = 0.5 * (x[IN.torque_left] / left + x[IN.torque_right] / right)  # N m, commanded
+            uneven = self.share * (right - left) * drive
+            action[i, 0] = (action[i, 0] - uneven) / (0.5 * (left + right))
+
+    def _compute_actions(self, inputs: Array, state: Array, action: Array) -> None:
+        """Compute what `_law` does with gains of one car for all rows."""
         limits = self._compute_max_moment(inputs), self._compute_sliding_slip(inputs)
         _lqr_law(inputs, state, action, *limits, self._design)
 

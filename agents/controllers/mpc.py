@@ -77,7 +77,8 @@ class Mpc(Lqr):
 
     Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`. The
-    memory is the last fraction of added steering and the last solution, from which the next starts.
+    memory is the last fraction of added steering and the last solution, from which the next starts,
+    and what `Lqr` remembers of the yaw moment.
 
     Args:
         env: Env of the controller.
@@ -126,10 +127,11 @@ class Mpc(Lqr):
         self._rows = inputs + (horizon if self.width > 1 else 0)
         # The last added steering (fraction of authority), the solution, and its dual variables: of
         # the inputs' limits, and of the added steering's rate where the env steers.
-        self.memory = 1 + inputs + self._rows
-        self._primal, self._dual = slice(1, 1 + inputs), slice(1 + inputs, None)
+        end = 1 + inputs + self._rows
+        self.memory = end + self.remembered
+        self._primal, self._dual = slice(1, 1 + inputs), slice(1 + inputs, end)
         self._dual_limits = slice(1 + inputs, 1 + 2 * inputs)
-        self._dual_rate = slice(1 + 2 * inputs, None)
+        self._dual_rate = slice(1 + 2 * inputs, end)
         self._ready_for: dict[float, tuple[_QuadraticProgram, Any]] = {}
         self.status: list[str] = []
         self.solve_time: list[float] = []
@@ -159,8 +161,12 @@ class Mpc(Lqr):
         rows = zip(inputs, state, action, self._compute_max_moment(inputs), strict=True)
         for x, memory, row_action, max_moment in rows:
             make_design_state(x, self.share, z)
+            if self.remembered:
+                z[-2:], memory[-2] = memory[-2:], z[2]
             speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
             status, seconds = self._solve(speed, z, memory, row_action, float(max_moment))
+            if self.remembered:
+                memory[-1] = row_action[0]
             self.status.append(status)
             self.solve_time.append(seconds)
 
@@ -173,6 +179,8 @@ class Mpc(Lqr):
         """
         if self.width == 2:
             state[:, 0] = action[:, 1]
+        if self.remembered:
+            state[:, -1] = action[:, 0]
 
     def _solve(
         self, speed: float, z: Array, memory: Array, row_action: Array, max_moment: float

@@ -20,7 +20,7 @@ from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_refere
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ...envs.vehicle.tyres import MIN_SPEED
+from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
 from ..design.prediction import (
     PredictionModel,
@@ -43,7 +43,8 @@ INVERSE_FRICTION = "inverse_friction_hat"
 _MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 
 Memory = namedtuple("Memory", "added_command status")
-"""Added steering last commanded (rad) and index in `STATUSES`; the plan's variables follow."""
+"""Added steering last commanded (rad) and index in `STATUSES`; the plan's variables follow, and
+what `Lqr` remembers of the yaw moment."""
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)
 
@@ -86,17 +87,21 @@ def _shift_plan(plan: Vector, blocks: Vector, m: int, steps: float) -> None:
 
 @jit
 def _interpolate_regulator(
-    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector
-) -> Matrix:
-    """Interpolate a table's rows, shape (rows, 9), for the nine states of `prediction`.
+    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector,
+    remembered: int,
+) -> Matrix:  # fmt: skip
+    """Interpolate a table's rows, shape (rows, 9 + remembered), for the states of `prediction`.
 
     `per`: what turns F_d and N_d into the table's own disturbances, forces or rates.
     """
-    values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
+    values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9 + remembered))
     interpolate_gains(table, axes, v, front, rear, values)
+    n = values.shape[1] - remembered
     for i in range(len(values)):
-        for j in range(min(values.shape[1], 9)):
+        for j in range(n):
             padded[i, j] = values[i, j]
+        for j in range(remembered):
+            padded[i, 9 + j] = values[i, n + j]
         padded[i, 7] *= per[0]
         padded[i, 8] *= per[1]
     return padded
@@ -110,10 +115,12 @@ def _prepare_prediction(
     roll: Vector,
     added_command: Scalar,
     max_moment: Scalar,
+    before: Vector,
 ) -> PredictionTask:
     """Prepare the predictions of a row's decision."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
-    # added_command: the last one of added steering (rad), max_moment: fraction of full scale
+    # added_command: the last one of added steering (rad), max_moment: fraction of full scale,
+    # before: yaw moment at the last decision and its command (of full scale), or empty
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
@@ -147,10 +154,12 @@ def _prepare_prediction(
         steady,
         DisturbanceForces(F_d, N_d, 0.0),
         max_moment,
+        before[0] if len(before) > 0 else 0.0,
+        before[1] if len(before) > 0 else 0.0,
     )
-    per_force = (1.0 / per[0], 1.0 / per[1])
-    K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
-    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
+    per_force, n = (1.0 / per[0], 1.0 / per[1]), len(before)
+    K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force, n)
+    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force, n)
     return PredictionTask(model, start, K, terminal, design.blocks)
 
 
@@ -167,18 +176,24 @@ def _nmpc_law(
     """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
-        last_command = state[row, LAST.added_command]
+        last_command, end = state[row, LAST.added_command], PLAN + m * len(blocks)
         task = _prepare_prediction(
-            design, x[row], friction[row], rolls[row], last_command, max_moment[row]
-        )
-        plan, extra_iterations = state[row, PLAN:].copy(), _FIRST_ITERATIONS
+            design, x[row], friction[row], rolls[row], last_command, max_moment[row],
+            state[row, end:],
+        )  # fmt: skip
+        plan, extra_iterations = state[row, PLAN:end].copy(), _FIRST_ITERATIONS
         if state[row, LAST.status] == SOLVED:
             _shift_plan(plan, blocks, m, design.steps)
             extra_iterations = 0
         iterations = design.iterations + extra_iterations
         J, share, added_command = update_plan(task, plan, iterations)
         if np.isfinite(J):
-            state[row, PLAN:], state[row, LAST.added_command] = plan, added_command
+            state[row, PLAN:end], state[row, LAST.added_command] = plan, added_command
+            if state.shape[1] > end:
+                start = task.start
+                torque_per_share = 2.0 * design.model.full_scale * start.car.r / start.car.d_r
+                state[row, end] = (start.T_r - start.T_l) / torque_per_share
+                state[row, end + 1] = share
             state[row, LAST.status] = SOLVED
             action[row, 0] = share
             if m > 1:
@@ -212,6 +227,7 @@ class Nmpc(Lqr):
         knots: Knots of each stiffness axis, as for `Lqr`.
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
+        knows_car: Whether each row's car is in the observation, as for `Lqr`.
 
     Raises:
         ValueError: An entry is missing, an option is out of range, or rows have different plants.
@@ -232,33 +248,45 @@ class Nmpc(Lqr):
         knots: int = 7,
         steer_weight: float = 10.0,
         grip: float | None = None,
+        knows_car: bool = False,
     ) -> None:
-        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip
+        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, knows_car
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
         spec, target = self.design_spec, make_reference_params(self.nominal)
         steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
         blocks = _make_blocks(steps, MAX_VARIABLES // self.width)
-        self.memory = PLAN + self.width * len(blocks)
+        self.memory = PLAN + self.width * len(blocks) + self.remembered
         plants = list_plant_kinds(env)
         plant, *others = plants
         if others:
             raise ValueError(
                 "the rows of a vector env share one prediction, but their plants differ"
             )
-        self.design = Design(
-            make_prediction_model(self.vehicle, plant, spec, target, self.authority),
-            target,
-            np.ascontiguousarray(self.table[..., : -self.width]),
-            self._terminal,
-            self.axes,
-            blocks,
-            int(self.scheduled),
-            ("none", "forces", "rates").index(spec.disturbances),
-            self.control_period / spec.period,
-            iterations,
-        )
+        self._plant = plant
+        disturbed = ("none", "forces", "rates").index(spec.disturbances)
+        lasting = target, blocks, disturbed, self.control_period / spec.period, iterations
+        self.design = self._make_design(*lasting)
+
+    def _make_design(
+        self, target: ReferenceParams, blocks: Array, disturbed: int, steps: float, iterations: int
+    ) -> Design:
+        """Make the parts of all decisions from the gains and what lasts when these change."""
+        spec, tables = self.design_spec, (self.table[..., : -self.width], self._terminal)
+        model = make_prediction_model(self.vehicle, self._plant, spec, target, self.authority)
+        gains, terminal = map(np.ascontiguousarray, tables)
+        scheduled = int(self.scheduled)
+        shared = self.axes, blocks, scheduled, disturbed, steps, iterations
+        return Design(model, target, gains, terminal, *shared)
+
+    def _design_anew(self, car: Vehicle) -> "Nmpc":
+        fitted = fit_fiala(car) if self._plant.tyres == "magic-formula" else car
+        other, last = super()._design_anew(fitted), self.design
+        assert isinstance(other, Nmpc)
+        lasting = last.target, last.blocks, last.disturbed, last.steps, last.iterations
+        other.design = other._make_design(*lasting)
+        return other
 
     def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
         rolling = ("phi_hat", "phi_rate_hat")
@@ -279,7 +307,7 @@ class Nmpc(Lqr):
         """
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+    def _compute_actions(self, inputs: Array, state: Array, action: Array) -> None:
         rolls = np.full((len(inputs), 2), np.nan)
         if self._rolling:
             rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])

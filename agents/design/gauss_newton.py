@@ -20,9 +20,12 @@ _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
 @jit
-def _make_plan_batch(variables: int, blocks: Vector, count: int) -> PlanBatch:
+def _make_plan_batch(
+    variables: int, blocks: Vector, count: int, n_terminal: int = N_TERMINAL
+) -> PlanBatch:
     """Make a batch of so many plans of zeros, with one column for each."""
-    shape, n_residuals = (variables, count), N_RESIDUALS * blocks.sum() + N_TERMINAL
+    n_step = N_RESIDUALS + n_terminal - N_TERMINAL
+    shape, n_residuals = (variables, count), n_step * blocks.sum() + n_terminal
     plans, perturbations, limits = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     residuals, first = np.zeros((n_residuals, count)), np.zeros((2, count))
     return PlanBatch(plans, perturbations, limits, residuals, first)
@@ -32,7 +35,7 @@ def _make_plan_batch(variables: int, blocks: Vector, count: int) -> PlanBatch:
 def _simulate_batch(task: PredictionTask, batch: PlanBatch) -> None:
     """Simulate any number of plans, as many at a time as there are lanes."""
     width, (variables, count) = count_lanes(), batch.plans.shape
-    chunk = _make_plan_batch(variables, task.blocks, width)
+    chunk = _make_plan_batch(variables, task.blocks, width, len(task.terminal))
     for c in range(0, count, width):
         n = min(width, count - c)
         chunk.plans[:, :n] = batch.plans[:, c : c + n]
@@ -143,7 +146,8 @@ def update_plan(
         Cost J of the improved plan, not finite where no plan's was and the plan is unchanged; its
         first yaw moment (fraction of full scale) and added steering (rad).
     """
-    n, batch = len(plan), _make_plan_batch(len(plan), task.blocks, _N_CANDIDATES)
+    n, n_terminal = len(plan), len(task.terminal)
+    batch = _make_plan_batch(n, task.blocks, _N_CANDIDATES, n_terminal)
     A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):

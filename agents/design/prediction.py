@@ -5,7 +5,8 @@ as the plant limits it. So the plan of zeros is the regulator itself, which is o
 car is linear and no limit is met. As many plans as a SIMD value has lanes are simulated at once.
 
 The regulator's nine states, in this order, are the columns of K and T: beta, gamma, yaw moment
-(fraction of full scale), delta_f, driver's angle, beta_ref, gamma_ref, F_d, N_d.
+(fraction of full scale), delta_f, driver's angle, beta_ref, gamma_ref, F_d, N_d. Where the moment's
+rate costs there are two more: its fraction a step ago, and the command from then on.
 """
 
 import math
@@ -24,6 +25,7 @@ from ...envs.task import (
     EFFORT_WEIGHT,
     GAMMA_SCALE,
     LAGGED,
+    RATE_TICKS,
     STEER_SCALE,
     ZERO_SLIP,
     ReferenceParams,
@@ -74,6 +76,7 @@ class PredictionModel(NamedTuple):
     per_gamma: float  # of gamma (s/rad)
     per_share: float  # of the yaw moment's fraction
     per_steer: float  # of added steering (1/rad)
+    per_change: float  # of the yaw moment's change since the step before, over that of the moment
 
 
 class PredictionStart(NamedTuple):
@@ -91,6 +94,8 @@ class PredictionStart(NamedTuple):
     steady: tuple[Scalar, Scalar]  # values that a lagged reference approaches
     push: DisturbanceForces
     max_moment: Scalar  # largest yaw moment as a fraction of full scale
+    share_before: Scalar  # its fraction a step ago
+    command_before: Scalar  # its command from then on, likewise
 
 
 class PredictionTask(NamedTuple):
@@ -98,8 +103,8 @@ class PredictionTask(NamedTuple):
 
     model: PredictionModel
     start: PredictionStart
-    K: Matrix  # gains of the regulator on its nine states, (m, 9)
-    terminal: Matrix  # T of the terminal cost |T x|^2, (4, 9)
+    K: Matrix  # gains of the regulator on its states, (m, 9), or (m, 11) where the rate costs
+    terminal: Matrix  # T of the terminal cost |T x|^2, (4, 9) or (6, 11)
     blocks: Vector  # steps of each block
 
 
@@ -172,12 +177,14 @@ def make_prediction_model(
         0.0 if kind.reference == ZERO_SLIP else 1.0 / GAMMA_SCALE,
         math.sqrt(EFFORT_WEIGHT),
         math.sqrt(spec.steer_weight * EFFORT_WEIGHT) / STEER_SCALE,
+        math.sqrt(spec.moment_rate / (step * RATE_TICKS * TICK * EFFORT_WEIGHT)),
     )
 
 
 N_RESIDUALS = 6
 """Residuals of a step: error of the sideslip angle, error of the yaw rate, then for the yaw moment
-and for added steering the mean over the step and the standard deviation within it."""
+and for added steering the mean over the step and the standard deviation within it. Where the
+moment's rate costs, two more have those of the moment's change since the step before."""
 N_TERMINAL = 4  # residuals behind the last step, of what is to come
 
 
@@ -193,6 +200,8 @@ class _PredictionState(NamedTuple):
     gamma_ref: Scalar  # reference of the yaw rate (rad/s)
     F_d: Scalar  # disturbance force (N)
     N_d: Scalar  # disturbance moment (N m)
+    share_before: Scalar  # yaw moment a step ago, as a fraction of full scale
+    command_before: Scalar  # its command from then on, likewise
 
 
 @inline
@@ -217,12 +226,15 @@ def _multiply_row(
     state: _PredictionState,
     beta: Scalar,
 ) -> Scalar:
-    """Multiply a row of M, K or T of shape (rows, 9), by the nine states."""
+    """Multiply a row of M, K or T of shape (rows, 9 or 11), by the states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     first = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
     middle = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
     last = M[row, 6] * state.gamma_ref + M[row, 7] * state.F_d + M[row, 8] * state.N_d
-    return first + middle + last
+    total = first + middle + last
+    if M.shape[1] > 9:
+        total = total + (M[row, 9] * state.share_before + M[row, 10] * state.command_before)
+    return total
 
 
 @inline
@@ -309,8 +321,25 @@ def _predict_step(
         apply_lag(start.steady[1], state.gamma_ref, model.ref_decay),
         model.decay * state.F_d,
         model.decay * state.N_d,
+        share_before,
+        target_share,
     )
     return next_state, efforts
+
+
+@inline
+def _compute_changes(
+    model: PredictionModel,
+    ago: _PredictionState,
+    efforts: tuple[Scalar, Scalar, Scalar, Scalar],
+) -> tuple[Scalar, Scalar]:
+    """Compute residuals of the moment's change: mean, and deviation within the step from `ago`."""
+    mean = apply_lag(ago.command_before, ago.share_before, model.motor_rest[0])
+    deviation = model.motor_rest[1] * (ago.share_before - ago.command_before)
+    return (
+        model.per_change * (efforts[0] - model.per_share * mean),
+        model.per_change * (efforts[1] - model.per_share * deviation),
+    )
 
 
 @noinline
@@ -339,9 +368,12 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
         start.refs[1] + zero,
         start.push.F_d + zero,
         start.push.N_d + zero,
+        start.share_before + zero,
+        start.command_before + zero,
     )
     beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
-    row, last = 0, N_RESIDUALS * (blocks.sum() - 1)
+    n_step = N_RESIDUALS + len(terminal) - N_TERMINAL
+    row, last = 0, n_step * (blocks.sum() - 1)
     for b in range(len(blocks)):
         moment_share, share_beyond = load_element(plans, m * b), load_element(perturbations, m * b)
         steer_share, steer_beyond = zero, zero
@@ -359,6 +391,7 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             if row == 0:
                 store_element(first, share, 0)
                 store_element(first, added_command, 1)
+            ago = state
             state, efforts = _predict_step(
                 model, start, state, share, added_command, share_beyond, steer_beyond
             )
@@ -376,7 +409,11 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             store_element(residuals, span * efforts[1], row + 3)
             store_element(residuals, span * efforts[2], row + 4)
             store_element(residuals, span * efforts[3], row + 5)
-            row += N_RESIDUALS
-    for j in range(N_TERMINAL):
+            if n_step > N_RESIDUALS:
+                changes = _compute_changes(model, ago, efforts)
+                store_element(residuals, span * changes[0], row + 6)
+                store_element(residuals, span * changes[1], row + 7)
+            row += n_step
+    for j in range(len(terminal)):
         value = _multiply_row(terminal, j, model, start.driver, state, beta)
         store_element(residuals, value, row + j)

@@ -17,7 +17,14 @@ import numpy as np
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
-from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
+from ...envs.task import (
+    BETA_SCALE,
+    EFFORT_WEIGHT,
+    GAMMA_SCALE,
+    RATE_TICKS,
+    STEER_SCALE,
+    ZERO_SLIP,
+)
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import make_lag
 from ...envs.vehicle.linear import LinearModel, make_bicycle_model
@@ -27,6 +34,8 @@ DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
 """States that the inputs move; N_z is the delivered fraction of full scale, angles are in rad."""
 _HELD = ("driver", "beta_ref", "gamma_ref")
 """Quantities held constant: the driver's steering in rad and the references."""
+_REMEMBERED = ("N_z before", "N_z commanded before")
+"""Where the moment's rate costs: its fraction a period ago, and the command from then on."""
 _DISTURBANCES: dict[str, tuple[str, ...]] = {
     "none": (),
     "forces": ("F_d", "N_d"),
@@ -47,11 +56,13 @@ class DesignSpec:
     disturbances: str = "none"  # key of `_DISTURBANCES`
     disturbance_time: float = 0.3  # time in which forces decay (s)
     steer_weight: float = 1.0  # factor on the cost of added steering
+    moment_rate: float = 0.0  # s2, weight of the yaw moment's rate
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of all states."""
-        return DYNAMIC + _HELD + _DISTURBANCES[self.disturbances]
+        remembered = _REMEMBERED if self.moment_rate > 0.0 else ()
+        return DYNAMIC + _HELD + _DISTURBANCES[self.disturbances] + remembered
 
     @property
     def cost_weights(self) -> tuple[float, ...]:
@@ -81,6 +92,20 @@ class DesignModel:
     states: tuple[str, ...]  # names
     n_moved: int = len(DYNAMIC)  # states that inputs move; the others move by themselves alone
 
+    @property
+    def order(self) -> list[int]:
+        """Indices of the states, those that inputs move first."""
+        n = len(self.states)
+        d, last = len(DYNAMIC), n - (self.n_moved - len(DYNAMIC))
+        return [*range(d), *range(last, n), *range(d, last)]
+
+    def sort_states(self) -> "DesignModel":
+        """Move the states that inputs move to the front."""
+        order = self.order
+        grid, names = np.ix_(order, order), tuple(f"state {i}" for i in order)
+        matrices = self.G[grid], self.H[order], self.Q[grid], self.R, self.N[order]
+        return DesignModel(*matrices, names, self.n_moved)
+
     def solve(self) -> tuple[Array, Array]:
         """Solve for the regulator u = -K x of least cost, and its cost to go x'Vx.
 
@@ -92,6 +117,10 @@ class DesignModel:
         """
         from scipy.linalg import solve, solve_discrete_are
 
+        if _REMEMBERED[0] in self.states:
+            K, V = self.sort_states().solve()
+            back = np.argsort(self.order)
+            return K[:, back], V[np.ix_(back, back)]
         G, H, Q, R, N, d = self.G, self.H, self.Q, self.R, self.N, self.n_moved
         A, B, W = G[:d, :d], H[:d], G[d:, d:]
         P = solve_discrete_are(A, B, Q[:d, :d], R, s=N[:d])
@@ -124,14 +153,37 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
     W = TICK * np.diag(design_spec.cost_weights)
     step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
     cost_matrix = np.zeros((n + m, n + m))
+    shares = []  # delivered in each tick, by states and inputs
     for _ in range(design_spec.period):
         transition = np.vstack([np.hstack([G, H]), np.hstack([np.zeros((m, n)), np.eye(m)])])
         cost_outputs = np.hstack([C, D]) @ transition
         cost_matrix += cost_outputs.T @ W @ cost_outputs
+        shares.append(cost_outputs[2])
         G, H = np.split(step @ transition, [n], axis=1)
+    if design_spec.moment_rate > 0.0:
+        cost_matrix += _compute_rate_cost(vehicle, design_spec, np.array(shares))
+        G[-2:], H[-2:] = np.eye(n)[[2, n - 1]], 0.0
+        G[-1], H[-1, 0] = 0.0, 1.0
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
     Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
-    return DesignModel(G, H, Q, R, N, design_spec.states)
+    moved = len(DYNAMIC) + (len(_REMEMBERED) if design_spec.moment_rate > 0.0 else 0)
+    return DesignModel(G, H, Q, R, N, design_spec.states, moved)
+
+
+def _compute_rate_cost(vehicle: Vehicle, design_spec: DesignSpec, shares: Array) -> Array:
+    """Compute the cost (n + m, n + m) of the moment's rate from a period's shares (period, n + m).
+
+    A rate is taken over `RATE_TICKS`, in shorter periods over one of them.
+    """
+    ticks, width = shares.shape
+    lag, span = make_lag(vehicle.motor_lag, TICK), min(ticks, RATE_TICKS)
+    rest = lag.mean * lag.end ** np.arange(ticks)
+    before = np.zeros((ticks, width))
+    first = len(design_spec.states) - len(_REMEMBERED)
+    before[:, first], before[:, first + 1] = rest, 1.0 - rest
+    changes = shares - np.vstack([before, shares])[ticks - span : 2 * ticks - span]
+    weight = design_spec.moment_rate * TICK / (span * TICK) ** 2
+    return np.asarray(weight * changes.T @ changes)
 
 
 def make_tick_model(
@@ -166,9 +218,9 @@ def make_tick_model(
     for i in range(m):
         H[2 + i, i], D[2 + i, i] = 1.0 - lags[i].end, 1.0 - lags[i].mean
     if design_spec.disturbances != "none":
-        G[:2, 7:] = push
+        G[:2, 7:9] = push
         if design_spec.disturbances == "forces":
-            G[7:, 7:] *= math.exp(-TICK / design_spec.disturbance_time)
+            G[7:9, 7:9] *= math.exp(-TICK / design_spec.disturbance_time)
     C[:2], D[:2] = G[:2], H[:2]
     C[0, 5], C[1, 6] = -1.0, -1.0
     return G, H, C, D
@@ -283,14 +335,14 @@ def make_gain_table(
         K, V = model.solve()
         # in one period another input costs (u + K x)'S(u + K x) more
         gains.append(np.hstack([K, model.R + model.H.T @ V @ model.H]))
-        terminal.append(_factor_cost(V))
+        terminal.append(_factor_cost(V, model.order, model.n_moved))
     tables = (np.array(parts).reshape(*shape, *parts[0].shape) for parts in (gains, terminal))
     return GainTables(*tables)
 
 
-def _factor_cost(V: Array) -> Array:
+def _factor_cost(V: Array, order: Sequence[int], d: int) -> Array:
     """Factor V: T (d, n) with |T x|^2 = x'Vx but for the states that no input moves."""
-    d = len(DYNAMIC)
+    V = V[np.ix_(order, order)]  # those that inputs move first
     P = V[:d, :d] + 1e-9 * np.diag(np.diag(V)[:d]) + 1e-15 * np.eye(d)  # without lag: singular
     L = np.linalg.cholesky(P)
-    return np.hstack([L.T, np.linalg.solve(L, V[:d, d:])])
+    return np.hstack([L.T, np.linalg.solve(L, V[:d, d:])])[:, np.argsort(order)]

@@ -24,6 +24,7 @@ from ...agents.baselines import (
 from ...agents.learned.policy import is_policy, load_policy
 from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
+from ...envs.scenarios.world import make_world
 from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import short_repr
@@ -243,12 +244,15 @@ class ControlCase(NamedTuple):
                 sensors = gym.spec(self.task.env_id).kwargs["sensors"]
                 options = options | {"slow": list(SENSOR_SETS[sensors])}
             if name in (FILTER, TYRE_FILTER):
-                levels = make_noise_options(make_scenario(self.env_options["scenario"]))
+                world = make_world(self.env_options.get("world", "ideal"))
+                scenario = make_scenario(self.env_options["scenario"])
+                levels = make_noise_options(scenario, world, name == TYRE_FILTER)
                 # where nothing pushes, the filter's own level
                 levels = {key: x for key, x in levels.items() if key not in _PUSHES or x > 0.0}
                 is_tuned = name == FILTER or agent == ADAPTIVE.get(estimator)
                 options = levels | (self.options["filter"] if is_tuned else {}) | options
                 unused = set() if "gps" in options["slow"] else {"hdop_table"}
+                unused |= set() if "camera" in options["slow"] else {"camera_yaw_sd"}
                 if "accel_y" not in options.get("fast", ()):
                     unused |= {"accel_y_noise", "accel_bias_sd"}
                 options = {key: value for key, value in options.items() if key not in unused}

@@ -9,15 +9,26 @@ import numpy.typing as npt
 from ..numerics.jit import jit
 from ..numerics.packed import read
 from ..numerics.primitives import Matrix, Vector
-from ..record import Array, Record
+from ..record import FAST, FAST_WIDTH, Array, Record
 from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK, count_ticks
 from ..vehicle.dynamics import compute_gravity, compute_sideslip_angle
 from ..vehicle.parameters import Vehicle
+from ..vehicle.tyres import MAGIC_FORMULA, fit_fiala
 from .config import EpisodeConfig
 from .layout import FLAGS, P, Z
+
+
+class CarTruth(NamedTuple):
+    """What an oracle is told of an episode's constants."""
+
+    vehicle: Vehicle  # the true one
+    fiala: Vehicle  # likewise, with Fiala's law fitted to tyres of the Magic Formula
+    motor_left: float  # torque over the commanded one, of the left motor
+    motor_right: float
+    calibration: Array  # offset and scale of each fast column, (2, FAST_WIDTH)
 
 
 class Episode(NamedTuple):
@@ -54,6 +65,20 @@ class Episode(NamedTuple):
             rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
             friction=0.5 * (car.mu + car.mu_r),
         )
+
+    @property
+    def car_truth(self) -> CarTruth:
+        """What an oracle is told; a calibrated reading is (reading - offset) / scale."""
+        car, errors, vehicle = read(self.params, P.car), read(self.params, P.errors), self.vehicle
+        calibration = np.array([[0.0], [1.0]]).repeat(FAST_WIDTH, axis=1)
+        if not car.m > 0.0:  # not reset yet
+            return CarTruth(vehicle, vehicle, 1.0, 1.0, calibration)
+        angles, wheels = [FAST.steer, FAST.steer_command], [FAST.wheel_left, FAST.wheel_right]
+        calibration[:, angles] = [[errors.steer_offset], [errors.steer_scale]]
+        calibration[1, wheels] = errors.wheel_left, errors.wheel_right
+        calibration[1, [FAST.torque_left, FAST.torque_right]] = 1.0 / car.k_l, 1.0 / car.k_r
+        fiala = fit_fiala(vehicle) if self.switches[FLAGS.law] == MAGIC_FORMULA else vehicle
+        return CarTruth(vehicle, fiala, float(car.k_l), float(car.k_r), calibration)
 
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:

@@ -12,7 +12,7 @@ from ...envs.vehicle.parameters import VehicleSource
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
-from ..wrappers.truth import choose_vehicle, set_stiffness
+from ..wrappers.truth import calibrate, choose_vehicle, set_stiffness
 from .make import build_batch
 from .records import BatchedEnv, Mask, Observations, VectorObservation
 
@@ -136,6 +136,7 @@ class EstimateObservation(VectorObservation):
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
+        self._calibration = np.ones((env.num_envs, 2, FAST_WIDTH))
         specs = self._make_specs(range(env.num_envs))
         self._first_vehicle, source = specs[0].vehicle, self._arguments.estimator
         self.estimator = build_batch(source, specs, self._records.dt, self._arguments.options)
@@ -169,8 +170,10 @@ class EstimateObservation(VectorObservation):
         """Make the specs of some rows' estimators."""
         specs = self._records.make_specs(rows)
         if self._arguments.is_told_truth:
-            cars = self._get_true_vehicles(rows)
-            return [spec._replace(vehicle=car) for spec, car in zip(specs, cars, strict=True)]
+            truths = self._get_truths(rows)
+            self._calibration[rows] = [item.calibration for item in truths]
+            pairs = zip(specs, truths, strict=True)
+            return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
         if self._arguments.vehicle is None:
             return specs
         return [spec._replace(vehicle=self._arguments.vehicle) for spec in specs]
@@ -219,6 +222,9 @@ class EstimateObservation(VectorObservation):
         truth: Any = (beta, gamma) if has_truth else (np.zeros(N), np.zeros(N))
         summary, inner = np.zeros((N, 3)), np.ascontiguousarray(obs, np.float32)
         observed = Observed(inner, self._outputs.table, truth[0], truth[1], out, summary)
+        if self._arguments.is_told_truth:
+            fast = calibrate(records.fast, self._calibration[:, None])
+            records = records._replace(fast=fast)
         self.estimator.take(mask, records, observed)
         for key, index in self._outputs.keys:
             if index == NEES and not has_truth:

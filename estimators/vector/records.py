@@ -13,6 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ...envs.engine.views import CarTruth
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.task import ObservationEntry, make_space
@@ -199,11 +200,11 @@ class VectorObservation(
         env.set_state(snapshot["env"])
         self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
 
-    def _get_true_vehicles(self, rows: Sequence[int]) -> list[Vehicle]:
-        """Return the true vehicles of some rows; TypeError where they are out of reach."""
+    def _get_truths(self, rows: Sequence[int]) -> list[CarTruth]:
+        """Return what is told of some rows' episodes; TypeError where it is out of reach."""
         base: Any = self.unwrapped
         if isinstance(base, SyncVectorEnv):
-            return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
-        if not hasattr(base, "vehicle"):
+            return [base.envs[i].unwrapped.car_truth for i in rows]  # type: ignore[attr-defined]
+        if not hasattr(base, "car_truth"):
             raise TypeError(f"{type(base).__name__} does not offer which vehicles its rows drive")
-        return [base.vehicle[i] for i in rows]
+        return [base.car_truth[i] for i in rows]

@@ -6,7 +6,14 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_states
+from ..wrappers.truth import (
+    STIFFNESSES,
+    calibrate,
+    find_readings,
+    make_truth_entries,
+    read_parameters,
+    read_states,
+)
 from ..wrappers.truth import TruthObservation as Single
 from .records import Mask, Observations, VectorObservation
 
@@ -45,16 +52,22 @@ class TruthObservation(VectorObservation):
         if self._same_step and states:
             raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
         self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
+        self._places, self._columns = find_readings(env.layout)
+        shape = env.num_envs, 2, len(self._columns)
+        self._calibration: Observations = np.ones(shape, np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
 
     def _begin(self, mask: Mask) -> None:
         rows = np.flatnonzero(mask)
-        for i, car in zip(rows, self._get_true_vehicles(rows.tolist()), strict=True):
-            self._values[i] = [getattr(car, name) for name in self._parameters]
+        for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
+            self._values[i] = read_parameters(truth, self._parameters)
+            self._calibration[i] = truth.calibration[:, self._columns]
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
         for i in np.flatnonzero(ended):
-            infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
+            final = np.concatenate([infos["final_obs"][i], self._values[i]])
+            final[self._places] = calibrate(final[self._places], self._calibration[i])
+            infos["final_obs"][i] = final
 
     def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
         parts = [obs, self._values]
@@ -67,11 +80,14 @@ class TruthObservation(VectorObservation):
             else:
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
             parts.append(read_states(true_states, self._states))
-        return np.hstack(parts)
+        appended: Observations = np.hstack(parts)
+        appended[:, self._places] = calibrate(appended[:, self._places], self._calibration)
+        return appended
 
     def get_state(self) -> dict[str, Any]:
         """Return a snapshot for `set_state`; TypeError where the env makes none."""
-        return super().get_state() | {"values": self._values.copy()}
+        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
+        return super().get_state() | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -81,3 +97,4 @@ class TruthObservation(VectorObservation):
         """
         super().set_state(snapshot)
         self._values = snapshot["values"].copy()
+        self._calibration = snapshot["calibration"].copy()

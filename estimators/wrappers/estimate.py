@@ -32,7 +32,7 @@ from .outputs import (
     compile_observe,
     write_outputs,
 )  # fmt: skip
-from .truth import TRUTH, choose_vehicle, set_stiffness
+from .truth import TRUTH, calibrate, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
@@ -249,7 +249,8 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
         vehicle: Vehicle as the estimator believes it to be, a preset or a mapping; None for the
-            env's nominal. "truth" is the true car of each episode, as it is at the reset.
+            env's nominal. "truth" is the true car of each episode, as it is at the reset, and
+            readings are calibrated as in `TruthObservation`; its tyres have Fiala's law.
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
@@ -285,14 +286,15 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         base, arguments, previous = self._base, self._arguments, self._estimator_spec
         spec, car = make_spec(base), arguments.vehicle
         if arguments.is_told_truth:
-            car = base.vehicle
+            truth = base.car_truth
+            car, self._calibration = truth.fiala, truth.calibration
             if previous is not None:
-                car = choose_vehicle(self.estimator, previous.vehicle, base.vehicle)
+                car = choose_vehicle(self.estimator, previous.vehicle, truth.fiala)
         spec = spec if car is None else spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
             self.estimator, self._estimator_spec = self._build_estimator(spec), spec
         if arguments.is_told_truth:
-            set_stiffness(self.estimator, base.vehicle)
+            set_stiffness(self.estimator, truth.fiala)
         return self.estimator
 
     def _build_estimator(self, spec: EstimatorSpec) -> AnyEstimator:
@@ -355,7 +357,10 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
     def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""
         base, estimator, out = self._base, self.estimator, np.empty(len(self.layout), np.float32)
-        record = StepRecord(base.rows, base.ticks_done, base.packets, base.delivered)
+        rows = base.rows
+        if self._arguments.is_told_truth:
+            rows = calibrate(rows, self._calibration)
+        record = StepRecord(rows, base.ticks_done, base.packets, base.delivered)
         truth = info["beta"], info["gamma"]  # for the NEES in info; the filter never reads it
         observed, done = Observed(obs, self.outputs.table, *truth, out, self._summary), 0
         if isinstance(estimator, Estimator) and estimator.compiled:

@@ -2,24 +2,27 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
-from ...envs.engine.views import TRUE_STATE
-from ...envs.record import Array
+from ...envs.engine.views import TRUE_STATE, CarTruth
+from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
 _Floats = npt.NDArray[np.float32]
+Readings = TypeVar("Readings", Array, _Floats)
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
+_MOTORS = {"motor_left": "-", "motor_right": "-"}
 _MAX_PARAMETER = 1e7  # bound of any parameter of a vehicle, SI
 _STATES = {
     "beta": ("rad", math.pi),
@@ -37,7 +40,7 @@ def make_truth_entries(
     """Make the entries of true parameters and states behind those of an observation.
 
     Args:
-        parameters: Parameters of a `Vehicle`, each as `true_<parameter>`.
+        parameters: Parameters of a `Vehicle` or motors of `CarTruth`, each as `true_<parameter>`.
         states: States of a `TrueState`, each as `<state>_hat`.
         inner: Entries of the observation.
 
@@ -48,6 +51,7 @@ def make_truth_entries(
         ValueError: A parameter or state is unknown, or a name would stand twice.
     """
     fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
+    fields |= _MOTORS
     entries = []
     for name in parameters:
         unit = fields.get(name)
@@ -65,6 +69,46 @@ def make_truth_entries(
     if duplicates:
         raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
     return (*inner, *entries)
+
+
+def read_parameters(truth: CarTruth, parameters: Sequence[str]) -> list[float]:
+    """Read parameters of the true car.
+
+    Args:
+        truth: What is told of the episode.
+        parameters: Names of a `Vehicle`'s parameters or of `CarTruth`'s motors.
+
+    Returns:
+        Values in SI units.
+    """
+    return [getattr(truth if name in _MOTORS else truth.vehicle, name) for name in parameters]
+
+
+def find_readings(layout: Sequence[ObservationEntry]) -> tuple[list[int], list[int]]:
+    """Find the entries of an observation that are readings of fast sensors.
+
+    Args:
+        layout: Entries of the observation.
+
+    Returns:
+        Places of these entries, and the fast column of each.
+    """
+    stems = [re.sub(r"_(mean|\d+)$", "", entry.name) for entry in layout]
+    places = [i for i, stem in enumerate(stems) if stem in FAST._fields]
+    return places, [FAST._fields.index(stems[i]) for i in places]
+
+
+def calibrate(readings: Readings, calibration: Readings) -> Readings:
+    """Correct readings by what is told of their sensors.
+
+    Args:
+        readings: Readings, shape (..., k).
+        calibration: Offset and scale of each, shape (2, k), or (N, 2, k) of N cars.
+
+    Returns:
+        True values but for noise, shape (..., k).
+    """
+    return (readings - calibration[..., 0, :]) / calibration[..., 1, :]
 
 
 def read_states(true_state: Array, states: Sequence[str]) -> _Floats:
@@ -119,6 +163,9 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
 class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
+    Readings of steering, wheels and motors lose the constant errors that a `World` draws; the
+    references, by which all are judged, are made from what the env's own sensors read.
+
     No sensor measures these: it makes the oracles with which others are compared
     (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
     whole observation.
@@ -142,6 +189,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         self.layout = make_truth_entries(self._parameters, self._states, inner)
         self.observation_space = make_space(self.layout)
         self._values = np.zeros(len(self._parameters), np.float32)
+        self._places, self._columns = find_readings(inner)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,7 +205,9 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        self._values[:] = [getattr(base.vehicle, name) for name in self._parameters]
+        truth = base.car_truth
+        self._values[:] = read_parameters(truth, self._parameters)
+        self._calibration = truth.calibration[:, self._columns].astype(np.float32)
         return self.observation(obs), info
 
     def observation(self, observation: _Floats) -> _Floats:
@@ -171,11 +221,14 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         """
         base: Any = self.unwrapped
         states = [read_states(base.true_state, self._states)] if self._states else []
-        return np.concatenate([observation, self._values, *states])
+        appended = np.concatenate([observation, self._values, *states])
+        appended[self._places] = calibrate(appended[self._places], self._calibration)
+        return appended
 
     def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the parameters for `set_state`."""
-        return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
+        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
+        return {"env": self.env.get_wrapper_attr("get_state")()} | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -185,3 +238,4 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()
+        self._calibration = snapshot["calibration"].copy()

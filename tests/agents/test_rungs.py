@@ -1,8 +1,10 @@
 """The rungs: what each of them is given, in single and vector alike, and that knowing pays."""
 
 import itertools
+import math
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ from sideslip.envs import COMS
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS, TIERS
 from sideslip.envs.scenarios.scenario import Scenario
+from sideslip.envs.scenarios.world import WORLDS, World
+from sideslip.estimators.vector.estimate import EstimateObservation
 from tests.envs.helpers import bits
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
@@ -84,6 +88,45 @@ def test_levels_are_the_scenarios() -> None:
     levels = make_noise_options(scenario)
     assert levels["force_sd"] == 7.0 and levels["gyro_noise"] == 0.1
     assert levels["hdop_table"] == [(1.0, 1.0), (101.0, 101.0)]
+
+
+def test_levels_of_a_world_are_those_of_its_ranges() -> None:
+    """Uniform within +-a: a / sqrt(3); what has no range has no state; what is known no force."""
+    scenario, v1 = SCENARIOS["car-slalom"], WORLDS["v1"]
+    levels, plain = make_noise_options(scenario, v1), make_noise_options(scenario)
+    assert levels["camera_yaw_sd"] == pytest.approx(v1.camera_yaw[1] / 3**0.5)  # type: ignore[index]
+    assert levels["steer_offset_sd"] == pytest.approx(v1.steer_offset[1] / 3**0.5)  # type: ignore[index]
+    assert levels["bank_sd"] == pytest.approx(math.hypot(0.02, 0.02) / 3**0.5)
+    assert levels.keys() - make_noise_options(scenario, v1, True).keys() == {
+        "force_share",
+        "moment_share",
+    }
+    still = make_noise_options(scenario, World(moment_rate=0.1), True)
+    assert {key: value for key, value in still.items() if value and key in plain} == plain
+    assert {key for key, value in still.items() if not value} == {
+        *("camera_yaw_sd", "steer_offset_sd", "q_psi")
+    }
+
+
+@pytest.mark.parametrize(("name", "most"), [("coms-slalom", 6.0), ("car-slalom", 4.0)])
+def test_in_a_world_nominal_knows_how_wrong_its_slip_may_be(name: str, most: float) -> None:
+    """Nobody drives: the squared error over its variance, in the median of the cars."""
+    car = "coms" if name.startswith("coms") else "passenger-car"
+    env: Any = gym.make_vec(
+        FUSION, num_envs=CARS, scenario=name, vehicle=car, nominal=car, world="v1"
+    )
+    base, found = SCENARIOS[name], []
+    for world in (WORLDS["v1"], WORLDS["ideal"]):
+        options = make_noise_options(base, world) | {"slow": ["camera", "gps"]}
+        wrapped = EstimateObservation(env, "exact-kf", ("beta",), replace=True, options=options)
+        obs, squares, over = wrapped.reset(seed=2**29)[0], [], np.zeros(CARS, bool)
+        while not over.all():
+            obs, _, terminated, truncated, infos = wrapped.step(np.zeros((CARS, 1), np.float32))
+            over |= terminated | truncated
+            square = ((obs[:, 0] - infos["beta"]) / obs[:, 1]) ** 2
+            squares.append(np.where(over, np.nan, square))
+        found.append(np.median(np.nanmean(squares[100:-1], axis=0)))
+    assert found[0] < most < 50.0 < found[1]
 
 
 def test_biases_are_taken_away_for_the_oracle_alone() -> None:

@@ -52,7 +52,7 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
     x = obs[agent._columns].astype(np.float64)
     friction, roll = x[agent.needs.index("true_friction")], x[-3:-1]
     return _prepare_prediction(
-        agent.design, x, friction, roll, 0.0, agent._compute_max_moment(x[None])[0]
+        agent.design, x, friction, roll, 0.0, agent._compute_max_moment(x[None])[0], np.zeros(0)
     )
 
 
@@ -237,7 +237,9 @@ def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
         obs, *_ = env.step(np.zeros(1, np.float32))
     x, motion = obs[agent._columns].astype(np.float64), env.unwrapped.motion
     max_moment = agent._compute_max_moment(x[None])[0]
-    start = _prepare_prediction(agent.design, x, 0.9, np.full(2, np.nan), 0.0, max_moment).start
+    start = _prepare_prediction(
+        agent.design, x, 0.9, np.full(2, np.nan), 0.0, max_moment, np.zeros(0)
+    ).start
     assert abs(motion.phi) > 1e-3
     assert (start.motion.phi, start.motion.phi_dot) == pytest.approx((motion.phi, 0.0), rel=0.02)
 

@@ -100,6 +100,20 @@ def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
     assert not driven.error and np.isfinite(driven.costs).all()
 
 
+def test_in_a_world_a_filter_has_the_levels_of_nominals() -> None:
+    """But where it lacks the sensor, or knows the tyres by itself."""
+    contest = ControlTask(scenario="coms-slalom", changes={"world": "v1"})
+    names = (REFERENCE_FILTER, "exact-kf, gps", "joint")
+    whole, gps, joint = (
+        ControlCase(contest, Entry("lqr", name)).estimate_options["options"] for name in names
+    )
+    assert whole["camera_yaw_sd"] > 0.0 and whole["force_share"] > 0.0
+    assert whole.keys() - gps.keys() == {"camera_yaw_sd"}
+    assert "force_share" not in joint and joint["camera_yaw_sd"] == whole["camera_yaw_sd"]
+    for name in names:
+        Entry("lqr", name).make(contest)
+
+
 def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oracles' numbers are those of the adaptive controllers, which know nearly as much."""
     found = {
