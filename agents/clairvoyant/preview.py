@@ -213,9 +213,10 @@ def _compute_preview(
     set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])
     car, change = read(p, P.car), read(p, P.tyre_change)
     is_changed = nodes >= change.tick
+    factors = (change.front, change.rear, change.friction, change.friction)
     tyres = [
-        np.where(is_changed, factor * stiffness, stiffness)
-        for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
+        np.where(is_changed, factor * number, number)
+        for factor, number in zip(factors, (car.C_f, car.C_r, car.mu, car.mu_r), strict=True)
     ]
     # Weights (s) of the cost rates at every n-th tick, by the trapezoid rule: n / 2 ticks at either
     # end. J sums ticks 1 to the last: the start, which does not count, has half a tick less, and
@@ -229,7 +230,6 @@ def _compute_preview(
         command[nodes],
         *mean_forces.T,
         *tyres,
-        *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
         *set_points.T,
         _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, n).mean(axis=1),
         weights,

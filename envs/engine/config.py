@@ -359,7 +359,7 @@ class EnvConfig:
                 slew=scenario.driver_rate * TICK,
             ),
             path=make_path(scenario.path, vehicle.width),
-            tyre_change=TyreChange(FOREVER, 1.0, 1.0),  # drawn
+            tyre_change=TyreChange(FOREVER, 1.0, 1.0, 1.0),  # drawn
             field_of_view=FieldOfView(scenario.camera_heading, scenario.camera_offset),
             nominal_car=Bicycle(*nominal.lateral),
             errors=IDEAL_SENSORS,

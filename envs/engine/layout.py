@@ -49,11 +49,12 @@ class TaskParams(NamedTuple):
 
 
 class TyreChange(NamedTuple):
-    """Tyres that change in mid-run."""
+    """Tyres and road that change in mid-run."""
 
     tick: Scalar  # at whose start they change
     front: Scalar  # factor on the front cornering stiffness
     rear: Scalar  # factor on the rear cornering stiffness
+    friction: Scalar  # factor on the road's friction
 
 
 class FrictionWave(NamedTuple):

@@ -172,7 +172,7 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
         d = read(scratch, DRAWS)
     write(p, draw_car(d, read(p, P.car)), P.car)
     change_tick = select(d.tyre_change_time > 0.0, round_to_ticks(d.tyre_change_time), FOREVER)
-    write(p, (change_tick, d.front_change, d.rear_change), P.tyre_change)
+    write(p, (change_tick, d.front_change, d.rear_change, d.friction_change), P.tyre_change)
     write_steering(switches[FLAGS.steering], d, p[P.steering_profile[0] :])
     if lead_in > 0.0:
         _write_gentle_steering(p, d.speed)

@@ -139,11 +139,11 @@ class Measurements(NamedTuple):
 
 @inline
 def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) -> CarParams:
-    """Change the car's tyres.
+    """Change the car's tyres and the road's friction.
 
     Args:
         car: Parameters of the car.
-        change: Factors on the stiffnesses, and the tick of the change.
+        change: Factors on stiffnesses and friction, and the tick of the change.
         is_changed: Whether they are changed.
 
     Returns:
@@ -151,8 +151,10 @@ def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) ->
     """
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
-    new_stiffness = (C_f, C_r)
-    return CarParams(*(car[:4] + new_stiffness + car[6:]))  # fields 4 and 5
+    factor = select(is_changed, change.friction, 1.0)
+    tyres, left, right = (C_f, C_r), (car.mu * factor,), (car.mu_r * factor,)
+    # fields 4, 5, 10 and 19
+    return CarParams(*(car[:4] + tyres + car[6:10] + left + car[11:19] + right + car[20:]))
 
 
 @inline
@@ -236,10 +238,13 @@ def _apply_due_change(
 
 
 @inline
-def _apply_friction_wave(params: StepParams, state: StepState, variant: StepVariant) -> StepState:
+def _apply_friction_wave(
+    params: StepParams, state: StepState, tick: Scalar, variant: StepVariant
+) -> StepState:
     """Change the friction under the car to that of its place, held over the tick."""
-    wave, car = params.friction_wave, state.car
+    wave, change, car = params.friction_wave, params.tyre_change, state.car
     factor = 1.0 + wave.share * compute_sine(wave.rate * state.motion.s + wave.phase)
+    factor = factor * select(tick >= change.tick, change.friction, 1.0)
     left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
     car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
     return StepState(
@@ -406,7 +411,7 @@ def integrate_tick(
     """
     state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion
     if variant.has_errors:
-        state = _apply_friction_wave(params, state, variant)
+        state = _apply_friction_wave(params, state, tick, variant)
     if variant.road == NOMINAL_PATH:
         params, nominal_motion = _follow_nominal_path(params, state, tick)
     plant = compute_inputs(params, inputs, state, tick, variant)

@@ -63,7 +63,7 @@ class Episode(NamedTuple):
             relaxation=car.relaxation,
             front_stiffness=car.C_f * (change.front if is_changed else 1.0),
             rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
-            friction=0.5 * (car.mu + car.mu_r),
+            friction=0.5 * (car.mu + car.mu_r) * (change.friction if is_changed else 1.0),
         )
 
     @property
@@ -103,6 +103,7 @@ class TrueState(NamedTuple):
     N_d: int = 3  # N m, with the wind's
     phi: int = 4  # rad
     phi_rate: int = 5  # rad/s
+    friction_factor: int = 6  # by which a `friction_change` has changed friction
 
 
 TRUE_STATE = TrueState()
@@ -137,3 +138,6 @@ def _write_true_states(params: Vector, states: Vector, switches: Matrix, out: Ma
         out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * lateral_gravity
         out[i, TRUE_STATE.N_d] = z[Z.drive.N_d] + N_w
         out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_rate] = motion.phi, motion.phi_dot
+        change = read(p, P.tyre_change)
+        is_changed = z[Z.clock.tick] >= change.tick
+        out[i, TRUE_STATE.friction_factor] = change.friction if is_changed else 1.0

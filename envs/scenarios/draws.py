@@ -78,6 +78,8 @@ class Draws(NamedTuple):
     friction_across: Scalar
     relaxation: Scalar
     phase: Scalar  # uniform in (0, 1): where the waves of a world begin
+    friction_change: Scalar  # factor on the friction from the tyres' change on
+    critical_speed: Scalar  # least critical speed of a drawn car, over its speed
 
 
 DRAWS, DRAWS_WIDTH = make_offsets(Draws)
@@ -122,16 +124,17 @@ def _is_stable(d: Draws, car: CarParams) -> Scalar:
     has_change = d.tyre_change_time > 0.0
     later_f = drawn.C_f * select(has_change, d.front_change, 1.0)
     later_r = drawn.C_r * select(has_change, d.rear_change, 1.0)
-    return _is_below_critical(drawn.C_f, drawn.C_r, d.speed, drawn) & _is_below_critical(
-        later_f, later_r, d.speed, drawn
+    speed = d.critical_speed * d.speed
+    return _is_below_critical(drawn.C_f, drawn.C_r, speed, drawn) & _is_below_critical(
+        later_f, later_r, speed, drawn
     )
 
 
 @jit
 def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: CarParams) -> Scalar:
-    """Check whether 1.05 times a speed (m/s) is below the critical speed of linear tyres."""
+    """Check whether a speed (m/s) is below the critical speed of linear tyres."""
     excess = C_f * car.l_f - C_r * car.l_r
-    l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
+    l, v = car.l_f + car.l_r, speed  # noqa: E741
     return car.m * v * v * excess < 2.0 * C_f * C_r * l * l
 
 

@@ -88,6 +88,12 @@ def _set_amplitude(shape: Fields, low: float, high: float) -> Fields:
     return shape | {"amplitude": (low, high)}
 
 
+def _set_friction(low: float, high: float) -> Fields:
+    """Set the range of friction, whose middle a designer takes for nominal."""
+    nominal = _CAR_PLANT | {"friction": round(0.5 * (low + high), 3)}
+    return {"friction": (low, high), "nominal": nominal}
+
+
 def _make_scenarios(tier: str, common: Fields, **shapes: Fields) -> list[Scenario]:
     """Make a tier's scenarios from their fields by name, written with underscores."""
     scenarios = []
@@ -120,10 +126,9 @@ _TWO_A = _make_scenarios(
     car_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.01, 0.03),
     car_iso_3888_1=_ISO_3888_1 | {"path_speed": (60.0 * KMH, 80.0 * KMH)},
 )
-# the nominal friction is the middle of what may come, as a designer would take it
 _TWO_B = _make_scenarios(
     "2b",
-    _CAR | {"friction": (0.3, 1.0), "nominal": _CAR_PLANT | {"friction": 0.65}},
+    _CAR | _set_friction(0.3, 1.0),
     any_friction_random=_make_random_steering(0.002, 0.006),
     any_friction_slalom=_set_amplitude(_SLALOM, 0.01, 0.025),
     any_friction_step=_set_amplitude(_STEP, 0.008, 0.025),
@@ -133,12 +138,53 @@ _TWO_B = _make_scenarios(
 )
 _TWO_C = _make_scenarios(
     "2c",
-    _CAR | {"friction": (0.6, 1.0), "nominal": _CAR_PLANT | {"friction": 0.8}},
+    _CAR | _set_friction(0.6, 1.0),
     limit_slalom=_set_amplitude(_SLALOM, 0.02, 0.06) | {"speed": (75.0 * KMH, 85.0 * KMH)},
     limit_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.03, 0.08)
     | {"speed": (75.0 * KMH, 85.0 * KMH)},
     limit_step=_set_amplitude(_STEP, 0.02, 0.06),
     limit_random=_make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
+)
+
+# Those of env version 1 ask for stability: without control cars slip by 2 degrees, or are lost.
+_SMALL_CAR = _make_scenarios(
+    "small car",
+    _COMS,
+    small_car_random=_make_random_steering(0.02, 0.04),
+    small_car_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.1, 0.16),
+    small_car_double_lane_change=_DOUBLE_LANE_CHANGE
+    | {"path_speed": (13.0, 16.0), "driver_preview": 1.0, "half_width": 3.0},
+)
+_ROAD = _make_scenarios(
+    "road",
+    _CAR | {"speed": (60.0 * KMH, 90.0 * KMH)} | _set_friction(0.4, 1.0),
+    road_random=_make_random_steering(0.01, 0.02),
+    road_slalom=_set_amplitude(_SLALOM, 0.04, 0.07),
+    road_step=_set_amplitude(_STEP, 0.03, 0.06),
+    road_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.04, 0.07),
+    road_brake_in_turn=_set_amplitude(_BRAKE_IN_TURN, 0.015, 0.03),
+)
+_ATTENTIVE: Fields = {"steering": "driver", "driver_preview": 1.6, "duration": 6.0}
+_LIMIT = _make_scenarios(
+    "limit",
+    _CAR | {"speed": (80.0 * KMH, 110.0 * KMH)} | _set_friction(0.6, 1.0),
+    limit_fmvss_126=_set_amplitude(_SINE_WITH_DWELL, 0.06, 0.12),
+    limit_wet_sine=_set_amplitude(_SINE_WITH_DWELL, 0.04, 0.08)
+    | {"speed": (70.0 * KMH, 90.0 * KMH), "friction": (0.3, 0.6)},
+    limit_iso_3888_2=_DOUBLE_LANE_CHANGE
+    | {"driver_preview": 1.6, "path_speed": (80.0 * KMH, 100.0 * KMH), "half_width": 4.0},
+    # a turn begun on the dry, with a wet patch in it
+    limit_friction_jump=_set_amplitude(_STEP, 0.015, 0.03)
+    | {"duration": 6.0, "onset": (0.4, 0.6), "hold": (4.5, 5.0), "tyre_change_time": (2.0, 3.0)}
+    | {"friction_change": (0.3, 0.6)},
+    limit_friction_split=_ATTENTIVE
+    | {"half_width": 5.0, "friction_right": (0.4, 0.6), "speed_change": -40.0 * KMH}
+    | {"change_start": 1.0, "change_length": 3.0},
+    limit_lift_off=_set_amplitude(_BRAKE_IN_TURN, 0.02, 0.05),
+    # another car hits the rear: what is left is a yaw rate, from which the car recovers or not
+    limit_hit_at_the_rear=_ATTENTIVE
+    | {"half_width": 6.0, "wind_force": (6000.0, 14000.0), "wind_arm": (-1.5, -1.0)}
+    | {"wind_start": (1.0, 2.0), "wind_length": 0.15},
 )
 
 # Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
@@ -153,7 +199,9 @@ _WET_ROAD = _CAR | {
 }  # fmt: skip
 _WET_EVASION = Scenario(name="wet-evasion", duration=6.0, steering="driver", **_WET_ROAD)
 
-TIERS: tuple[Scenario, ...] = (*_ONE, *_TWO_A, *_TWO_B, *_TWO_C, _RECOVERY)
+TIERS: tuple[Scenario, ...] = (
+    *_ONE, *_TWO_A, *_TWO_B, *_TWO_C, *_SMALL_CAR, *_ROAD, *_LIMIT, _RECOVERY
+)  # fmt: skip
 
 
 def _make_stiffness(stiffness: float) -> dict[str, float]:
@@ -301,7 +349,6 @@ _MANOEUVRES = (
              **_GENTLE_RANDOM, **_HARSH),  # uneven-delay, Fig. 5
 )  # fmt: skip
 
-# Easier ones, to begin with.
 _EASY = (
     Scenario(name="straight", **_DRAWN),
     Scenario(name="sine", steering="sine", onset=(0.5, 1.5), amplitude=(0.02, 0.06),

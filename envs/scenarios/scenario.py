@@ -30,7 +30,7 @@ _MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 MIN_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 _MAX_SAMPLES = 1_000_000  # of a trace
 _SIDES = ("side", "wind_side")  # drawn, but no fields
-_TIER_NAMES = ("", "1", "2a", "2b", "2c")
+_TIER_NAMES = ("", "1", "2a", "2b", "2c", "small car", "road", "limit")
 _PARAMETERS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
 
@@ -148,6 +148,7 @@ class Scenario:
     tyre_change_time: Range | None = quantity("s", 1e-12, inf, "None: they never change", None)
     front_change: Range = quantity("-", 0.01, 20, "further factor on the front from then on", 1.0)
     rear_change: Range = quantity("-", 0.01, 20, "further factor on the rear from then on", 1.0)
+    friction_change: Range = quantity("-", 0.01, 20, "further factor on friction from then on", 1.0)
     wind_force: Range = quantity("N", -1e5, 1e5, "force of a side wind", 0.0)
     wind_arm: Range = quantity("m", -10, 10, "its arm ahead of the centre of gravity", 0.0)
     wind_start: Range = quantity("s", -inf, inf, "time at which it begins", 0.0)
@@ -225,7 +226,7 @@ class Scenario:
             (self.driver_lag >= 0.0, f"driver_lag is zero or more, got {self.driver_lag!r}"),
             *((self.tyre_change_time is not None or self.range(name) == (1.0, 1.0),
                f"{name} {getattr(self, name)!r} needs a tyre_change_time, from which it acts")
-              for name in ("front_change", "rear_change")),
+              for name in ("front_change", "rear_change", "friction_change")),
             (steering not in ("ramp", "sweep", "wander") or self.range("hold")[0] >= TICK,
              f"hold of a {steering} is 1 ms or more, got {self.hold!r}"),
             (steering != "sine-with-dwell" or self.range("hold")[0] >= 0.0,

@@ -16,6 +16,8 @@ from ..validation import check_choice, describe_unknown, is_finite, short_repr
 from ..vehicle.tyres import TYRE_LAWS
 from .draws import Range, get_range
 
+WORLD_VERSION = 1
+"""Version of plant, sensors and world "v1": what was measured in another is measured anew."""
 GROUPS = (
     "camera", "steering", "wheels and motors", "inertial", "GPS and map", "load", "road", "tyres",
 )  # fmt: skip
@@ -71,6 +73,7 @@ class World:
     friction_across: Range = _draw("road", "-", (0.1, 5), 1.0, "right over left")
     relaxation: Range = _draw("tyres", "-", (0, 5), 1.0, "factor on relaxation lengths")
     tyres: str = ""  # tyre law; "": the scenario's
+    critical_speed: float = 1.05  # of a drawn car over its speed, at least; others are drawn anew
     moment_rate: float = 0.0  # s2, weight of the yaw moment's rate in the cost
 
     def __post_init__(self) -> None:

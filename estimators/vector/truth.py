@@ -10,6 +10,7 @@ from ..wrappers.truth import (
     STIFFNESSES,
     calibrate,
     find_readings,
+    follow_friction,
     make_truth_entries,
     read_parameters,
     read_states,
@@ -79,6 +80,7 @@ class TruthObservation(VectorObservation):
                 true_states = np.asarray(base.true_state)
             else:
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+            parts = [obs, follow_friction(self._values, self._parameters, true_states)]
             parts.append(read_states(true_states, self._states))
         appended: Observations = np.hstack(parts)
         appended[:, self._places] = calibrate(appended[:, self._places], self._calibration)

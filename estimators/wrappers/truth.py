@@ -31,6 +31,7 @@ _STATES = {
     "N_d": ("N m", _MAX_PARAMETER),
     "phi": ("rad", math.pi),
     "phi_rate": ("rad/s", 100.0),
+    "friction_factor": ("-", 100.0),
 }
 
 
@@ -127,6 +128,24 @@ def read_states(true_state: Array, states: Sequence[str]) -> _Floats:
     return values.astype(np.float32)
 
 
+def follow_friction(values: _Floats, parameters: Sequence[str], true_state: Array) -> _Floats:
+    """Multiply `friction` by what has changed since the reset, which belongs to the state.
+
+    Args:
+        values: Parameters at the reset, shape (..., len(parameters)).
+        parameters: Their names.
+        true_state: States, shape (..., len(TrueState)).
+
+    Returns:
+        Parameters now, of the same shape.
+    """
+    present = values.copy()
+    if "friction" in parameters:
+        factor = true_state[..., TRUE_STATE.friction_factor]
+        present[..., parameters.index("friction")] *= factor.astype(np.float32)
+    return present
+
+
 def choose_vehicle(
     estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle
 ) -> Vehicle:
@@ -162,6 +181,8 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
 
 class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
+
+    Beside states `true_friction` is the present one.
 
     Readings of steering, wheels and motors lose the constant errors that a `World` draws; the
     references, by which all are judged, are made from what the env's own sensors read.
@@ -220,8 +241,12 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
             Observation of the wrapper, float32, shape (len(layout),).
         """
         base: Any = self.unwrapped
-        states = [read_states(base.true_state, self._states)] if self._states else []
-        appended = np.concatenate([observation, self._values, *states])
+        values, states = self._values, list[_Floats]()
+        if self._states:
+            true_state = base.true_state
+            values = follow_friction(values, self._parameters, true_state)
+            states.append(read_states(true_state, self._states))
+        appended = np.concatenate([observation, values, *states])
         appended[self._places] = calibrate(appended[self._places], self._calibration)
         return appended
 

@@ -1,5 +1,6 @@
 """Short cuts that several of these tests share."""
 
+import re
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -17,8 +18,10 @@ IDS = tuple(
         for name in gymnasium.registry
         if name.startswith("sideslip/")
         and name not in ("sideslip/Highway-v0", "sideslip/Outside-v0")  # which need extras
+        and name.endswith("-v0")
     )
 )
+V1 = tuple(sorted(name for name in gymnasium.registry if re.fullmatch("sideslip/.*-v1", name)))
 
 SILENT: dict[str, float] = dict.fromkeys(Noise._fields, 0.0)
 """Sensors without noise."""

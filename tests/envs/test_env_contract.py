@@ -14,9 +14,9 @@ from gymnasium.utils.env_checker import check_env
 
 from sideslip.envs import FAILURES, StabilityEnv
 
-from .helpers import IDS, bits, play, unwrapped
+from .helpers import IDS, V1, bits, play, unwrapped
 
-pytestmark = [pytest.mark.plain, pytest.mark.parametrize("name", IDS)]
+pytestmark = [pytest.mark.plain, pytest.mark.parametrize("name", IDS + V1)]
 COMPILED = pytest.mark.compiled
 
 NUMBERS = ("t", "beta", "gamma", "psi", "beta_ref", "gamma_ref", "steer", "yaw_moment", "cost")
@@ -25,16 +25,18 @@ INFO: dict[str, type] = dict.fromkeys(NUMBERS, float) | {"failure": int, "is_suc
 
 @pytest.mark.smoke
 def test_gymnasiums_checker_is_content(name: str) -> None:
+    env = gymnasium.make(name).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make(name).unwrapped)
+        check_env(env)
 
 
 def test_stable_baselines_checker_is_content(name: str) -> None:
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = gymnasium.make(name).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        checker.check_env(gymnasium.make(name).unwrapped)
+        checker.check_env(env)
 
 
 @pytest.mark.smoke

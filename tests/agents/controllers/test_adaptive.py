@@ -17,7 +17,7 @@ from sideslip.envs import make_scenario
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as Vector
 
-STEERED = ControlTask("2a", STEERING, "passenger-car", "lagged", "car-slalom")
+STEERED = ControlTask("", STEERING, "passenger-car", "lagged", "car-slalom")
 
 
 def env_of(cars: int | None = None, friction: float = 0.3) -> Any:

@@ -32,6 +32,7 @@ pytestmark = pytest.mark.plain
 DRAWN = Draws(*[0.0] * DRAWS_WIDTH)._replace(speed=25.0 / 3.6, onset=0.5, hold=1.5, side=1.0)
 DRAWN = DRAWN._replace(amplitude=0.1, amplitude_2=0.03, front_stiffness=1.0, rear_stiffness=1.0)
 DRAWN = DRAWN._replace(frequency=0.4, frequency_2=0.5, frequency_3=0.2, frequency_4=0.8)
+DRAWN = DRAWN._replace(critical_speed=1.05)
 
 
 def steering(kind: str, seconds: float = 10.0, **changes: float) -> np.ndarray:

@@ -1,25 +1,29 @@
 """A world's errors: each does what it is named after, and nothing else changes."""
 
 import dataclasses
+import importlib
 import json
 import math
+import warnings
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 
+import sideslip
 from sideslip.envs import StabilityEnv
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.scenarios.draws import Draws
+from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.scenarios.world import GROUPS, IDEAL, WORLDS, World, make_world
 from sideslip.envs.sensors.errors import CAMERA_HEIGHT
 from sideslip.envs.task import RATE_TICKS
-from sideslip.envs.vehicle.parameters import GRAVITY, PASSENGER_CAR
+from sideslip.envs.vehicle.parameters import GRAVITY, PASSENGER_CAR, critical_speed
 from sideslip.estimators import EstimateObservation
 
 from ..batches import drive, pair, same
-from ..helpers import FULL, Moment, fast_rows, packets, play
+from ..helpers import FULL, V1, Moment, fast_rows, packets, play
 
 SWERVING: dict[str, Any] = {"steering": "sine", "amplitude": 0.03, "frequency": 0.4}
 QUIET: dict[str, Any] = {"duration": 3.0, "speed": 15.0, "half_width": 1e3} | SWERVING
@@ -53,7 +57,8 @@ def test_a_world_without_errors_is_the_ideal_one(scenario: Any) -> None:
 
 
 def test_a_world_draws_what_draws_have() -> None:
-    assert set(NAMES) - {"tyres", "moment_rate"} == {*Draws._fields[-len(NAMES) + 1 :]} - {"phase"}
+    drawn = set(Draws._fields) - set(Scenario.__dataclass_fields__) - {"side", "wind_side", "phase"}
+    assert set(NAMES) - {"tyres", "moment_rate"} == drawn
 
 
 TIME = 1e-3 * np.arange(1, len(ROWS) + 1)
@@ -328,7 +333,7 @@ def test_rows_of_a_batch_have_a_single_cars_bits(mode: str) -> None:
 def test_groups_are_scaled_about_the_ideal() -> None:
     world = WORLDS["v1"]
     assert set(GROUPS) == {
-        World.__dataclass_fields__[name].metadata["group"] for name in NAMES[:-2]
+        World.__dataclass_fields__[name].metadata["group"] for name in NAMES[:-3]
     }
     doubled = world.scale("camera", 2.0)
     assert doubled.camera_yaw == pytest.approx(2.0 * np.array(world.camera_yaw))
@@ -336,7 +341,7 @@ def test_groups_are_scaled_about_the_ideal() -> None:
     assert world.scale("steering", 2.0).steer_scale == pytest.approx((0.94, 1.06))
     for group in GROUPS:
         world = world.scale(group, 0.0)
-    assert dataclasses.replace(world, tyres="", moment_rate=0.0) == IDEAL
+    assert dataclasses.replace(world, tyres="", moment_rate=0.0, critical_speed=1.05) == IDEAL
 
 
 def test_a_world_goes_through_a_spec() -> None:
@@ -386,3 +391,54 @@ def test_what_is_no_world_is_refused(world: Any, error: type[Exception], message
 def test_what_is_no_lead_in_is_refused(told: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         StabilityEnv("fusion", **told)
+
+
+@pytest.mark.parametrize("world", ["ideal", {"friction_wave": 0.1}])
+def test_friction_that_changes_is_that_of_another_road_from_then_on(world: Any) -> None:
+    """Nearly from the start it is another road's; before its time nothing has changed."""
+    turn = {"base": "limit-slalom", "mirror": False, "friction": 0.8, "amplitude": 0.05}
+    changes = turn | {"tyre_change_time": 0.001, "friction_change": 0.5}
+    later = turn | {"tyre_change_time": 2.0, "friction_change": 0.5}
+    ends = {}
+    for name, scenario in (("dry", turn), ("wet", turn | {"friction": 0.4}), ("changes", changes),
+                           ("later", later)):  # fmt: skip
+        env: Any = StabilityEnv("fusion", scenario=scenario, vehicle="passenger-car", world=world)
+        env.reset(seed=4)
+        slips = [env.step(np.zeros(1, np.float32))[4]["beta"] for _ in range(250)]
+        ends[name] = np.array(slips), env.vehicle.friction
+    assert ends["changes"][0] == pytest.approx(ends["wet"][0], abs=2e-4)
+    assert np.abs(ends["dry"][0] - ends["wet"][0]).max() > 0.02
+    assert (ends["later"][0][:199] == ends["dry"][0][:199]).all()
+    assert np.abs(ends["later"][0] - ends["dry"][0]).max() > 1e-3
+    assert ends["changes"][1] == pytest.approx(0.4) == ends["later"][1]
+
+
+def test_no_car_of_the_world_is_near_its_critical_speed() -> None:
+    """Others are drawn anew: a driver would lose them on a straight road."""
+    told: dict[str, Any] = {
+        "scenario": "any-friction-step",
+        "vehicle": "passenger-car",
+        "world": "v1",
+    }
+    env: Any = StabilityEnv("fusion", **told)
+    for seed in range(64):
+        env.reset(seed=seed)
+        assert critical_speed(env.vehicle) > 1.5 * env.motion.v_x
+
+
+@pytest.mark.parametrize("name", V1)
+def test_version_1_of_an_id_is_version_0_in_the_world_v1(name: str) -> None:
+    """And version 0 is used without a word: it is the papers' world."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        importlib.reload(sideslip)  # its filter comes first again
+        older = gymnasium.make(name.replace("-v1", "-v0"), world="v1")
+    assert not [each for each in caught if "out of date" in str(each.message)]
+    newer = gymnasium.make(name)
+    for env in (older, newer):
+        env.reset(seed=3)
+    action = np.full(older.action_space.shape or (), 0.3, np.float32)
+    for _ in range(40):
+        one, other = older.step(action), newer.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[1] == other[1]

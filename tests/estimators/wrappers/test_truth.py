@@ -157,3 +157,21 @@ def test_given_the_truth_the_filter_knows_its_error() -> None:
         means.append(np.mean(nees[100:]))
     error = np.std(means, ddof=1) / len(means) ** 0.5
     assert abs(np.mean(means) - 1.0) < 3.0 * error < 0.3
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_beside_states_the_friction_is_the_present_one(num_envs: int | None) -> None:
+    """Without states it is the one at the reset: a change is no parameter."""
+    jump = {"base": "limit-friction-jump", "tyre_change_time": 0.2, "friction_change": 0.5}
+    told: Any = {"scenario": jump, "vehicle": "passenger-car"}
+    env: Any = gym.make(FUSION, **told)
+    wrapper: Any = TruthObservation
+    if num_envs:
+        env, wrapper = gym.make_vec(FUSION, num_envs=num_envs, **told), VectorTruthObservation
+    for states, factor in (((), 1.0), (("beta",), 0.5)):
+        wrapped = wrapper(env, ("friction",), states)
+        column = [entry.name for entry in wrapped.layout].index("true_friction")
+        first = np.atleast_2d(wrapped.reset(seed=3)[0])[:, column]
+        idle = np.zeros(wrapped.action_space.shape or (1,), np.float32)
+        seen = np.array([np.atleast_2d(wrapped.step(idle)[0])[:, column] for _ in range(40)])
+        assert (seen[:18] == first).all() and seen[-1] == pytest.approx(factor * first)
