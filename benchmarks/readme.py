@@ -1,9 +1,9 @@
 """The tables of results in README.md and docs/benchmark.md, made from the rows of runs.
 
 `sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme rows.json`
-writes the tiers' rows to docs/control.json and the table of docs/benchmark.md. With --add NAME, a
-policy that came after the run drives its seeds. With --first, README's few entries drive the
-contests with steering; their rows go to docs/first.json and make README's table.
+writes the tiers' rows to docs/control.json and the table of docs/benchmark.md. With --first,
+README's few entries drive the contests with steering; their rows go to docs/first.json and make
+README's table. Rows of env version 0 have its tiers.
 """
 
 import math
@@ -15,16 +15,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from .. import __version__
 from .control.entries import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .control.run import Results, measure
-from .control.score import make_score_scales, rank_entries
+from .control.score import rank_entries
 from .control.tasks import (
     NOMINAL,
     PARAMETERS,
     STATE,
     STEERING,
-    ControlTask,
     list_scored_tasks,
     make_salt,
     make_task_seeds,
@@ -35,7 +33,9 @@ from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
 PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
 METRICS = ("cost_vs_nominal", "failure_rate")
-HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"}
+HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"} | {
+    "small car": "18-28 km/h", "road": "60-90 km/h", "limit": "70-110 km/h"
+}  # fmt: skip
 _ON_JOINT = (
     *("distill-car-steering", "distill-car-yaw", "ppo-coms-yaw", "ppo-coms-steering"),
     *("distill-coms-yaw", "distill-coms-steering"),
@@ -97,7 +97,7 @@ def _measure_first(
     seeds = make_task_seeds(salt, EPISODES)
     results = measure(cases, seeds, jobs=jobs, console=console, title="README")
     _check_driven(results)
-    return _make_tier_rows(results, tasks, salt)
+    return _make_tier_rows(results, salt)
 
 
 def _check_driven(results: Results) -> None:
@@ -107,26 +107,29 @@ def _check_driven(results: Results) -> None:
             raise ValueError(f"{entry.label} in {task.name}: {result.error}")
 
 
-def _make_tier_rows(
-    results: Results, tasks: Sequence[ControlTask], salt: str, controller: str = ""
-) -> list[ResultRow]:
-    """Cost and failures in each tier of a controller's entries, "" for all."""
-    rows: list[ResultRow] = []
+def _make_tier_rows(results: Results, salt: str) -> list[ResultRow]:
+    """Cost and failures in each tier."""
+    suite = Suite("control", "", "")
     for tier in HEADS:
-        scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
-        for standing in rank_entries(results, tier, scales):
-            if controller in ("", standing.entry.agent):
-                suite = Suite("control", "", "")
-                standing.add_rows(suite, salt)
-                metric_rows = (row for row in suite.rows if row.metric in METRICS)
-                rows += [row for row in metric_rows if row.scenario == f"tier {tier}"]
-    return rows
+        for standing in rank_entries(results, tier):
+            standing.add_rows(suite, salt)
+    return _select_tier_rows(suite.rows)
 
 
 def _read_tier_rows(path: str | Path) -> list[ResultRow]:
     """Read the tiers' rows of which the table is made; raises what `read_json` does."""
+    return _select_tier_rows(read_json(path))
+
+
+def _select_tier_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     tiers = {f"tier {tier}" for tier in HEADS}
-    return [row for row in read_json(path) if row.metric in METRICS and row.scenario in tiers]
+    return [row for row in rows if row.metric in METRICS and row.scenario in tiers]
+
+
+def _list_tiers(rows: Sequence[ResultRow]) -> list[str]:
+    """List the tiers that rows have."""
+    known = {row.scenario for row in rows}
+    return [tier for tier in HEADS if f"tier {tier}" in known]
 
 
 def make_table(rows: Sequence[ResultRow]) -> str:
@@ -139,10 +142,10 @@ def make_table(rows: Sequence[ResultRow]) -> str:
         Markdown.
     """
     by_key = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
-    lines = []
+    lines, tiers = [], _list_tiers(rows)
     for name, key in _SHOWN.items():
         cells = []
-        for tier in HEADS:
+        for tier in tiers:
             cost, failing = (by_key.get((f"tier {tier}", *key, metric)) for metric in METRICS)
             if cost is None or failing is None:
                 cells.append("")
@@ -151,26 +154,26 @@ def make_table(rows: Sequence[ResultRow]) -> str:
             text = f"{100.0 * cost.value:.0f}{'' if key[0] == NOMINAL else interval}"
             cells.append(f"{text} ({100.0 * failing.value:.0f})")
         lines.append([name, *cells])
-    return _format_table(lines)
+    return _format_table(lines, tiers)
 
 
-def _format_table(lines: Sequence[Sequence[str]]) -> str:
+def _format_table(lines: Sequence[Sequence[str]], tiers: Sequence[str]) -> str:
     """A table with a column for each tier, as Markdown."""
-    heads = " | ".join(f"{tier}: {text}" for tier, text in HEADS.items())
+    heads = " | ".join(f"{tier}: {HEADS[tier]}" for tier in tiers)
     body = (f"| {' | '.join(line)} |" for line in lines)
-    return "\n".join([f"| | {heads} |", "|---" * (1 + len(HEADS)) + "|", *body])
+    return "\n".join([f"| | {heads} |", "|---" * (1 + len(tiers)) + "|", *body])
 
 
 def _make_first_table(rows: Sequence[ResultRow]) -> str:
     """Make README's table: cost in % of nominal's, the best of the first tier's columns first."""
     cost_rows = [row for row in rows if row.metric == METRICS[0]]
     by_key = {(row.scenario, row.controller, row.estimator): row.value for row in cost_rows}
-    lines = []
+    lines, tiers = [], _list_tiers(rows)
     for name, entries in FIRST.items():
-        costs = [[by_key.get((f"tier {tier}", *pair)) for pair in entries] for tier in HEADS]
+        costs = [[by_key.get((f"tier {tier}", *pair)) for pair in entries] for tier in tiers]
         first = (next((x for x in tier_costs if x is not None), None) for tier_costs in costs)
         lines.append([name, *("" if x is None else f"{100.0 * x:.0f}" for x in first)])
-    return _format_table(lines)
+    return _format_table(lines, tiers)
 
 
 def _make_headlines(root: Path) -> list[str]:
@@ -199,44 +202,14 @@ def _make_headlines(root: Path) -> list[str]:
 
 def _replace_table(text: str, new_table: str) -> str:
     """Replace the table of a page."""
-    pattern = re.compile(r"^\| \| 1: [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
+    pattern = re.compile(r"^\| \| (1|small car): [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
         raise ValueError("the page has no table that begins with the tiers, or several")
     return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def _add_policy(
-    rows: Sequence[ResultRow], name: str, jobs: int | None = None, console: Console | None = None
-) -> list[ResultRow]:
-    """Add the rows of a learned policy in its class's contests, on the rows' own seeds.
-
-    Its contests' reference points are driven anew.
-    """
-    known_entries = [(kind, entry) for kind, entries in LEARNED.items() for entry in entries]
-    policies = {kind: entry for kind, entry in known_entries if entry.agent == name}
-    if not policies:
-        known = ", ".join(entry.agent for _, entry in known_entries)
-        raise ValueError(f"the matrix's policies are {known}, got {name!r}")
-    tier_1 = [row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1")]
-    versions = {row.env_version for row in tier_1}
-    if versions != {__version__}:
-        got = ", ".join(versions) or "none"
-        raise ValueError(f"expected rows of {STATE} in tier 1, of version {__version__}, got {got}")
-    count = sum(task.tier == "1" for task in list_scored_tasks())
-    episodes = -(-tier_1[0].n // count)  # n: of those that the rungs survived
-    tasks = [task for task in list_scored_tasks() if task.tier and task.kind in policies]
-    cases = [(task, Entry(oracle)) for task in tasks for oracle in (NOMINAL, STATE)]
-    cases += [(task, policies[task.kind]) for task in tasks]
-    seeds = make_task_seeds(tier_1[0].salt, episodes)
-    results = measure(cases, seeds, jobs=jobs, console=console, title=name)
-    _check_driven(results)
-    merged = [row for row in rows if row.controller != name]
-    return merged + _make_tier_rows(results, tasks, tier_1[0].salt, name)
-
-
 def _main(
     rows: Annotated[Path | None, typer.Argument(help="Of sideslip bench control --json.")] = None,
-    add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
     first: Annotated[bool, typer.Option("--first", help="Drive README's entries.")] = False,
     salt: Annotated[str, typer.Option(help="Of the seeds of --first, hexadecimal.")] = "",
 ) -> None:
@@ -247,8 +220,6 @@ def _main(
         _write(FIRST_ROWS, result_rows, README, _make_first_table(result_rows))
     if rows is not None:
         result_rows = _read_tier_rows(rows)
-        for name in add or []:
-            result_rows = _add_policy(result_rows, name, console=console)
         _write(ROWS, result_rows, PAGE, make_table(result_rows))
 
 

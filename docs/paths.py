@@ -60,7 +60,7 @@ PATHS = {
              "drives entry.make(task, n) in processes: n seeds at once, step by step",
              "DriveResult of each case: metrics, shape (seeds, len(NUMBERS))"),
         Step("benchmarks/control/score.py", "rank_entries",
-             "pairs costs by episode, and ranks by failures or score"),
+             "pairs drives with nominal's, and ranks by score"),
     ),
 }  # fmt: skip
 """Steps by the picture's name."""

@@ -27,7 +27,9 @@ _ENVIRONMENTS = {
 def _list_environments() -> dict[str, str]:
     """List the package's ids with their slow sensors."""
     ids = [name for name in gym.registry if name.startswith("sideslip/")]
-    return {name: _ENVIRONMENTS[name.rpartition("/")[2].partition("-v")[0]] for name in ids}
+    texts = {name: _ENVIRONMENTS[name.rpartition("/")[2].partition("-v")[0]] for name in ids}
+    errs = "; car and sensors err"
+    return {name: text + errs * name.endswith("-v1") for name, text in texts.items()}
 
 
 def check_env(env_id: str) -> None:

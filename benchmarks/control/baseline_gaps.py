@@ -1,33 +1,34 @@
-"""The gaps between the baselines: what delay costs them, and which tasks they make worth scoring.
+"""What tasks demand of a car, which decides what is scored, and what delay costs the baselines.
 
-Nominal knows the data sheet, oracle-parameters the true car, friction and biases, oracle-state the
-state and the disturbances too. Tasks (contests in the tables) are scored where these lie apart on
-tuning seeds: `python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates
-and writes the file.
+Tasks (contests in the tables) are scored where a car without control slips or is lost, never by
+who gains: `python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates on
+tuning seeds and writes the file.
 """
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ... import __version__
+from ...envs.scenarios.world import WORLD_VERSION
 from ..harness.results import write_text
 from ..harness.stats import Estimate, geometric_mean
 from .entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .run import Results, measure
-from .score import ScoreScale, compute_log_ratios
+from .score import PairedDrives, compute_log_ratios
+from .tables import compute_gaps
 from .tasks import (
     FILE,
     LIMIT,
     NOMINAL,
     ORACLES,
     PARAMETERS,
+    QUICK_LEAD_IN,
     STATE,
     YAW,
     ControlTask,
@@ -39,7 +40,7 @@ from .tasks import (
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
 # s between the frames of a late camera: 0.3 s late, 7 are in flight of `link.MAX_IN_FLIGHT`
 _FRAME_PERIOD = 0.05
-DELAY_TASK = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
+DELAY_TASK = ControlTask("small car", YAW, "coms", "zero-slip", "small-car-random")
 _FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
 DELAY_ENTRIES = (
     *(Entry(name) for name in (NOMINAL, ORACLES[PARAMETERS][0], ORACLES[STATE][0])),
@@ -76,97 +77,92 @@ def measure_delay_cost(
     return costs, late
 
 
-EPISODES = 64
-_GAP = 0.3  # a scored task's mean of log(J_nominal / J_oracle) is above it: 26 % of the cost
-_MIN_LOW = 0.2  # and the lower limit of its 95 % interval above this one
-# of the episodes: nominal fails in less of a scored task's (but for the tiers `LIMIT`), and an
-# oracle that fails in more is worse than one that does not
-_FAILING = 0.1
-_BASELINES = tuple(map(Entry, (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])))
+EPISODES = 32
+MIN_PEAK = 2.0  # deg, median peak of the slip angle without control; below it nobody needs help
+MIN_LOST = 0.3  # of the cars without control, at the limit
+MAX_SHARE = 0.5  # of these, that the best baseline may lose: what nobody saves separates nobody
+_NUMBERS = ("peak_slip", "lost", "lost_nominal", "lost_oracle", "slip_gap", "yaw_rate_gap")
+_NONE, _NOMINAL = Entry("none"), Entry(NOMINAL)
+_BASELINES = (_NONE, _NOMINAL, *map(Entry, (*ORACLES[PARAMETERS], *ORACLES[STATE])))
 
 
-def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
-    """Measure a candidate with the better oracle of each kind.
+def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
+    """Measure what a candidate demands; what could not be driven is in its verdict.
 
-    That one fails in at most `_FAILING` of the episodes, and among those it has the larger gap. A
-    baseline that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
+    Args:
+        results: Episodes of `none`, nominal and all oracles.
+        task: Candidate.
+
+    Returns:
+        Entry of the file.
     """
-    nominal = results[task, Entry(NOMINAL)]
-    errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
-    failing = 1.0 if nominal.error else float(np.mean(~nominal.survived))
-    parameter_oracle, _ = _select_oracle(results, task, PARAMETERS)
-    state_oracle, oracle_errors = _select_oracle(results, task, STATE)
-    gap, n_compared = state_oracle.gap, state_oracle.n_compared
-    is_unknown = bool(nominal.error) or len(oracle_errors) == len(ORACLES[STATE])
-    verdict = _describe_verdict(task, gap, failing, n_compared)
-    facts: dict[str, Any] = {**task.record, "env_version": __version__}
-    facts["oracle"] = state_oracle.name
-    facts |= {"knowing": parameter_oracle.name, "judged": n_compared, "n": len(nominal.costs)}
-    numbers = zip(("gap", "low", "high", "failing"), (*gap, failing), strict=True)
-    facts |= {key: round(number, 4) for key, number in numbers}
-    facts["verdict"] = "; ".join(errors + oracle_errors) if is_unknown else verdict
-    return TaskMeasurement(**facts)
+    none, nominal = results[task, _NONE], results[task, _NOMINAL]
+    errors = [f"{x}: {results[task, x].error}" for x in (_NONE, _NOMINAL) if results[task, x].error]
+    best = dict[str, str]()
+    for kind, candidates in ORACLES.items():
+        driven = [name for name in candidates if not results[task, Entry(name)].error]
+        if not driven:
+            errors.append(f"{candidates[0]}: {results[task, Entry(candidates[0])].error}")
+        best[kind] = candidates[0]
+        if driven and not errors:
+            drives = (results[task, Entry(name)] for name in driven)
+            pairs = [PairedDrives(nominal, drive, task.cost_floor) for drive in drives]
+            best[kind] = driven[int(np.argmax([pair.compute_scores().mean() for pair in pairs]))]
+    facts: dict[str, Any] = {**task.record, "world_version": WORLD_VERSION}
+    facts |= {"oracle": best[STATE], "knowing": best[PARAMETERS], "n": len(nominal.costs)}
+    if errors:
+        facts |= dict.fromkeys(_NUMBERS, 0.0)
+        return TaskMeasurement(**facts, verdict="; ".join(errors))
+    state = results[task, Entry(best[STATE])]
+    slip, yaw = compute_gaps(PairedDrives(nominal, state, task.cost_floor), task)
+    numbers = {"peak_slip": float(np.degrees(np.median(none["peak_slip"])))}
+    for name, result in (("lost", none), ("lost_nominal", nominal), ("lost_oracle", state)):
+        numbers[name] = float(np.mean(~result.survived))
+    numbers |= {"slip_gap": slip, "yaw_rate_gap": yaw}
+    facts |= {name: round(float(np.nan_to_num(x)), 4) for name, x in numbers.items()}
+    references = (nominal, *(results[task, Entry(name)] for name in best.values()))
+    lost_by_best = min(float(np.mean(~result.survived)) for result in references)
+    verdict = _describe_verdict(task.tier, numbers["peak_slip"], numbers["lost"], lost_by_best)
+    return TaskMeasurement(**facts, verdict=verdict)
 
 
-class _OracleCandidate(NamedTuple):
-    """A candidate for an oracle; of several the smallest tuple is the best."""
-
-    often_fails: bool  # in more than `_FAILING` of the episodes
-    minus_gap: float
-    name: str
-    gap: Estimate  # mean of log(J_nominal / J) over the compared episodes
-    n_compared: int  # episodes that nominal and the candidate survive
-
-
-def _select_oracle(
-    results: Results, task: ControlTask, oracle_kind: str
-) -> tuple[_OracleCandidate, list[str]]:
-    """Select the better candidate for an oracle; return also what went wrong."""
-    nominal, candidates, errors = results[task, Entry(NOMINAL)], list[_OracleCandidate](), []
-    for name in ORACLES[oracle_kind]:
-        oracle = results[task, Entry(name)]
-        if oracle.error:
-            errors.append(f"{name}: {oracle.error}")
-        elif not nominal.error:
-            log_ratios = ScoreScale(nominal, oracle).compute_paired_ratios(oracle)[1]
-            gap, failing = Estimate(0.0, 0.0, 0.0), float(np.mean(~oracle.survived))
-            if len(log_ratios) > 1:
-                gap = Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
-            rank = failing > _FAILING, -gap.value
-            candidates.append(_OracleCandidate(*rank, name, gap, len(log_ratios)))
-    undriven = _OracleCandidate(True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
-    return min(candidates, default=undriven), errors
-
-
-def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compared: int) -> str:
-    if n_compared < 2:
-        return "no episode that nominal and oracle-state survive"
-    if failing >= _FAILING and task.tier not in LIMIT:
-        return f"nominal fails in {100.0 * failing:.0f} %"
-    if not (gap.value > _GAP and gap.low > _MIN_LOW):
-        return f"too little to win: {gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]"
+def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) -> str:
+    """Describe whether a candidate demands enough, and whether a baseline meets the demand."""
+    if tier != LIMIT:
+        return (
+            "scored" if peak > MIN_PEAK else f"the slip angle peaks at {peak:.1f} deg uncontrolled"
+        )
+    if lost < MIN_LOST:
+        return f"{100.0 * lost:.0f} % of the cars are lost uncontrolled"
+    if lost_by_best > MAX_SHARE * lost:
+        return f"the best baseline loses {100.0 * lost_by_best:.0f} % of the cars"
     return "scored"
 
 
-def main(write: bool = False, episodes: int = EPISODES, jobs: int | None = None) -> None:
-    """Measure which tasks are scored: where the baselines lie apart, on tuning seeds.
+def main(
+    write: bool = False,
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    keep: Path | None = None,
+) -> None:
+    """Measure which tasks are scored: what they demand of a car, on tuning seeds.
 
     Args:
         write: Whether the package's file is replaced.
         episodes: Tuning seeds a task, at least 2.
         jobs: Processes; None: one a processor.
+        keep: Folder in which finished cases stay, so that a stopped run goes on.
     """
     console = Console()
-    candidates = list_candidates()
+    short = {"lead_in": QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
+    candidates = [replace(task, changes=short) for task in list_candidates()]
     cases = [(task, entry) for task in candidates for entry in _BASELINES]
-    results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console)
-    measurements = [_measure_task(results, task) for task in candidates]
-    columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
-    table = Table(*columns)
+    results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console, keep=keep)
+    measurements = [measure_task(results, task) for task in candidates]
+    table = Table("contest", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
     for m in measurements:
-        gap = f"{m.gap:.2f} [{m.low:.2f}, {m.high:.2f}]"
-        failing = f"{100.0 * m.failing:.1f}"
-        table.add_row(m.tier, m.task.name, m.knowing, m.oracle, gap, failing, m.verdict)
+        lost = (f"{100.0 * share:.0f}" for share in (m.lost, m.lost_nominal, m.lost_oracle))
+        table.add_row(m.task.name, f"{m.peak_slip:.1f}", ", ".join(lost), m.verdict)
     console.print(table)
     if write:
         write_text(FILE, json.dumps([asdict(m) for m in measurements], indent=1) + "\n")

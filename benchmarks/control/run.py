@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from ...agents.env_info import list_configs
 from ...agents.learned.policy import hash_policy
 from ...agents.rollout import EpisodeStep, iterate_steps
 from ...envs.numerics.kernel_cache import hash_experiment
@@ -98,21 +99,23 @@ class _MetricAccumulator:
         self.full_scale = np.array([car.yaw_moment_limit, car.steering_authority])
         self.full_scale[self.width :] = 0.0
         self.dt = base.control_period * TICK
+        self.lead_in = list_configs(base)[0].lead_in  # s; what happens before is not measured
         self.base, self.radius = base, car.wheel_radius
         self.last, self.last_command = reset.info, np.zeros((base.num_envs, 2))
         self.heading_error, self.lateral_deviation = np.zeros((2, base.num_envs))  # rad, m
         self.steps, self.totals = np.zeros(base.num_envs), np.zeros((len(EPISODE), base.num_envs))
 
     def add(self, step: EpisodeStep) -> None:
+        judged = step.running & (np.asarray(step.info["t"]) > self.lead_in + 0.5 * TICK)
         command = np.zeros_like(self.last_command)
         shares = parse_actions(step.action, len(command), self.width, fail=True)
         command[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
         info, speed = step.info, self.base.motion[:, Motion._fields.index("v_x")]
         # heading error (rad): int (gamma - gamma_ref) dt; course error e (rad): that plus beta -
         # beta_ref; lateral deviation (m): int v_x e dt, for small angles
-        self.heading_error += (info["gamma"] - info["gamma_ref"]) * self.dt
+        self.heading_error += judged * (info["gamma"] - info["gamma_ref"]) * self.dt
         course_error = self.heading_error + info["beta"] - info["beta_ref"]
-        self.lateral_deviation += speed * course_error * self.dt
+        self.lateral_deviation += judged * speed * course_error * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
         base, commands = self.base, (command, self.last_command)
@@ -122,14 +125,16 @@ class _MetricAccumulator:
         sample = StepSample(*commands, step.reward, *infos, *scales, *motion)
         for metric, total in zip(EPISODE, self.totals, strict=True):
             added = REDUCTIONS[metric.reduction].add(total, metric.compute(sample))
-            np.copyto(total, added, where=step.running)
-        self.steps += step.running
+            is_counted = step.running if metric.name in ("cost", "failure") else judged
+            np.copyto(total, added, where=is_counted)
+        self.steps += judged
         self.last, self.last_command = step.info, command
 
     def numbers(self) -> Array:
         """Metrics of all episodes, shape (cars, NUMBERS)."""
         reductions = [REDUCTIONS[metric.reduction] for metric in EPISODE]
-        values = [r.finish(t, self.steps) for r, t in zip(reductions, self.totals, strict=True)]
+        steps = np.maximum(self.steps, 1.0)  # a car may be lost before anything is measured
+        values = [r.finish(t, steps) for r, t in zip(reductions, self.totals, strict=True)]
         return np.stack(values, axis=1)
 
 

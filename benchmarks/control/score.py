@@ -1,8 +1,9 @@
-"""From episode costs to scores: 0 is `nominal`, 1 is `oracle-state`, everything paired by episode.
+"""From episode costs to scores, each drive paired with nominal's on the same seed.
 
-r = log((J_nominal + 0.001) / (J + 0.001)), clipped to +-3, over the episodes that both baselines
-survive; a failure there counts log(1 / 20). The score is the sum over tasks of the mean r over
-that of the oracle's: a ratio of sums, so that no small gap decides. Standings become rows here.
+r = log((J_nominal + J_0) / (J + J_0)) where both finish; a drive that the entry alone loses counts
+-2, one that nominal alone loses 2, one that both lose 0. J_0 is `ControlTask.cost_floor`. The score
+is the mean r; entries that surely lose more cars than nominal stand below all others. Standings
+become rows here.
 """
 
 import math
@@ -24,31 +25,29 @@ from ..harness.stats import (
     compute_win_rate,
     geometric_mean,
     interval,
-    ratio_of_sums,
+    is_share_larger,
     share,
 )
 from .entries import ControlCase, Entry
 from .run import DriveResult, Results
-from .tasks import NOMINAL, STATE, ControlTask
+from .tasks import NOMINAL, ControlTask
 
-MIN_GAP = 0.05  # mean r of the oracle, below which there is nothing to win
+LOSS = 2.0  # r of a drive that nominal alone loses, and less it where the entry alone does
 _CLIP = 3.0
-FAILURE_RATIO = 20.0  # times nominal's cost, of an episode that ends by a failure
+FAILURE_RATIO = 20.0  # times nominal's cost, of a failure in `compute_log_ratios`
 _RATES = {"spin": "spin_rate", "off-road": "departure_rate", "not-finite": "not_finite_rate"}
 _RATES |= {"bad-action": "bad_action_rate"}
-_OFTEN = 0.1  # nominal's failure rate above which failures rank
-_Pair = tuple[Array, Array]  # r of an entry and of the oracle on the episodes that count
 
 
 def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
-    """Compute r of the first n episodes.
+    """Compute log(J_nominal / J) of the first n episodes, clipped to +-3, log(1 / 20) if failed.
 
     Args:
         nominal: Costs of nominal on the same seeds, shape (n,).
         result: Episodes of at least as many seeds.
 
     Returns:
-        Values of r, shape (n,).
+        Logarithms, shape (n,).
     """
     n = len(nominal)
     with np.errstate(invalid="ignore"):
@@ -57,86 +56,52 @@ def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
 
 
 @dataclass(frozen=True)
-class ScoreScale:
-    """The scale of scores in a task: the episodes of `nominal`, 0, and of `oracle-state`, 1.
+class PairedDrives:
+    """Drives of an entry and of nominal on the same seeds of a task.
 
-    Raises ValueError with the reason where one of them was not driven.
+    Attributes:
+        nominal: Drives of nominal.
+        result: Drives of the entry; of both the first n count, as many as either has.
+        floor: Cost J_0 of the task.
     """
 
     nominal: DriveResult
-    oracle: DriveResult
+    result: DriveResult
+    floor: float
 
-    def __post_init__(self) -> None:
-        for name, baseline in ((NOMINAL, self.nominal), (STATE, self.oracle)):
-            if baseline.error:
-                raise ValueError(f"{name}: {baseline.error}")
+    @cached_property
+    def n(self) -> int:
+        """Drives that count."""
+        return min(len(self.nominal.costs), len(self.result.costs))
 
-    def mark_compared(self, n: int) -> npt.NDArray[np.bool_]:
-        """Mark the episodes that both survive.
+    @cached_property
+    def costs(self) -> Array:
+        """Costs of the entry and of nominal, shape (2, n)."""
+        return np.array([drive.costs[: self.n] for drive in (self.result, self.nominal)])
+
+    @cached_property
+    def finished(self) -> npt.NDArray[np.bool_]:
+        """Whether the entry, and whether nominal, finishes each drive, shape (2, n)."""
+        return np.array([drive.survived[: self.n] for drive in (self.result, self.nominal)])
+
+    @cached_property
+    def both(self) -> npt.NDArray[np.bool_]:
+        """Whether both finish each drive, shape (n,)."""
+        return np.asarray(self.finished.all(axis=0))
+
+    def compute_scores(self, loss: float = LOSS, floor_factor: float = 1.0) -> Array:
+        """Compute r of each drive.
 
         Args:
-            n: Maximum of episodes.
+            loss: r of a drive that nominal alone loses.
+            floor_factor: Factor on J_0.
 
         Returns:
-            Whether both survive each, shape (m,).
+            Scores, shape (n,).
         """
-        n = min(n, len(self.nominal.costs), len(self.oracle.costs))
-        return self.nominal.survived[:n] & self.oracle.survived[:n]
-
-    def compute_paired_ratios(self, result: DriveResult) -> tuple[Array, Array]:
-        """Compute r of an entry and of the oracle on the episodes that count.
-
-        Args:
-            result: Episodes of the entry.
-
-        Returns:
-            r of both, shape (n,) each.
-        """
-        compared = self.mark_compared(len(result.costs))
-        nominal = self.nominal.costs[: len(compared)]
-        r, oracle_ratios = (compute_log_ratios(nominal, x)[compared] for x in (result, self.oracle))
-        return r, oracle_ratios
-
-    @property
-    def gap(self) -> float:
-        """The oracle's mean r; NaN where no episode counts."""
-        _, oracle_ratios = self.compute_paired_ratios(self.oracle)
-        return float(oracle_ratios.mean()) if len(oracle_ratios) else math.nan
-
-
-def make_score_scales(
-    results: Results, tasks: Sequence[ControlTask]
-) -> dict[ControlTask, ScoreScale]:
-    """Make the scale of scores of each task in which both baselines were driven.
-
-    Args:
-        results: Episodes.
-        tasks: Tasks to make scales for.
-
-    Returns:
-        Scales by task.
-    """
-    ends = {task: (results[task, Entry(NOMINAL)], results[task, Entry(STATE)]) for task in tasks}
-    return {
-        task: ScoreScale(nominal, oracle)
-        for task, (nominal, oracle) in ends.items()
-        if not (nominal.error or oracle.error)
-    }
-
-
-def score(pairs: Sequence[_Pair]) -> Estimate:
-    """Compute the score.
-
-    Args:
-        pairs: Result of `compute_paired_ratios` in each task.
-
-    Returns:
-        Score; NaN without a gap to be won.
-    """
-    filled = [pair for pair in pairs if len(pair[0])]
-    if not filled or np.mean([oracle_ratios.mean() for _, oracle_ratios in filled]) < MIN_GAP:
-        return Estimate(math.nan)
-    return ratio_of_sums([r for r, _ in filled], [oracle_ratios for _, oracle_ratios in filled])
+        costs, nominal = self.costs + floor_factor * self.floor
+        losses = loss * (self.finished[0].astype(np.float64) - self.finished[1])
+        return np.asarray(np.where(self.both, np.log(nominal / costs), losses))
 
 
 @dataclass
@@ -146,7 +111,7 @@ class Standing:
     tier: str  # tier, "" for all
     entry: Entry
     results: dict[ControlTask, DriveResult]  # of all its tasks, errors too
-    scales: Mapping[ControlTask, ScoreScale]  # scales of the tier's tasks
+    nominal: Mapping[ControlTask, DriveResult]  # nominal's drives, where it could drive
     us: float = math.nan  # time of a decision (us)
 
     @property
@@ -160,11 +125,18 @@ class Standing:
         return {task: result for task, result in self.results.items() if not result.error}
 
     @cached_property
-    def pairs(self) -> dict[ControlTask, _Pair]:
-        """r of the entry and of the oracle on the episodes that count, where any do."""
-        scaled = [(task, run) for task, run in self.drives.items() if task in self.scales]
-        paired = {task: self.scales[task].compute_paired_ratios(run) for task, run in scaled}
-        return {task: pair for task, pair in paired.items() if len(pair[0])}
+    def pairs(self) -> dict[ControlTask, PairedDrives]:
+        """Drives beside nominal's, where there are any."""
+        return {
+            task: PairedDrives(self.nominal[task], result, task.cost_floor)
+            for task, result in self.drives.items()
+            if task in self.nominal
+        }
+
+    @cached_property
+    def scores(self) -> dict[ControlTask, Array]:
+        """r of each drive by task."""
+        return {task: pair.compute_scores() for task, pair in self.pairs.items()}
 
     @cached_property
     def by_task(self) -> dict[ControlTask, dict[str, Estimate]]:
@@ -176,33 +148,18 @@ class Standing:
         """Metrics over all tasks; failures of all episodes, NaN where none was driven."""
         all_failed = [~result.survived for result in self.drives.values()]
         failed = np.concatenate(all_failed) if all_failed else np.empty(0)
-        metrics = {"failure_rate": share(failed)}
-        if self.pairs:
-            metrics["cost_vs_nominal"] = geometric_mean(*(-r for r, _ in self.pairs.values()))
-            metrics["score"] = score(list(self.pairs.values()))
-            compared = zip(*map(self._select_compared, self.pairs), strict=True)
-            metrics["share_won"] = compute_win_rate(*map(np.concatenate, compared))
-            costs = np.concatenate([self.drives[task].costs for task in self.pairs])
-            metrics["worst_cost"] = compute_tail_mean(costs)
-        return metrics
+        return {"failure_rate": share(failed)} | _measure_pairs(list(self.pairs.values()))
+
+    @cached_property
+    def loses_more(self) -> bool:
+        """Whether it surely loses more cars than nominal, over all its tasks."""
+        return check_losses(list(self.pairs.values()))
 
     @property
-    def rank(self) -> tuple[float, float]:
-        """Key of the order: smaller is better; what has no number comes last.
-
-        Failures rank in a tier in which nominal fails in more than 10 %.
-        """
-        failing = [1.0 - scale.nominal.survived.mean() for scale in self.scales.values()]
-        by_failures = bool(failing) and float(np.mean(failing)) > _OFTEN
-        failed = self.overall["failure_rate"].value if by_failures else 0.0
+    def rank(self) -> tuple[bool, float]:
+        """Key of the order: smaller is better; what has no number comes last."""
         value = self.overall.get("score", Estimate(math.nan)).value
-        return tuple(np.nan_to_num([failed, -value], nan=np.inf).tolist())
-
-    @property
-    def excluded(self) -> int:
-        """Episodes of the compared ones that nominal or the oracle did not survive."""
-        marks = (self.scales[c].mark_compared(len(self.drives[c].costs)) for c in self.pairs)
-        return sum(map(len, marks)) - self.n
+        return self.loses_more, float(np.nan_to_num(-value, nan=np.inf))
 
     @property
     def control_period(self) -> float:
@@ -211,8 +168,8 @@ class Standing:
 
     @property
     def n(self) -> int:
-        """Episodes that count."""
-        return sum(len(r) for r, _ in self.pairs.values())
+        """Drives that count."""
+        return sum(pair.n for pair in self.pairs.values())
 
     def mean(self, name: str) -> float:
         """Average a metric over all tasks in which it means something.
@@ -229,22 +186,11 @@ class Standing:
         means = [run[name].mean() for run in counted]
         return float(np.mean(means)) if means else math.nan
 
-    def _select_compared(self, task: ControlTask) -> tuple[Array, Array]:
-        """Costs of the entry and of nominal on the episodes that count, shape (n,) each."""
-        costs, scale = self.drives[task].costs, self.scales[task]
-        mask = scale.mark_compared(len(costs))
-        return costs[: len(mask)][mask], scale.nominal.costs[: len(mask)][mask]
-
     def _measure_task(self, task: ControlTask) -> dict[str, Estimate]:
         result = self.drives[task]
         metrics = {"failure_rate": share(~result.survived)}
-        metrics["worst_cost"] = compute_tail_mean(result.costs)
         if task in self.pairs:
-            r, oracle_ratios = self.pairs[task]
-            metrics["cost_vs_nominal"] = geometric_mean(-r)
-            metrics["score"] = score([(r, oracle_ratios)])
-            metrics["gap"] = average(oracle_ratios)
-            metrics["share_won"] = compute_win_rate(*self._select_compared(task))
+            metrics |= _measure_pairs([self.pairs[task]])
         for metric in EPISODE:
             if metric.name != "failure":
                 metrics[metric.name] = interval(result[metric.name])
@@ -269,15 +215,41 @@ class Standing:
         suite.add_rows([{"us_per_decision": self.us}], **labels)
 
 
-def rank_entries(
-    results: Results, tier: str | None, scales: Mapping[ControlTask, ScoreScale]
-) -> list[Standing]:
-    """Rank the entries of a tier, by failures or by score.
+def check_losses(pairs: Sequence[PairedDrives]) -> bool:
+    """Check whether an entry surely loses more cars than nominal, paired.
+
+    Args:
+        pairs: Drives of its tasks.
+
+    Returns:
+        Whether it stands below the line.
+    """
+    if not pairs:
+        return False
+    finished = np.concatenate([pair.finished for pair in pairs], axis=1)
+    return is_share_larger(*~finished)
+
+
+def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
+    """Score, and costs of the drives that both finish, over tasks of equal weight."""
+    if not pairs:
+        return {}
+    metrics = {"score": average(*(pair.compute_scores() for pair in pairs))}
+    costs = [pair.costs[:, pair.both] for pair in pairs if pair.both.any()]
+    if costs:
+        logs = [np.log(compute_cost_ratios(*both)) for both in costs]
+        metrics["cost_vs_nominal"] = geometric_mean(*logs)
+        metrics["share_won"] = compute_win_rate(*np.concatenate(costs, axis=1))
+    metrics["worst_cost"] = compute_tail_mean(np.concatenate([pair.costs[0] for pair in pairs]))
+    return metrics
+
+
+def rank_entries(results: Results, tier: str | None) -> list[Standing]:
+    """Rank the entries of a tier: those that surely lose more cars than nominal come last.
 
     Args:
         results: Episodes.
         tier: Tier, None for all.
-        scales: Scales by task.
 
     Returns:
         Standings, the best first.
@@ -286,5 +258,7 @@ def rank_entries(
     for (task, entry), result in results.items():
         if tier in (None, task.tier):
             by_entry.setdefault(entry, {})[task] = result
-    ranked = [Standing(tier or "", entry, drives, scales) for entry, drives in by_entry.items()]
+    driven = by_entry.get(Entry(NOMINAL), {}).items()
+    nominal = {task: result for task, result in driven if not result.error}
+    ranked = [Standing(tier or "", entry, drives, nominal) for entry, drives in by_entry.items()]
     return sorted(ranked, key=lambda standing: standing.rank)

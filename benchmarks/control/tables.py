@@ -1,5 +1,6 @@
 """What a run of the matrix measured, as tables: standings, baselines, and what went wrong."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,10 +13,10 @@ from ...envs.record import Array
 from ...envs.task import FAILURES
 from ..harness.metrics import EPISODE
 from ..harness.results import Column, Line, ResultTable
-from ..harness.stats import Estimate, average, compute_p_value, geometric_mean, holm
+from ..harness.stats import Estimate, average, compute_p_value, holm
 from .entries import LEARNED, ORACLE_NAMES, Entry
 from .run import Results
-from .score import MIN_GAP, ScoreScale, Standing, make_score_scales
+from .score import PairedDrives, Standing, rank_entries
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask, find_oracle
 
 _CAR_OUTCOMES = ("none", "spin", "off-road")  # how an episode ends by the car's own motion
@@ -52,9 +53,9 @@ class Matrix:
         return {case: drive.series for case, drive in drives if drive.series is not None}
 
     @cached_property
-    def scales(self) -> dict[ControlTask, ScoreScale]:
-        """Scales of scores by task."""
-        return make_score_scales(self.results, self.tasks)
+    def overall(self) -> list[Standing]:
+        """Standings over all tiers, the best first."""
+        return rank_entries(self.results, None)
 
     @cached_property
     def foresight(self) -> dict[ControlTask, Array]:
@@ -65,14 +66,13 @@ class Matrix:
 _LABEL = Column("label", "controller and estimator")
 _MAIN = (
     _LABEL,
+    Column("score", form=".2f"),
     Column("failure_rate", "fails / %", 100.0, ".1f"),
     Column("cost_vs_nominal", "cost / nominal's, %", 100.0, ".1f"),
-    Column("score", form=".2f"),
     Column("share_won", "won / %", 100.0, ".0f", interval=False),
     Column("worst_cost", "worst 5 %", form=".3g", interval=False),
     Column("contests", form="{:.0f} of {:.0f}"),
     Column("n", "episodes"),
-    Column("excluded", "left out"),
     Column("us", "us a decision", form=".0f"),
 )
 _SHOWN = [metric for metric in EPISODE if metric.heading]
@@ -83,12 +83,14 @@ _MOTION = (
 )
 _BASELINES = (
     "contest",
-    Column("fails", "nominal fails / %", 100.0, ".1f"),
+    Column("peak", "none: peak slip / deg", form=".1f"),
+    Column("lost", "lost: none, nominal, oracle / %", form="{:.0f}, {:.0f}, {:.0f}"),
     "oracle-state is",
-    Column("gap", "its gap", form=".2f"),
-    Column("parameters", "oracle-parameters", form=".2f"),
+    Column("slip", "slip gap / deg", form=".2f"),
+    Column("yaw", "yaw rate gap / (deg/s)", form=".2f"),
+    Column("parameters", "r of oracle-parameters", form=".2f"),
+    Column("state", "of oracle-state", form=".2f"),
     Column("foresight", "clairvoyant beyond", form=".2f"),
-    Column("episodes", form="{:.0f} of {:.0f}"),
     "falls",
 )
 _KNOWLEDGE = (
@@ -98,10 +100,11 @@ _KNOWLEDGE = (
     Column("foresight", "what is ahead (foresight)", form=".2f"),
 )
 _MAIN_NOTE = (
-    "won: share of the compared episodes that cost less than nominal's. worst 5 %: their mean "
-    "cost. contests: with an episode that counts. left out: episodes that nominal or oracle-state "
-    "did not survive. A decision is the estimator's step and the controller's, of one car."
+    "score: mean r, 0 as nominal. cost, won: of the drives that nominal finishes too. worst 5 %: "
+    "their mean cost. contests: driven, with nominal. A decision is the estimator's step and the "
+    "controller's, of one car."
 )
+_LINE = "surely lose more cars than nominal:"
 _MOTION_NOTE = (
     "Yaw error and path where the reference turns. motors: mechanical work of both. effort: "
     "mean square share of the full yaw moment. Steps: the largest of what is asked between "
@@ -140,12 +143,14 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
 
 def _make_main_table(title: str, ranked: Sequence[Standing], *notes: str) -> ResultTable:
     """Make the table of the entries, the best first."""
-    lines = [
-        {"label": standing.label, "n": standing.n, "excluded": standing.excluded}
-        | {"contests": (len(standing.pairs), len(standing.results)), "us": standing.us}
+    lines: list[Line] = [
+        {"label": standing.label, "n": standing.n, "us": standing.us}
+        | {"contests": (len(standing.pairs), len(standing.results))}
         | standing.overall
         for standing in ranked
     ]
+    if below := sum(standing.loses_more for standing in ranked):
+        lines.insert(len(lines) - below, {"label": _LINE})
     note = " ".join([_MAIN_NOTE, *_describe_findings(ranked), *notes])
     return ResultTable(title, _MAIN, lines, note)
 
@@ -164,7 +169,7 @@ def _describe_policies() -> list[str]:
 def make_task_table(
     title: str, ranked: Sequence[Standing], tasks: Sequence[ControlTask]
 ) -> ResultTable:
-    """Make the table of the cost over nominal's (%), every entry in every task.
+    """Make the table of the scores, every entry in every task.
 
     Args:
         title: Title of the table.
@@ -174,32 +179,26 @@ def make_task_table(
     Returns:
         Table.
     """
-    columns = (_LABEL, *(Column(task.name, scale=100.0, form="{:.0f} ({:.0f})") for task in tasks))
+    columns = (_LABEL, *(Column(task.name, form="{:.2f} ({:.0f})") for task in tasks))
     lines: list[Line] = [
         {"label": item.label} | {task.name: _make_cell(item, task) for task in tasks}
         for item in ranked
     ]
-    note = "Percent of nominal's cost, the paired geometric mean; in brackets failures in percent."
+    note = "Score, the mean r; in brackets failures in percent."
     return ResultTable(title, columns, lines, note, detail=True)
 
 
 def _make_cell(standing: Standing, task: ControlTask) -> tuple[float, float] | str:
-    """Cost and failures, or why there is no cost."""
+    """Score and failures, or why there is no score."""
     if task not in standing.results:
         return ""
     if standing.results[task].error:
         return "not driven"
     metrics = standing.by_task[task]
-    failed = metrics["failure_rate"].value
-    if task not in standing.scales:
-        reason = "no yardstick"
-    elif task not in standing.pairs:
-        reason = "no episode counts"
-    elif standing.scales[task].gap < MIN_GAP:
-        reason = "nothing to win here"
-    else:
-        return metrics["cost_vs_nominal"].value, failed
-    return f"{reason} ({100.0 * failed:.0f})"
+    failed = 100.0 * metrics["failure_rate"].value
+    if task not in standing.pairs:
+        return f"no nominal ({failed:.0f})"
+    return metrics["score"].value, failed
 
 
 def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
@@ -213,35 +212,55 @@ def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
 
 
 def _describe_findings(standings: Sequence[Standing]) -> list[str]:
-    """Describe the entries that cost less than oracle-state over their tier, Holm-corrected."""
+    """Describe the entries whose score is above oracle-state's over their tier, Holm-corrected."""
+    oracle = next((item for item in standings if item.entry == Entry(STATE)), None)
+    if oracle is None:
+        return []
     others = [
         item
         for item in standings
-        if item.entry.agent not in ORACLE_NAMES
-        and np.isfinite(item.overall.get("score", Estimate(math.nan)).value)
+        if item.entry.agent not in ORACLE_NAMES and item.scores.keys() & oracle.scores.keys()
     ]
-    excess = [  # log(J / J_oracle-state): below 0 where the entry is better
-        np.concatenate([oracle_ratios - ratios for ratios, oracle_ratios in item.pairs.values()])
-        for item in others
+    best = oracle.scores
+    excess = [  # below 0 where the entry is better
+        np.concatenate([subtract(best[task], r) for task, r in x.scores.items() if task in best])
+        for x in others
     ]
     sentences = [
-        f"Finding: {item.label} costs less than oracle-state in tier {item.tier} "
-        f"(score {item.overall['score'].value:.2f})."
+        f"Finding: {item.label} scores more than oracle-state in tier {item.tier} "
+        f"({item.overall['score'].value:.2f})."
         for item in others
     ]
     return _select_cheaper(sentences, excess)
 
 
+def subtract(values: Array, others: Array) -> Array:
+    """Subtract numbers of the seeds that both have.
+
+    Args:
+        values: Numbers, shape (n,).
+        others: Numbers that are subtracted, shape (m,).
+
+    Returns:
+        Differences, shape (min(n, m),).
+    """
+    n = min(len(values), len(others))
+    return values[:n] - others[:n]
+
+
 def _select_cheaper(texts: Sequence[str], logs: Sequence[Array]) -> list[str]:
-    """Select the texts whose paired log ratios surely have a mean below 0, Holm-corrected."""
+    """Select the texts whose paired differences surely have a mean below 0, Holm-corrected."""
     sure = holm([compute_p_value(item) for item in logs])
     return [text for text, is_sure in zip(texts, sure, strict=True) if is_sure]
 
 
 def _make_oracle_table(matrix: Matrix) -> ResultTable:
-    """Make the table of every task's baselines, and of whether they fall in cost."""
+    """Make the table of every task's demand and baselines, and of whether they fall in cost."""
     lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
-    note = "Mean of log(J_nominal / J), 0.69 for half the cost; the score's 1 is the gap."
+    note = (
+        "Gaps: medians by which oracle-state's root mean square errors are below nominal's. r is "
+        "0.69 for half of nominal's cost."
+    )
     if not matrix.foresight:
         note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
     if matrix.regrets:
@@ -253,60 +272,104 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
 
 
 def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
-    if task not in matrix.scales:
-        errors = [matrix.results[task, Entry(oracle)].error for oracle in (NOMINAL, STATE)]
-        return {"contest": task.name, "falls": "; ".join(filter(None, errors))}
-    scale, parameters = matrix.scales[task], matrix.results[task, Entry(PARAMETERS)]
-    oracle_ratios, ratios = scale.compute_paired_ratios(scale.oracle)[1], np.empty(0)
+    none, nominal, parameters, state = (
+        matrix.results[task, Entry(name)] for name in ("none", NOMINAL, PARAMETERS, STATE)
+    )
+    errors = [drive.error for drive in (none, nominal, state) if drive.error]
+    if errors:
+        return {"contest": task.name, "falls": "; ".join(errors)}
+    pair = PairedDrives(nominal, state, task.cost_floor)
+    state_scores, foresight = pair.compute_scores(), matrix.foresight.get(task)
+    scores = [np.zeros(pair.n), state_scores]
     if not parameters.error:
-        ratios = scale.compute_paired_ratios(parameters)[0]
-    foresight = matrix.foresight.get(task)
+        scores[1:1] = [PairedDrives(nominal, parameters, task.cost_floor).compute_scores()]
+    slip, yaw = compute_gaps(pair, task)
     return {
         "contest": task.name,
-        "fails": 1.0 - scale.nominal.survived.mean(),
+        "peak": float(np.degrees(np.median(none["peak_slip"]))),
+        "lost": tuple(100.0 * float(np.mean(~x.survived)) for x in (none, nominal, state)),
         "oracle-state is": find_oracle(task),
-        "gap": average(oracle_ratios),
-        "parameters": ratios.mean() if len(ratios) else None,
+        "slip": slip,
+        "yaw": yaw,
+        "parameters": scores[1].mean() if len(scores) > 2 else None,
+        "state": average(state_scores),
         "foresight": None if foresight is None else foresight.mean(),
-        "episodes": (len(oracle_ratios), len(scale.mark_compared(len(scale.oracle.costs)))),
-        "falls": _describe_order(scale, oracle_ratios, foresight),
+        "falls": _describe_order(scores, foresight),
     }
 
 
-def _describe_order(scale: ScoreScale, oracle_ratios: Array, foresight: Array | None) -> str:
-    """Describe whether each baseline costs less than the one that knows less."""
-    if not len(oracle_ratios):
-        return "no episode that nominal and oracle-state survive"
-    if scale.gap < MIN_GAP:
-        return "nothing to win here"
+def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
+    """Compute by how much an entry's errors are below nominal's, medians of the drives of both.
+
+    Args:
+        pair: Drives of the entry and of nominal.
+        task: Their task.
+
+    Returns:
+        Gap of the slip angle (deg) and of the yaw rate (deg/s), NaN where it is not judged, or no
+        drive is finished by both.
+    """
+    gaps = []
+    for name in ("rms_slip_error", "rms_yaw_error"):
+        errors, nominal = (
+            drive[name][: pair.n][pair.both] for drive in (pair.result, pair.nominal)
+        )
+        is_judged = len(errors) and not (name == "rms_yaw_error" and task.reference == "zero-slip")
+        gaps.append(float(np.degrees(np.median(nominal - errors))) if is_judged else math.nan)
+    return gaps[0], gaps[1]
+
+
+def is_resolved(pair: PairedDrives, task: ControlTask) -> bool:
+    """Check whether nominal and oracle-state lie further apart than instruments resolve.
+
+    Args:
+        pair: Drives of oracle-state and of nominal.
+        task: Their task.
+
+    Returns:
+        Whether a gap exceeds 0.2 deg of slip, 1 deg/s of yaw rate or 10 % of the cars.
+    """
+    slip, yaw = compute_gaps(pair, task)
+    lost = float(np.diff(1.0 - pair.finished.mean(axis=1))[0])
+    return slip > 0.2 or yaw > 1.0 or lost > 0.1
+
+
+def _describe_order(scores: Sequence[Array], foresight: Array | None) -> str:
+    """Describe whether a baseline surely scores less than one that knows less.
+
+    Args:
+        scores: r of the baselines by rising knowledge, shape (n_i,).
+        foresight: Log of oracle-state's cost over clairvoyant's, None where not calibrated.
+
+    Returns:
+        Text.
+    """
     if foresight is not None and foresight.mean() <= 0.0:
         return "clairvoyant does not"
-    return "yes" if average(oracle_ratios).low > 0.0 else "not surely"
+    rises = [average(subtract(more, less)) for less, more in itertools.pairwise(scores)]
+    if any(rise.high < 0.0 for rise in rises):
+        return "no"
+    return "yes" if average(scores[-1]).low > 0.0 else "not surely"
 
 
 def _make_knowledge_table(matrix: Matrix) -> ResultTable:
-    """Make the table of what not knowing costs in each tier: ratios of neighbouring baselines."""
+    """Make the table of what not knowing costs in each tier: differences of neighbours' scores."""
     lines = []
-    for tier in matrix.by_tier:
-        pairs = [
-            matrix.scales[task].compute_paired_ratios(parameters)
-            for task in matrix.tasks
-            if task.tier == tier and task in matrix.scales
-            if not (parameters := matrix.results[task, Entry(PARAMETERS)]).error
-        ]
-        counted = [(ratios, oracle_ratios) for ratios, oracle_ratios in pairs if len(ratios)]
+    for tier, ranked in matrix.by_tier.items():
+        by_name = {x.entry.agent: x.scores for x in ranked if not x.entry.estimator}
+        parameters, state = (by_name.get(name, {}) for name in (PARAMETERS, STATE))
         steps = {
-            "model": [ratios for ratios, _ in counted],
-            "sensing": [oracle_ratios - ratios for ratios, oracle_ratios in counted],
+            "model": list(parameters.values()),
+            "sensing": [subtract(state[x], r) for x, r in parameters.items() if x in state],
             "foresight": [x for task, x in matrix.foresight.items() if task.tier == tier],
         }
-        saved = {name: geometric_mean(*logs) for name, logs in steps.items() if logs}
+        saved = {name: average(*logs) for name, logs in steps.items() if logs}
         lines.append({"tier": f"{tier}: {TITLES[tier]}"} | saved)
     note = (
-        "Cost without over cost with the knowledge: nominal / oracle-parameters, oracle-parameters "
-        "/ oracle-state, oracle-state / clairvoyant. Paired geometric means."
+        "Scores gained: oracle-parameters over nominal, oracle-state over oracle-parameters; "
+        "clairvoyant over oracle-state by the logarithm of cost alone."
     )
-    return ResultTable("What not knowing costs", _KNOWLEDGE, lines, note, keyed=False)
+    return ResultTable("What knowing is worth", _KNOWLEDGE, lines, note, keyed=False)
 
 
 def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:

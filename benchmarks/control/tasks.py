@@ -1,8 +1,8 @@
 """Tasks of the control benchmark: a manoeuvre with its car, actuators and reference.
 
-Those of a tier are chosen once, on tuning seeds, by the gap between the baselines
-(`baseline_gaps.py`); `contests.json` holds them with the measured gaps. Test seeds follow a salt, a
-hash of the contestants' sources and the env's version, so that nobody can have tuned on them.
+Those of a tier are chosen once, on tuning seeds, by what they demand of a car without control
+(`baseline_gaps.py`); `contests.json` holds them with the measured demand. Test seeds follow a salt,
+a hash of the contestants' sources and the world's version, so that nobody can have tuned on them.
 """
 
 import hashlib
@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ... import __version__
 from ...agents import baselines
 from ...envs.io import from_json
 from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
+from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.ticks import TICK
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import VEHICLES
@@ -36,19 +36,22 @@ ORACLES = {PARAMETERS: baselines.PARAMETER_ORACLES, STATE: baselines.STATE_ORACL
 """The candidates for a baseline's name, of which a task has the better one."""
 
 TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
-    "1": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
-    "2a": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
-    "2b": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
-    "2c": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "small car": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
+    "road": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "limit": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
 }
 """The (env id, vehicle, reference) with which a tier's scenarios are driven."""
 TITLES = {
-    "1": "the COMS at 18 to 28 km/h",
-    "2a": "the passenger car at 60 to 80 km/h on a dry road",
-    "2b": "the passenger car on a road of unknown friction",
-    "2c": "the passenger car at the limit of its tyres",
+    "small car": "the COMS at 18 to 28 km/h",
+    "road": "the passenger car at 60 to 90 km/h, friction unknown",
+    "limit": "the passenger car at 70 to 110 km/h, at the limit of its tyres",
 }
-LIMIT = ("2c",)  # tiers in which nominal may fail as often as it does
+LIMIT = "limit"  # the tier in which cars without control are lost
+WORLD = "v1"  # of all tiers
+LEAD_IN, QUICK_LEAD_IN = 20.0, 4.0  # s of gentle driving before a manoeuvre
+COST_FLOOR, SLIP_COST_FLOOR = 0.0552, 0.0476
+"""Cost (1/s) of a slip angle of 0.25 deg and a yaw rate 0.5 deg/s off, what instruments resolve;
+the second where yaw rate is not judged."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,15 @@ class ControlTask:
         """Options of the env without the changes."""
         car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
         reference_options = {"reference": self.reference} if self.reference else {}
-        return {"scenario": self.scenario} | car | reference_options
+        world = {"world": WORLD, "lead_in": LEAD_IN} if self.tier else {}
+        return {"scenario": self.scenario} | car | reference_options | world
+
+    @property
+    def cost_floor(self) -> float:
+        """Cost J_0 of a drive whose errors are as small as instruments resolve."""
+        scenario = make_scenario(self.changes.get("scenario", self.scenario))
+        rate = SLIP_COST_FLOOR if self.reference == "zero-slip" else COST_FLOOR
+        return rate * scenario.duration
 
 
 def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,19 +152,21 @@ class TaskRecord:
 class TaskMeasurement(TaskRecord):
     """A candidate with what was measured on tuning seeds: an entry of the file.
 
-    oracle, knowing: The better of `ORACLES` for state and for parameters. gap: Mean of
-    log(J_nominal / J_oracle) of the episodes that both survive, `judged` of n, with its 95 %
-    interval. failing: Fraction in which nominal fails. verdict: "scored", or why not.
+    oracle, knowing: The better of `ORACLES` for state and for parameters. peak_slip: Median peak of
+    the slip angle without control (deg). lost: Fraction of the cars lost without control, and
+    lost_nominal, lost_oracle. slip_gap, yaw_rate_gap: Median by which oracle-state's root mean
+    square errors are below nominal's (deg, deg/s). verdict: "scored", or why not.
     """
 
-    env_version: str
+    world_version: int
     oracle: str
     knowing: str
-    gap: float
-    low: float
-    high: float
-    failing: float
-    judged: int
+    peak_slip: float
+    lost: float
+    lost_nominal: float
+    lost_oracle: float
+    slip_gap: float
+    yaw_rate_gap: float
     n: int
     verdict: str
 
@@ -180,16 +193,16 @@ def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
 
     Raises:
         FileNotFoundError: There is no file.
-        ValueError: It was measured with another version, is cut short, or names what there is not.
+        ValueError: It was measured in another world, is cut short, or names what there is not.
     """
     measurements = []
     for i, item in enumerate(read_objects(path), 1):
         where = f"{path}: entry {i}"
         measurement = from_json(TaskMeasurement, item, where)
-        if measurement.env_version != __version__:
+        if measurement.world_version != WORLD_VERSION:
             raise ValueError(
-                f"{where} was measured with version {measurement.env_version}, this is "
-                f"{__version__}; measure the contests anew: {COMMAND}"
+                f"{where} was measured in world {measurement.world_version}, this is "
+                f"{WORLD_VERSION}; measure the contests anew: {COMMAND}"
             )
         check_choice(f"{where}: oracle", measurement.oracle, ORACLES[STATE])
         check_choice(f"{where}: knowing", measurement.knowing, ORACLES[PARAMETERS])
@@ -237,7 +250,7 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash of the contestants' files, weights, the env's version and texts.
+    """Make the salt: a hash of the contestants' files, weights, the world's version and texts.
 
     Args:
         more: Texts that belong to it.
@@ -245,7 +258,7 @@ def make_salt(*more: str) -> str:
     Returns:
         Hexadecimal digits.
     """
-    digest = hashlib.sha256(__version__.encode())
+    digest = hashlib.sha256(str(WORLD_VERSION).encode())
     for folder, endings in _CONTESTANTS.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
             if path.suffix in endings:

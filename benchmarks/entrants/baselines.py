@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...envs.io import from_json
+from ...envs.scenarios.world import WORLD_VERSION
 from ..control.entries import (
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
@@ -53,7 +53,7 @@ class BaselineRecord(TaskRecord):
     estimator: str
     controller: str
     salt: str
-    env_version: str
+    world_version: int
     costs: list[float]
     failures: list[int]
 
@@ -88,7 +88,7 @@ def make_baseline_cases(
 
 
 def read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], BaselineRecord]:
-    """Read the records of a file that are of this version.
+    """Read the records of a file that are of this world.
 
     Args:
         path: JSON file of the records.
@@ -101,7 +101,7 @@ def read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], Baselin
     """
     items = enumerate(read_objects(path), 1)
     records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
-    return {record.case: record for record in records if record.env_version == __version__}
+    return {record.case: record for record in records if record.world_version == WORLD_VERSION}
 
 
 def find_baselines(
@@ -153,7 +153,7 @@ def _write_baselines(path: Path = FILE) -> None:
             "costs": result.costs.tolist(),
             "failures": result["failure"].astype(int).tolist(),
         }
-        version = {"salt": salt, "env_version": __version__}
+        version = {"salt": salt, "world_version": WORLD_VERSION}
         lines.append(json.dumps(record | version | numbers))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 

@@ -38,7 +38,7 @@ EPISODES = 64
 _IDS = tuple(
     name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name
 )
-_COMS, _CAR = "1", "2a"  # tiers, of which a scenario without one has car and reference
+_COMS, _CAR = "small car", "road"  # tiers, of which a scenario without one has car and reference
 
 
 def make_user_entry(agent: object, estimator: object, trust: bool = False) -> Entry:

@@ -14,17 +14,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 
 from ...envs.numerics import require_extra
 from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
 from ..control.run import Chunk, Results, measure
-from ..control.score import Standing, make_score_scales, rank_entries
+from ..control.score import Standing, rank_entries
 from ..control.tables import list_failures, make_task_table
 from ..control.tasks import NOMINAL, make_salt, make_task_seeds, make_tuning_seeds
 from ..harness.parallel import run_cases
 from ..harness.results import Column, Line, ResultTable, Suite
-from ..harness.stats import Estimate, geometric_mean
+from ..harness.stats import Estimate, average
 from ..harness.verdict import format_percent
 from .baselines import find_baselines, make_baseline_cases
 from .challenge import EPISODES, ComparisonRequest, choose_estimator, make_user_entry
@@ -35,10 +36,10 @@ if TYPE_CHECKING:
 
 _TABLE = (
     Column("label", "contestant"),
+    Column("score", "score [95 %]", form=".2f"),
+    Column("failure_rate", "fails, %", 100.0, ".1f", interval=False),
     Column("cost_vs_nominal", "cost, % [95 %]", 100.0, ".0f"),
     Column("share_won", "won, %", 100.0, ".0f", interval=False),
-    Column("failure_rate", "fails, %", 100.0, ".1f", interval=False),
-    Column("score", "score [95 %]", form=".2f"),
     Column("n", "episodes"),
 )
 _NONE = Estimate(math.nan)
@@ -70,8 +71,7 @@ class Comparison:
         Returns:
             Standings, the best first.
         """
-        scales = make_score_scales(self.results, self.request.tasks)
-        return rank_entries(self.results, tier, scales)
+        return rank_entries(self.results, tier)
 
 
 def compare(
@@ -156,42 +156,39 @@ def compose_verdict(comparison: Comparison) -> list[str]:
 
 def _make_sentence(standing: Standing) -> str:
     """Make the sentence that says where an entry stands."""
-    cost = standing.overall.get("cost_vs_nominal")
+    score = standing.overall.get("score")
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
-    if cost is None or not math.isfinite(cost.value):
-        reason = "nominal and oracle-state leave no episode to compare"
-        return f"{standing.label}: {f'not driven: {errors[0]}' if errors else reason}"
+    if score is None:
+        return (
+            f"{standing.label}: {f'not driven: {errors[0]}' if errors else 'nominal is not driven'}"
+        )
     tiers = []
-    for tier in dict.fromkeys(task.tier for task in standing.pairs if task.tier):
-        logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
-        tiers.append(f"tier {tier}: {100.0 * geometric_mean(*logs).value:.0f}")
-    failed = standing.overall["failure_rate"]
-    nominal = [standing.scales[task].nominal for task in standing.drives if task in standing.scales]
-    nominal_failures = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
-    episodes = sum(len(run.costs) for run in nominal)
-    won, failing = standing.overall["share_won"].value, 100.0 * failed.value
+    for tier in dict.fromkeys(task.tier for task in standing.scores if task.tier):
+        scores = [r for task, r in standing.scores.items() if task.tier == tier]
+        tiers.append(f"{tier}: {average(*scores).value:.2f}")
+    finished = np.concatenate([x.finished for x in standing.pairs.values()], axis=1)
+    lost = 100.0 * (1.0 - finished.mean(axis=1))
     parts = [
-        f"{format_percent(cost)} of nominal's cost"
-        + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
-        f"wins {100.0 * won:.0f} % of the episodes",
-        f"fails in {failing:.1f} % (nominal {100.0 * nominal_failures / episodes:.1f} %)",
-        _describe_gap(standing.overall["score"]),
+        _describe_score(score) + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
+        f"loses {lost[0]:.1f} % of the cars (nominal {lost[1]:.1f} %)"
+        + (", surely more" if standing.loses_more else ""),
     ]
+    if "cost_vs_nominal" in standing.overall:
+        won = 100.0 * standing.overall["share_won"].value
+        cost = format_percent(standing.overall["cost_vs_nominal"])
+        parts += [f"costs {cost} of nominal where both finish", f"and wins {won:.0f} % of these"]
     text = f"{standing.label}: {', '.join(parts)}"
     if errors:
         text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
     return text
 
 
-def _describe_gap(score: Estimate) -> str:
-    """How much of the way from nominal to oracle-state."""
-    if not math.isfinite(score.value):
-        return "and nothing is to be won here"
+def _describe_score(score: Estimate) -> str:
+    """Describe a score, and whether it is told apart from nominal's 0."""
+    text = f"score {score.inline()}"
     if score.low > 0.0:
-        return f"closes {format_percent(score)} of the gap to oracle-state"
-    if score.high < 0.0:
-        return f"and is behind nominal (score {score.value:.2f}, oracle-state 1)"
-    return f"and is not told apart from nominal (score {score.value:.2f}, oracle-state 1)"
+        return f"{text}, surely above nominal's 0"
+    return f"{text}, {'surely below' if score.high < 0.0 else 'not told apart from'} nominal's 0"
 
 
 def _describe_trust(comparison: Comparison) -> str:
@@ -234,23 +231,23 @@ def make_table(comparison: Comparison) -> ResultTable:
             label = f"{label} (lqr on {REFERENCE_FILTER})"
         lines.append({"label": label, "n": standing.n} | standing.overall)
     note = (
-        "> yours. Cost in percent of nominal's, the paired geometric mean of the episodes that "
-        "nominal and oracle-state survive. won: cheaper than nominal. score: 0 nominal, an LQG "
-        "that knows the nominal car, 1 oracle-state, which knows state and car."
+        "> yours. score: mean r, 0 as nominal, an LQG that knows the nominal car; a loss that "
+        "nominal does not have counts -2. Who surely loses more cars than nominal comes last. "
+        "cost, won: of the drives that nominal finishes too."
     )
     return ResultTable("Your contestants and the package's", _TABLE, lines, note)
 
 
 @dataclass(frozen=True, repr=False)
 class Score:
-    """The score of an entry between nominal, 0, and oracle-state, 1.
+    """The score of an entry, 0 as nominal; oracle-state's stands in the table.
 
     Attributes:
         agent: Name of the agent.
         estimator: Name of the estimator.
-        score: Score; like the next three an `Estimate` with its 95 % interval, NaN where unknown.
-        cost: Cost over nominal's.
-        won: Fraction of the episodes that cost less than nominal's.
+        score: Mean r; like the next three an `Estimate` with its 95 % interval, NaN where unknown.
+        cost: Cost over nominal's, of the episodes that both finish.
+        won: Fraction of these that cost less than nominal's.
         failures: Fraction of all episodes that failed.
         n: Episodes that count.
         contests: A row for each task with the same numbers.
@@ -336,7 +333,7 @@ def score(
             number = numbers.get(metric, _NONE)
             row |= {name: number.value, f"{name}_low": number.low, f"{name}_high": number.high}
         pairs = standing.pairs.get(task)
-        rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
+        rows.append(row | {"n": pairs.n if pairs else 0, "error": result.error})
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
     errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
     n, contests, error = standing.n, tuple(rows), errors[0] if all(errors) else ""

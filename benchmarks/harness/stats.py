@@ -293,6 +293,24 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     return Estimate(ratio, ratio - reach, ratio + reach)
 
 
+def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
+    """Check whether a share is surely larger than another of the same drives: McNemar's exact test.
+
+    Args:
+        hits: Whether each drive is a hit, shape (n,).
+        others: The same of the other share, shape (n,).
+
+    Returns:
+        Whether the one-sided p value is at most 2.5 %.
+    """
+    one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
+    larger = int((one & ~other).sum())
+    differing = int((one != other).sum())
+    from scipy.special import bdtrc
+
+    return differing > 0 and float(bdtrc(larger - 1, differing, 0.5)) <= _TAIL
+
+
 def compute_p_value(logs: Array) -> float:
     """Compute p of Student's test that paired differences have a mean not below 0.
 

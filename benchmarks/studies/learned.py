@@ -16,7 +16,7 @@ from ...agents.rollout import compute_cost_ratios
 from ...envs.record import Array
 from ..control.entries import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Entry
 from ..control.run import DriveResult, Results, measure
-from ..control.score import FAILURE_RATIO, ScoreScale, compute_log_ratios, score
+from ..control.score import FAILURE_RATIO, compute_log_ratios
 from ..control.tasks import (
     NOMINAL,
     PARAMETERS,
@@ -32,6 +32,7 @@ from ..harness.stats import (
     compute_tail_mean,
     compute_win_rate,
     geometric_mean,
+    ratio_of_sums,
     share,
 )
 from ..harness.verdict import format_verdict
@@ -86,11 +87,9 @@ def list_entries(kind: str) -> list[Entry]:
 
 
 def _select_tasks(kind: str) -> list[ControlTask]:
-    """Select a class's tasks: the middle one of each of three tiers, or three of its only one."""
+    """Select three of a class's tasks, evenly from the first to the last."""
     tasks = [task for task in list_scored_tasks() if task.kind == kind]
-    tiers = [[c for c in tasks if c.tier == tier] for tier in dict.fromkeys(c.tier for c in tasks)]
-    n = max(3 // len(tiers), 1)
-    return [tier[(2 * i + 1) * len(tier) // (2 * n)] for tier in tiers for i in range(n)]
+    return [tasks[(2 * i + 1) * len(tasks) // 6] for i in range(3)]
 
 
 @dataclass
@@ -107,13 +106,15 @@ class TransferResult:
 
     def _score(self, name: str, condition: str) -> Estimate:
         """An entry's share of the gap in a condition; NaN of a gap below _MIN_SCORED_GAP."""
-        drives = self.drives[condition]
-        scales = [ScoreScale(by_name[NOMINAL], by_name[PARAMETERS]) for by_name in drives]
-        gaps = [scale.gap for scale in scales if not np.isnan(scale.gap)]  # NaN: nobody survived
-        if not gaps or not np.mean(gaps) > _MIN_SCORED_GAP:
+        ratios, gaps = list[Array](), list[Array]()
+        for by_name in self.drives[condition]:
+            nominal, oracle = by_name[NOMINAL], by_name[PARAMETERS]
+            if (compared := nominal.survived & oracle.survived).any():
+                ratios.append(compute_log_ratios(nominal.costs, by_name[name])[compared])
+                gaps.append(compute_log_ratios(nominal.costs, oracle)[compared])
+        if not gaps or not np.mean([gap.mean() for gap in gaps]) > _MIN_SCORED_GAP:
             return Estimate(np.nan)
-        pairs = zip(scales, drives, strict=True)
-        return score([scale.compute_paired_ratios(by_name[name]) for scale, by_name in pairs])
+        return ratio_of_sums(ratios, gaps)
 
     def _compute_ratios(self, name: str) -> Array:
         """Cost over nominal's of each episode, infinite where it ended by a failure, shape (n,)."""

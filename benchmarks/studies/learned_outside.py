@@ -23,8 +23,8 @@ from ..control.run import NUMBERS, Chunk, DriveResult, measure
 from ..control.tasks import (
     NOMINAL,
     STEERING,
+    YAW,
     ControlTask,
-    list_scored_tasks,
     make_salt,
     make_task_seeds,
     vary_scenario,
@@ -91,9 +91,8 @@ def make_outside_task(kind: str, model: str) -> _OutsideTask:
     Returns:
         Task.
     """
-    tasks = (task for task in list_scored_tasks() if task.scenario == MANOEUVRE)
-    like = next(task for task in tasks if task.kind == kind)
-    return _OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
+    like = STEERING if kind.endswith("steering") else YAW
+    return _OutsideTask("", OUTSIDE_ID, "", "lagged", MANOEUVRE, model, like)
 
 
 def _run_chunk(chunk: Chunk) -> DriveResult:

@@ -32,6 +32,7 @@ from ..control.tasks import (
     NOMINAL,
     ORACLES,
     PARAMETERS,
+    QUICK_LEAD_IN,
     ControlTask,
     list_scored_tasks,
     make_salted_seeds,
@@ -291,9 +292,12 @@ class Lessons:
             reads[teacher] = load_policy(teacher).card.estimator
         for task in _list_tasks(self.kind):
             for change in _draw_changes(self.varied, rng):
-                scenario_options = {"scenario": vary_scenario(task, change)} if change else {}
+                scenario_options: JsonMap = {}
+                if change:
+                    scenario_options["scenario"] = vary_scenario(task, change)
                 name = reads.get(teacher, REFERENCE_FILTER)
                 count = -(-self.cars // self.varied) if change else self.cars
+                scenario_options["lead_in"] = QUICK_LEAD_IN
                 varied_task = replace(task, changes=scenario_options)
                 twins, agent = Entry(teacher, name).make(varied_task, count)
                 options = task.env_options | scenario_options | dict(self.observation_options)

@@ -13,7 +13,7 @@ import pytest
 from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
 from sideslip.benchmarks.control.tasks import YAW, ControlTask, make_salt, make_task_seeds
 
-CONTEST = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
+CONTEST = ControlTask("", YAW, "coms", "zero-slip", "coms-random")
 PUBLIC = (0, 1, 2)
 KNOTS, TRIES, BEST, TURNS = 24, 96, 12, 12
 

@@ -28,8 +28,8 @@ from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.tasks import NOMINAL, STATE, YAW, ControlTask
 
-GUST = ControlTask("1", YAW, "coms", "zero-slip", "gust")
-SINE = ControlTask("1", YAW, "coms", "zero-slip", "sine")
+GUST = ControlTask("", YAW, "coms", "zero-slip", "gust")
+SINE = ControlTask("", YAW, "coms", "zero-slip", "sine")
 
 
 def calibrate(folder: Path, *tasks: ControlTask) -> list[CalibrationRecord]:

@@ -7,7 +7,7 @@ import numpy as np
 from sideslip.agents import Controller
 from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import measure, measure_decision_time
-from sideslip.benchmarks.control.score import make_score_scales, rank_entries
+from sideslip.benchmarks.control.score import rank_entries
 from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.benchmarks.harness.results import Suite
 
@@ -44,7 +44,7 @@ def test_a_users_controller_on_a_users_scenario_stands_in_the_tables() -> None:
     assert not any(driven.error for driven in found.values())
     ours, none = found[mine], found[cell("none")]
     assert np.median(ours["rms_slip"] / none["rms_slip"]) < 0.95  # it does what it is for
-    table = rank_entries(found, "", make_score_scales(found, [BEND]))
+    table = rank_entries(found, "")
     standing = {each.entry: each for each in table}[mine.entry]
     suite = Suite("control", "", "")
     standing.add_rows(suite, "ab")

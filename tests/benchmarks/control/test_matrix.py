@@ -26,7 +26,6 @@ from sideslip.benchmarks.control.tasks import (
     STATE,
     YAW,
     ControlTask,
-    find_oracle,
     list_scored_tasks,
     make_salt,
 )
@@ -125,11 +124,13 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
         "sideslip.benchmarks.control.entries.get_tuned_options",
         lambda _, name: found.get(name, nothing),
     )
-    one = {find_oracle(each, PARAMETERS)[-4:]: each for each in list_scored_tasks()}
-    contest = one["nmpc"]
-    adaptive = Entry("adaptive-nmpc", "joint, friction")
+    contest, kind = list_scored_tasks()[0], "lqr"
+    monkeypatch.setattr(
+        "sideslip.benchmarks.control.entries.find_oracle", lambda _, name: f"{name}-{kind}"
+    )
+    assert ControlCase(contest, Entry(PARAMETERS)).options == found["adaptive-lqr"]
+    adaptive, kind = Entry("adaptive-nmpc", "joint, friction"), "nmpc"
     assert ControlCase(contest, adaptive).options == found["adaptive-nmpc"]
-    assert ControlCase(one["-lqr"], Entry(PARAMETERS)).options == found["adaptive-lqr"]
     parameters, state = (ControlCase(contest, Entry(each)).options for each in (PARAMETERS, STATE))
     assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
     assert state == {"filter": {}, "controller": {"horizon": 0.3}}
@@ -247,15 +248,15 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables, rows, figures, menus, tracks; a contestant that cannot drive leaves the rest."""
     few = [ControlTask(tier, YAW, "coms", "zero-slip", f"coms-{name}")
-           for tier, name in (("", "step"), ("2a", "random"))]  # fmt: skip
+           for tier, name in (("", "step"), ("road", "random"))]  # fmt: skip
     some = [(c, Entry(rung)) for c in few for rung in (*ORACLE_NAMES, "none")]
     filters = ("exact-kf", "bicycle-kf", "nobody-kf")
     some += [(c, Entry("lqr", name)) for c in few for name in filters]
     monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
     monkeypatch.setattr(control, "make_cases", lambda *_: some)
-    monkeypatch.setattr(control, "TITLES", {"": "no tier", "2a": "a tier"})
+    monkeypatch.setattr(control, "TITLES", {"": "no tier", "road": "a tier"})
     for room in ("tables", "report"):
-        named = {"": "no tier", "2a": "a"}
+        named = {"": "no tier", "road": "a"}
         monkeypatch.setattr(f"sideslip.benchmarks.control.{room}.TITLES", named)
     monkeypatch.setattr(control, "measure_delay_cost", lambda *_, **__: ({}, []))
     monkeypatch.setattr(control, "measure_decision_time", lambda *_: 10.0)
@@ -268,13 +269,13 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     wrong = tables["Cells that went wrong"].cells
     assert all("nobody-kf" in line[-1] for line in wrong) and len(wrong) == 2
     first = next(iter(suite.tables))
-    assert list(first.header)[1] == "fails / %" and len(first.cells) == 7
+    assert list(first.header)[1] == "score" and len(first.cells) == 7
     assert {line["contests"] for line in first.cells} == {(1, 1), (0, 1)}
     assert "is not calibrated" in tables["The ladder"].note
     assert len(suite.explorers) == 1 and len(suite.explorers[0].cells) == len(some) - 2
     assert len(suite.files) == 2
     titles = " ".join(title for title, *_ in suite.figures)
-    assert all(text in titles for text in ("cost vs nominal", "failure rate"))
+    assert all(text in titles for text in ("score in every", "failure rate", "constants"))
     assert [title.split()[0] for title, *_ in suite.answers] == ["Which", "Which", "Which", "What"]
     (everywhere,) = suite.answers[0][1].layout.annotations[:1]
     assert "All contests" in everywhere.text

@@ -1,4 +1,4 @@
-"""Scores: what 0 and 1 are, which episodes count, what a failure costs."""
+"""Scores: r of a drive, what a loss counts, which drives count, who stands below the line."""
 
 import math
 from typing import Any
@@ -6,12 +6,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.control.entries import Entry
+from sideslip.benchmarks.control.report import compute_places
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
-from sideslip.benchmarks.control.score import ScoreScale, compute_log_ratios, score
+from sideslip.benchmarks.control.score import (
+    PairedDrives,
+    check_losses,
+    compute_log_ratios,
+    rank_entries,
+)
+from sideslip.benchmarks.control.tasks import NOMINAL, STEERING, YAW, ControlTask
+from sideslip.benchmarks.harness.stats import is_share_larger
 from sideslip.envs import FAILURES
+from sideslip.envs.scenarios.manoeuvres import SCENARIOS
+from sideslip.envs.task import REFERENCES, compute_cost_rate
 
-Array = np.ndarray
 SPIN = float(FAILURES.index("spin"))
+TASK = ControlTask("road", YAW, "passenger-car", "lagged", "road-step")
 
 
 def driven(costs: Any, failed: Any = (), error: str = "") -> DriveResult:
@@ -23,62 +34,90 @@ def driven(costs: Any, failed: Any = (), error: str = "") -> DriveResult:
     return DriveResult(numbers, 1.0, error=error)
 
 
-def test_nominal_scores_zero_the_oracle_one_and_half_of_the_way_half() -> None:
+def test_half_of_the_cost_and_the_losses() -> None:
+    """Drives that both finish, that one of them loses, and that both lose."""
+    nominal, own = driven([4.0, 4.0, 9e2, 9e2], [2, 3]), driven([1.5, 9e2, 4.0, 9e2], [1, 3])
+    pair = PairedDrives(nominal, own, 1.0)
+    assert pair.compute_scores() == pytest.approx([math.log(2.0), -2.0, 2.0, 0.0])
+    assert pair.compute_scores(3.0, 2.0) == pytest.approx([math.log(6.0 / 3.5), -3.0, 3.0, 0.0])
+    assert pair.both.tolist() == [True, False, False, False]
+    swapped = PairedDrives(own, nominal, 1.0).compute_scores()
+    assert swapped == pytest.approx(-pair.compute_scores())
+
+
+def test_what_instruments_do_not_resolve_hardly_counts() -> None:
+    """A hundredth of nominal's cost is little where nominal's is a hundredth of J_0."""
+    pair = PairedDrives(driven([0.01]), driven([0.0001]), 1.0)
+    assert 0.0 < pair.compute_scores()[0] < 0.01
+    assert compute_log_ratios(np.array([0.01]), driven([0.0001]))[0] > 2.0
+
+
+@pytest.mark.parametrize("reference", ["lagged", "zero-slip"])
+def test_the_floor_is_the_cost_of_a_quarter_degree(reference: str) -> None:
+    """And of half a degree a second where yaw rate is judged; of the manoeuvre, not before it."""
+    task = ControlTask("road", STEERING, "passenger-car", reference, "road-step")
+    errors = math.radians(0.25), math.radians(0.5)
+    rate = compute_cost_rate(*errors, 0.0, 0.0, REFERENCES.index(reference))
+    assert task.cost_floor == pytest.approx(rate * SCENARIOS["road-step"].duration, rel=2e-3)
+
+
+def test_a_slow_contestant_is_paired_with_its_own_episodes() -> None:
+    costs = np.random.default_rng(1).lognormal(0.0, 1.0, 20)
+    pair = PairedDrives(driven(2.0 * costs), driven(costs[:5]), 0.0)
+    assert pair.compute_scores() == pytest.approx(np.full(5, math.log(2.0)))
+
+
+def test_below_the_line_stand_those_that_surely_lose_more_cars() -> None:
+    """However good they are otherwise; equal numbers of losses in other drives do not suffice."""
+    nominal, n = driven(np.full(40, 8.0), range(10)), 40
+    entries = {
+        "sure": driven(np.full(n, 0.1), range(20)),  # 10 losses more, in the same drives
+        "unsure": driven(np.full(n, 4.0), range(13)),
+        "other": driven(np.full(n, 6.0), range(20, 30)),
+    }
+    results = {(TASK, Entry(name)): result for name, result in entries.items()}
+    results[TASK, Entry(NOMINAL)] = nominal
+    ranked = rank_entries(results, "road")
+    assert [item.label for item in ranked][-1] == "sure" and ranked[-1].loses_more
+    assert not any(item.loses_more for item in ranked[:-1])
+    assert not check_losses([PairedDrives(nominal, nominal, 1.0)]) and not check_losses([])
+
+
+def test_a_larger_share_is_sure_by_the_sign_of_what_differs() -> None:
+    """Six of six that differ are sure at 2.5 %, one-sided, five of five are not."""
+    other = np.zeros(100, bool)
+    for count, sure in ((6, True), (5, False)):
+        assert is_share_larger(np.arange(100) < count, other) is sure
+        assert is_share_larger(other, np.arange(100) < count) is False
+    assert is_share_larger(other, other) is False
+
+
+def test_sure_shares_are_rarely_wrong() -> None:
+    """Of equal shares that correlate, at most one in forty is called larger."""
     rng = np.random.default_rng(0)
-    best = rng.lognormal(0.0, 1.0, 50) + 1.0
-    middle, nominal = (best + 0.001) * 2.0 - 0.001, (best + 0.001) * 4.0 - 0.001
-    yard = ScoreScale(driven(nominal), driven(best))
-    assert yard.gap == pytest.approx(math.log(4.0))
-    for costs, expected in ((nominal, 0.0), (middle, 0.5), (best, 1.0)):
-        found = score([yard.compute_paired_ratios(driven(costs))])
-        assert found == pytest.approx((expected,) * 3, abs=1e-12)
+    for n, share in ((12, 0.5), (40, 0.2), (200, 0.05)):
+        wrong = 0
+        for _ in range(2000):
+            shared = rng.random(n) < 0.5 * share
+            one, other = (shared | (rng.random(n) < 0.5 * share) for _ in range(2))
+            wrong += is_share_larger(one, other)
+        assert wrong / 2000 <= 0.03
 
 
-def test_the_score_is_a_ratio_of_sums_over_contests() -> None:
-    """A contest with little to win weighs little, whatever is done there."""
-    wide = ScoreScale(driven([8.0] * 4), driven([1.0] * 4))
-    narrow = ScoreScale(driven([1.08] * 4), driven([1.0] * 4))
-    drives = ((wide, 1.0), (narrow, 1.2))
-    pairs = [scale.compute_paired_ratios(driven([cost] * 4)) for scale, cost in drives]
-    gaps = wide.gap, narrow.gap
-    expected = (gaps[0] + math.log(1.081 / 1.201)) / sum(gaps)
-    assert score(pairs).value == pytest.approx(expected)
-    assert score(pairs).value > 0.9 > np.mean([1.0, score(pairs[1:]).value])
-
-
-def test_only_episodes_that_both_rungs_survive_count() -> None:
-    nominal, oracle = driven([4.0] * 6, [0]), driven([2.0] * 6, [1, 2])
-    yard = ScoreScale(nominal, oracle)
-    assert yard.mark_compared(6).tolist() == [False, False, False, True, True, True]
-    r, own = yard.compute_paired_ratios(driven([2.0] * 6, [0, 3]))
-    assert own == pytest.approx([math.log(4.001 / 2.001)] * 3)
-    assert r.tolist() == pytest.approx([math.log(1.0 / 20.0), own[1], own[2]])
+def test_places_follow_the_constants() -> None:
+    """Who wins by cost and loses a car falls behind where a loss counts more."""
+    fast = driven([0.5] * 9 + [9e2], [9])
+    results = {(TASK, Entry("fast")): fast, (TASK, Entry("safe")): driven([3.4] * 10)}
+    results[TASK, Entry(NOMINAL)] = driven([4.0] * 10)
+    ranked = rank_entries(results, "road")
+    by_loss = {}
+    for loss in (0.5, 30.0):
+        places = compute_places(ranked, loss, 1.0)
+        by_loss[loss] = {x.label: place for x, place in zip(ranked, places, strict=True)}
+    assert by_loss[0.5]["fast"] < by_loss[0.5]["safe"]
+    assert by_loss[30.0]["safe"] < by_loss[30.0]["fast"]
 
 
 def test_one_wild_episode_counts_for_three_at_most() -> None:
     r = compute_log_ratios(np.array([1.0, 1.0, 1.0]), driven([1e9, 0.0, 1.0]))
     assert r.tolist() == [-3.0, 3.0, 0.0]
-
-
-def test_a_slow_contestant_is_paired_with_its_own_episodes() -> None:
-    """And a slow oracle pairs everybody with the few that it drove."""
-    rng = np.random.default_rng(1)
-    costs = rng.lognormal(0.0, 1.0, 20)
-    for oracles, mine, n in ((20, 5, 5), (8, 20, 8)):
-        yard = ScoreScale(driven(2.0 * costs), driven(0.5 * costs[:oracles]))
-        r, own = yard.compute_paired_ratios(driven(costs[:mine]))
-        assert len(r) == len(own) == n
-        assert r == pytest.approx(np.log((2.0 * costs[:n] + 0.001) / (costs[:n] + 0.001)))
-
-
-def test_nothing_to_win_or_to_count_is_no_score() -> None:
-    same = ScoreScale(driven([1.0] * 4), driven([0.97] * 4))
-    assert math.isnan(score([same.compute_paired_ratios(driven([0.5] * 4))]).value)
-    lost = ScoreScale(driven([1.0] * 4, range(4)), driven([0.5] * 4))
-    assert math.isnan(lost.gap)
-    assert math.isnan(score([lost.compute_paired_ratios(driven([0.5] * 4))]).value)
-    good = ScoreScale(driven([2.0] * 4), driven([0.5] * 4))
-    pairs = [scale.compute_paired_ratios(driven([0.5] * 4)) for scale in (lost, good)]
-    assert score(pairs).value == pytest.approx(1.0)  # the rest goes on
-    with pytest.raises(ValueError, match="oracle-state: no plant"):
-        ScoreScale(driven([1.0]), driven([1.0], error="no plant"))
