@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.report import compute_places
+from sideslip.benchmarks.control.robustness import compare_scores, list_reversals
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.score import (
     PairedDrives,
@@ -16,7 +17,7 @@ from sideslip.benchmarks.control.score import (
     rank_entries,
 )
 from sideslip.benchmarks.control.tasks import NOMINAL, STEERING, YAW, ControlTask
-from sideslip.benchmarks.harness.stats import is_share_larger
+from sideslip.benchmarks.harness.stats import Estimate, is_share_larger
 from sideslip.envs import FAILURES
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from sideslip.envs.task import REFERENCES, compute_cost_rate
@@ -121,3 +122,20 @@ def test_places_follow_the_constants() -> None:
 def test_one_wild_episode_counts_for_three_at_most() -> None:
     r = compute_log_ratios(np.array([1.0, 1.0, 1.0]), driven([1e9, 0.0, 1.0]))
     assert r.tolist() == [-3.0, 3.0, 0.0]
+
+
+def test_a_reversal_is_sure_in_both_worlds() -> None:
+    """Of costs that differ by a factor; what is unsure in either world is none."""
+    noise = np.random.default_rng(0).lognormal(0.0, 0.3, (3, 40))
+
+    def compare(**levels: float) -> dict[tuple[str, str], Estimate]:
+        results = {(TASK, Entry(NOMINAL)): driven(np.full(40, 8.0))}
+        for (name, level), factor in zip(levels.items(), noise, strict=True):
+            results[TASK, Entry(name)] = driven(level * factor)
+        return compare_scores(results)
+
+    base = compare(a=1.0, b=2.0, c=2.01)
+    assert list_reversals(base, compare(a=2.0, b=1.0, c=2.01)) == [("a", "b")]
+    assert list_reversals(base, compare(a=2.0, b=4.0, c=4.0)) == []
+    assert list_reversals(compare(a=2.0, b=1.0, c=1.0), base) == [("b", "a"), ("c", "a")]
+    assert not list_reversals(base, compare(a=1.0, b=2.01, c=2.0))
