@@ -340,14 +340,15 @@ def compute_places(standings: Sequence[Standing], loss: float, floor_factor: flo
         floor_factor: Factor on J_0.
 
     Returns:
-        Places, shape (len(standings),).
+        Places, NaN without a score, shape (len(standings),).
     """
     keys = []
     for standing in standings:
         scores = [x.compute_scores(loss, floor_factor).mean() for x in standing.pairs.values()]
         keys.append((standing.loses_more, -float(np.mean(scores)) if scores else math.inf))
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    return np.argsort(order).astype(np.float64) + 1.0
+    places = np.argsort(order) + 1.0
+    return np.where([score < math.inf for _, score in keys], places, np.nan)
 
 
 def make_tracks(matrix: Matrix) -> list[tuple[str, str, str]]:

@@ -273,7 +273,9 @@ def draw_heat_map(
     """
     flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
     scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
-    text = [[f"{v:.2f}" if np.isfinite(v) else "" for v in row] for row in values]
+    text = [
+        [f"{v:.2f}".removesuffix(".00") if np.isfinite(v) else "" for v in row] for row in values
+    ]
     low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
     trace = go.Heatmap(
         z=[[float(v) if np.isfinite(v) else None for v in row] for row in values],
