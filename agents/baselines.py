@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium as gym
 
 from ..envs.scenarios.draws import get_range
+from ..envs.scenarios.manoeuvres import SCENARIOS
 from ..envs.scenarios.scenario import Scenario
 from ..envs.scenarios.world import IDEAL, World
 from ..envs.sensors.inertial import Noise
@@ -115,7 +116,8 @@ def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
     turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
     lag = get_rms("map_lag") * turning  # rad, error of the road's direction
     course = plain["course"], _WAVE * get_rms("course_error"), get_rms("gps_stamp") * _ACCELERATION
-    spreads = [compute_range_rms(scenario, name, 1.0) for name in STIFFNESSES]
+    known = SCENARIOS.get(scenario.name, scenario)  # of a variant too: nobody is told of it
+    spreads = [compute_range_rms(known, name, 1.0) for name in STIFFNESSES]
     force_share = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
     options = {
         "camera_yaw_sd": get_rms("camera_yaw"),

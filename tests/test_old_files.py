@@ -140,8 +140,7 @@ def test_a_spec_makes_its_environment(file: str, wrapper: type) -> None:
 
 def test_what_the_package_ships_is_read() -> None:
     assert all(load_policy(name).card.env_id for name in list_shipped())
-    calibrated = sideslip.benchmarks.control.calibration.read_calibration()
-    assert calibrated and read_tasks() and read_baselines() and read_tuned()
+    assert read_tasks() and read_baselines() and read_tuned()
 
 
 @pytest.mark.parametrize(("algo", "action"), [("ppo", 0.012264779), ("gradient", -0.5908138)])

@@ -30,7 +30,7 @@ def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
     """So one network serves them all."""
     for estimator in FILTERS:
         lessons = Lessons("coms-zero-slip", estimator, "oracle-state-lqr", 2).make_tasks()
-        assert len(lessons) == len(_list_tasks("coms-zero-slip")) == 5
+        assert len(lessons) == len(_list_tasks("coms-zero-slip")) == 3
         card = Lessons("coms-zero-slip", estimator).make_card()
         for each in lessons:
             assert tuple((e.name, e.unit) for e in each.cars.layout) == card.observation
@@ -96,7 +96,7 @@ def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
         assert min(drawn) < 0.6 <= min(usual) and max(usual) <= 1.4 < max(drawn)
         masses.add(varied.cars.vehicle[0].mass / VEHICLES["coms"].mass)
         late.add(varied.cars.slow_sensors[0]["camera"].delays)
-    assert len(masses) == len(late) == 5
+    assert len(masses) == len(late) == 3
     assert VARIED["mass"][0] < min(masses) < 1.0 < max(masses) < VARIED["mass"][1]
 
 
@@ -171,12 +171,12 @@ def test_a_distillation_that_cannot_be_is_one_line(
 
 
 def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None:
-    """All of its class, of which none has a driver; on tensors all are of one kind of plant."""
+    """All of its class, but on tensors those of one kind of plant."""
     policy, task = prepare_start(Path("raw-car-yaw"))
     assert isinstance(policy, Policy)
     names = [each.scenario for each in _list_tasks("car-yaw")]
     driven = task(algo="gradient").scenarios
-    assert driven == names
+    assert set(names) - set(driven) == {"limit-friction-split"}  # a driver steers
     alone = task(algo="gradient", env_options={"scenario": "car-step"})
     assert not alone.scenarios and alone.env_options["vehicle"] == "passenger-car"
     assert prepare_start(Path("distill-car-yaw"))[1]().scenarios == names
