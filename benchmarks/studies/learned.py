@@ -20,6 +20,7 @@ from ..control.score import FAILURE_RATIO, compute_log_ratios
 from ..control.tasks import (
     NOMINAL,
     PARAMETERS,
+    QUICK_LEAD_IN,
     ControlTask,
     list_scored_tasks,
     make_salt,
@@ -160,9 +161,10 @@ def _measure(request: Request) -> list[TransferResult]:
     for condition in request.choose(tuple(CONDITIONS), _QUICK_CONDITIONS):
         change = CONDITIONS[condition]
         cases = [
-            (replace(task, changes={"scenario": vary_scenario(task, change)}), entry)
+            (replace(task, changes=changes), entry)
             for kind, class_tasks in tasks.items()
             for task in class_tasks
+            for changes in [{"scenario": vary_scenario(task, change), "lead_in": QUICK_LEAD_IN}]
             for entry in list_entries(kind)
         ]
         results[condition] = measure(
@@ -178,6 +180,7 @@ def _measure(request: Request) -> list[TransferResult]:
             for condition, outcomes in results.items()
         }
         scenarios, env_id = ", ".join(task.scenario for task in selected), selected[0].env_id
+        scenarios += f", after {QUICK_LEAD_IN:g} s of gentle driving"
         transfers.append(TransferResult(kind, drives, salt, env_id, kind, scenarios, remark))
     return transfers
 
