@@ -206,12 +206,25 @@ class ControlCase(NamedTuple):
             return entry.options
         if entry.trust or entry.is_users:
             trusted = {"trust": True} if entry.trust else {}
-            return get_tuned_options(kind, NOMINAL) | {"controller": trusted}
+            return self._get_tuned_options(NOMINAL) | {"controller": trusted}
         if name in _SHARED and not any(get_tuned_options(kind, name).values()):
             source, numbers = _SHARED[name]
             best = get_tuned_options(kind, source)["controller"]
             return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
-        return get_tuned_options(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
+        return self._get_tuned_options(NOMINAL if name == REFERENCE_CONTROLLER else name)
+
+    def _get_tuned_options(self, name: str) -> Options:
+        """Get what was tuned, in version 0, less what does worse in the tiers' world.
+
+        There the world's ranges tell the levels of `exact-kf`, and nominal does better with the
+        default weight of added steering.
+        """
+        tuned = get_tuned_options(self.task.kind, name)
+        if self.task.tier and name not in ADAPTIVE.values():
+            tuned["filter"] = {}
+            if name == NOMINAL:
+                tuned["controller"].pop("steer_weight", None)
+        return tuned
 
     @property
     def env_options(self) -> dict[str, Any]:
