@@ -53,7 +53,7 @@ def compose_verdict(matrix: Matrix) -> str:
         text = f", and {100.0 * ratio.value:.0f} % as much as no control"
     episodes = max((len(r) for gains in agents.gains.values() for r in gains.values()), default=0)
     return format_verdict(
-        "Controllers drive on what estimators infer; cost: squared error of slip and yaw rate.",
+        "Controllers drive on what estimators infer; cost: squared errors, a lost car 7.4-fold.",
         f"Of the controllers {complete.describe_first()}{text}.",
         f"Of the estimators, under one controller, {filters.describe_first()}.",
         _describe_reasons(matrix),
