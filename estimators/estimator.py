@@ -18,6 +18,7 @@ from ..envs.sensors.slow import SLOW_NAMES
 from .core.filter import advance, process_packet_all, reset_filters, step_all, write_estimate
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
+from .core.update import is_healthy
 from .design.models import STATES
 from .design.options import FilterConfig
 from .design.periodic import Schedule, compute_table_shape, count_ticks
@@ -357,6 +358,14 @@ class Estimator:
     def counts(self) -> dict[str, int]:
         """All counters of what was skipped, by the names of `core.record.SkipCounters`."""
         return dict(zip(SkipCounters._fields, map(int, self._f.counts), strict=True))
+
+    @property
+    def healthy(self) -> bool:
+        """Whether innovations are about as large as expected; False for a filter that is lost.
+
+        Filters whose noise is fixed (`noise_time=0`) keep no account of it and say True.
+        """
+        return bool(is_healthy(self.filters[1 if self._f.members > 0 else 0]))
 
     @property
     def nis(self) -> float:

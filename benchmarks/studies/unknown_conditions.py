@@ -174,7 +174,7 @@ def _vary_steering(degrees: float) -> Condition:
 def _vary_noise(factor: float) -> Condition:
     """Make a condition without a bound: the accelerometer feels that the car rolls."""
     noise = {"roll": True, "noise": {"accel": 0.1 * factor}}
-    options = _INERTIAL | {"accel_time": 2.0}
+    options = _INERTIAL | {"noise_time": 2.0}
     filters: Filters = {
         "joint, finds the noise": ("joint", options),
         "exact-kf": ("exact-kf", _INERTIAL),

@@ -21,7 +21,7 @@ from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
-from .update import correct_fast
+from .update import FIRST_VARIANCE, correct_fast
 
 
 @jit
@@ -64,9 +64,12 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
     for i in range(len(f.keep)):
         f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
     f.weight, f.fresh = f.odds, 0.0
+    _fill(f.surprise, 1.0)
     if f.r_share > 0.0:
-        f.r_fast[f.accel_row] = f.r_told
-        _fill(f.y_past, np.nan)
+        f.blocks, f.block_rows = 0, 0
+        _fill(f.block_sum, 0.0)
+        for i in range(f.fasts):
+            f.r_fast[i] = FIRST_VARIANCE * f.r_told[i]
     f.steer_before = np.nan
     if f.scaled > 0:
         f.C_fast[f.accel_row, f.scaled] = 0.0

@@ -6,6 +6,7 @@ its slope by slip stands in `car` and makes the bicycle's matrices, its slopes b
 columns beside them, and the rest is a known push. `design.periodic` has the tables of gains.
 """
 
+from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
@@ -42,6 +43,8 @@ def _build_lateral(f: FilterRecord, V: Scalar) -> None:
         _write_tyres(f, V)
     if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
         B[0, N_INPUTS + f.banked] = -GRAVITY / V
+    if f.mapped > 0:
+        B[Y_L, N_INPUTS + f.mapped - f.dense] = V
     if f.steered > 0:  # the input is the measured angle, with the offset in it
         felt = 1.0 if is_steering_felt(V) else 0.0
         for i in range(f.dense):
@@ -126,6 +129,9 @@ def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     f.push[0], f.push[1] = beta, gamma
     if f.rolling > 0:
         f.push[f.rolling + 1] = phi_rate
+    if f.mapped > 0:  # on a bend that the map turns late the lane's law needs its sine
+        course = f.x[BETA] + f.x[PSI]
+        f.push[Y_L] = V * (sincos(course)[0] - course)
     f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0
 
 

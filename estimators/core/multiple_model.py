@@ -111,7 +111,7 @@ def _remove_gust(f: FilterRecord) -> None:
         for j in range(f.total):
             f.P[index, j] = 0.0
             f.P[j, index] = 0.0
-        f.P[index, index] = f.q_known[i] / f.q_share  # the stationary variance
+        f.P[index, index] = f.q_known[i] / f.q_share[i]  # the stationary variance
 
 
 @noinline

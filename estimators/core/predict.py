@@ -11,6 +11,7 @@ from .covariance import predict_covariance
 from .innovation import BUFFER, LARSEN, PSEUDO
 from .model import (
     BETA,
+    CURVATURE,
     KINEMATIC,
     LINEAR,
     MIN_SPEED,
@@ -123,14 +124,6 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
         f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
-    if f.r_share > 0.0:  # the variance of a_y, by its second differences, which motion hardly has
-        accel_y, r = f.y[f.accel_row], f.r_fast[f.accel_row]
-        second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-        # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
-        if is_finite(second_difference):
-            sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
-            f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
-        f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
     turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
@@ -168,6 +161,10 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         walks = moves and f.P[index, index] < f.prior[index, index]
         extra = f.fresh if i < 2 else 0.0
         f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
+    if f.mapped > 0:  # a map that is late errs by the road's turn in that time
+        error = f.map_lag * V * f.u[CURVATURE]
+        share = 1.0 - f.decay[f.mapped] * f.decay[f.mapped]
+        f.Q[f.mapped, f.mapped] = share * (f.prior[f.mapped, f.mapped] + error * error)
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
@@ -184,8 +181,8 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
     if f.model_error > 0.0:
         force_error = f.model_error * total_force
         moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
-        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * force_error * force_error
-        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * moment_error * moment_error
+        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share[0] * force_error * force_error
+        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share[1] * moment_error * moment_error
 
 
 @jit

@@ -17,7 +17,7 @@ from ...envs.numerics.simd8 import pad_to_cache_line
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-N_CORE = 16  # states of a model; in whole eights, as `N_TOTAL`
+N_CORE = 24  # states of a model; in whole eights, as `N_TOTAL`
 N_INPUTS = 4  # inputs that drive a model
 N_FAST = 3  # measurements of a fast row
 N_DRIVERS = N_CORE + 8  # columns of B: inputs, then disturbances
@@ -84,6 +84,8 @@ _FIELDS = [
     ("pushed", _INT, (N_CORE,)),  # the state that each state behind the dense ones pushes; -1: none
     ("banked", _INT),  # place of the road's bank behind the dense states; -1: none
     ("steered", _INT),  # where the steering sensor's offset stands; 0: none
+    ("mapped", _INT),  # where the error of the map's heading stands; 0: none
+    ("map_lag", _FLOAT),  # s, deviation of the time by which the road's curvature is late
     ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
     ("car", _FLOAT, (len(CarIndex._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
@@ -102,7 +104,7 @@ _FIELDS = [
     ("q_tyres", _FLOAT, (3,)),  # variances of a step of factors and 1/friction, while it moves
     ("model_error", _FLOAT),  # fraction of the axles' forces by which the tyres' law errs
     ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without `model_error`
-    ("q_share", _FLOAT),  # fraction of a disturbance's variance that comes in a step
+    ("q_share", _FLOAT, (2,)),  # fractions of their variances that come in a step
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # fraction by which the delayed states follow in a step
     ("A", _FLOAT, (N_CORE, N_CORE)),
@@ -145,9 +147,12 @@ _FIELDS = [
     ("scaled", _INT),  # where the error of the accelerometer's scale stands; 0: none
     ("rest_fast", _FLOAT, (N_FAST,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (N_FAST,)),  # variances of the fast measurements
-    ("r_told", _FLOAT),  # (m/s2)^2, configured variance of a_y, the least it may have
-    ("r_share", _FLOAT),  # weight of a new second difference in a_y's variance; 0: fixed
-    ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
+    ("r_told", _FLOAT, (N_FAST,)),  # configured variances, the least that may be found
+    ("r_share", _FLOAT),  # weight of a new block in these variances; 0: fixed
+    ("block", _INT),  # rows of a block whose mean innovations show the noise
+    ("blocks", _INT),  # blocks so far
+    ("block_rows", _INT),  # rows of the present one
+    ("block_sum", _FLOAT, (N_FAST,)),  # sums of its innovations
     ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
     # slow sensors: what each one measures, how noisy it is, when it captures
     ("rows", _INT, (N_SLOW,)),  # rows of C
@@ -216,6 +221,9 @@ _FIELDS = [
     ("cursor", _INT),  # packets of the present call that are done
     ("counts", _INT, (len(SkipCounters._fields),)),
     ("scale", _FLOAT, (N_SLOW, N_ROWS)),  # factor on R, where it adapts
+    # of filters that find noise, means of squared innovations over variances: of the fast rows
+    # of the last second, of the last dozen slow samples; 1 where the filter knows how it errs
+    ("surprise", _FLOAT, (2,)),
     ("nis", _FLOAT),  # normalised innovation squared of the last packet; NaN: unknown
     # of each slow sensor, where `wary` is above 0
     ("last", _FLOAT, (N_SLOW, PACKET_WIDTH)),  # its last packet

@@ -256,12 +256,61 @@ def update_filter(
             for k in range(f.n):
                 f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
     else:
-        if is_gated and not check_sample(f, s, first, packet):
+        is_refused = is_gated and not check_sample(f, s, first, packet)
+        if is_gated and f.r_share > 0.0 and f.nis == f.nis:
+            _note_surprise(f, 1, f.nis / f.rows[s], _SAMPLE_WEIGHT)
+        if is_refused:
             f.counts[COUNTERS.gated] += 1
             f.first_fix = previous_fix
             return False
         _correct(f, s, first, packet)
     return True
+
+
+_SAMPLE_WEIGHT = 1.0 / 12.0  # of a slow sample in the mean of the last ones
+_MAX_SURPRISE = 50.0  # of one innovation: more says no more
+MAX_MEAN_SURPRISE = 3.0
+"""Mean squared innovation over its variance beyond which a filter is lost."""
+
+
+@jit
+def _note_surprise(f: FilterRecord, kind: int, surprise: Scalar, weight: Scalar) -> None:
+    f.surprise[kind] += weight * (minimum(surprise, _MAX_SURPRISE) - f.surprise[kind])
+
+
+@jit
+def is_healthy(f: FilterRecord) -> Scalar:
+    """Return whether a filter's innovations are about as large as it expects.
+
+    Args:
+        f: Memory of the filter.
+
+    Returns:
+        False for a filter that is lost; True for one whose noise is fixed, which keeps no account.
+    """
+    return maximum(f.surprise[0], f.surprise[1]) < MAX_MEAN_SURPRISE
+
+
+FIRST_VARIANCE = 100.0
+"""Variance of a fast sensor over the configured one until its first block is over."""
+
+
+@jit
+def _find_variance(f: FilterRecord, i: int, residual: float, projected: Scalar) -> None:
+    """Find the variance of fast row i from the mean innovation of blocks.
+
+    Of n rows of white noise of variance r a block's mean has r / n; of noise that is coloured, as
+    vibration is, it has more, and n times that is the variance which a filter has to assume of
+    rows that it takes for independent. `projected` is C P C^T, which is no noise.
+    """
+    f.block_sum[i] += residual
+    if f.block_rows + 1 < f.block:
+        return
+    sample, r = f.block_sum[i] * f.block_sum[i] / f.block - projected, f.r_fast[i]
+    f.block_sum[i] = 0.0
+    share = maximum(f.r_share, 1.0 / (f.blocks + 1.0))
+    sample = minimum(maximum(sample, 0.0), 9.0 * r)  # more is an outlier's
+    f.r_fast[i] = maximum(r + share * (sample - r), f.r_told[i])
 
 
 @noinline
@@ -299,7 +348,13 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
         if f.periodic == 1:
             _add_gain(f, gains, _locate_step_row(f) + i, residual)
             continue
-        update_scalar(f, project(f, f.C_fast[i]) + f.r_fast[i], residual)
+        projected = project(f, f.C_fast[i])
+        if f.r_share > 0.0:
+            _find_variance(f, i, residual, projected)
+        variance = projected + f.r_fast[i]
+        if f.r_share > 0.0:
+            _note_surprise(f, 0, residual * residual / variance, f.step / f.fasts)
+        update_scalar(f, variance, residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
         if f.between == PSEUDO:
@@ -309,6 +364,10 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
                 f.e[j] -= f.share[i, j] * projected
         if f.late == LARSEN:
             propagate_larsen_gains(f, f.C_fast[i])
+    if f.r_share > 0.0:
+        f.block_rows += 1
+        if f.block_rows == f.block:
+            f.block_rows, f.blocks = 0, f.blocks + 1
     if f.between == PSEUDO:  # the even fraction of the last sample's gain
         for i in range(f.fasts, f.fasts + f.rows[s]):
             for j in range(f.total):

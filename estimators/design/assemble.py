@@ -72,9 +72,9 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
         ),
         (is_buffer and f.pace > 1, "delay='buffer' is for filters that listen at every tick"),
         (
-            is_buffer and config.accel_time > 0.0,
+            is_buffer and config.noise_time > 0.0,
             "delay='buffer' filters stored ticks again and does not store the noise that "
-            f"accel_time={config.accel_time:g} finds; use delay='clone'",
+            f"noise_time={config.noise_time:g} finds; use delay='clone'",
         ),
     ]
     n_samples = 0
@@ -95,6 +95,7 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
 
 
 _EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
+_BLOCK_TIME = 0.2  # s of a block whose mean innovation shows the accelerometer's noise
 _SMOOTHING_TIME = 0.015  # s, time constant of the low-pass on the measured speed
 _MAX_SPEED = 80.0  # m/s, speed of the last table of gains
 _SPACING = 0.5  # m/s between two tables of gains
@@ -196,10 +197,11 @@ def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
 def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
     """Write what is known of a sample's noise, and which ones are skipped."""
     f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
-    f.steer_jump = config.steer_rate * f.step
-    f.model_error, f.r_told = config.model_error, config.noise["accel_y"] ** 2
-    if config.accel_time > 0.0 and f.accel_row > 0:
-        f.r_share = 1.0 - math.exp(-f.step / config.accel_time)
+    f.steer_jump, f.map_lag = config.steer_rate * f.step, config.map_lag_sd
+    f.model_error, f.r_told[:] = config.model_error, f.r_fast
+    if config.noise_time > 0.0:
+        f.block = max(1, round(_BLOCK_TIME / f.step))
+        f.r_share = 1.0 - math.exp(-f.block * f.step / config.noise_time)
     f.wary = config.wary
     if config.gate is not None:
         from scipy.stats import chi2  # slow to load
@@ -224,6 +226,7 @@ def _write_model(
     f.pushed[n - len(model.biases) - dense : n - dense] = -1
     f.banked = names.index("bank") - dense if "bank" in model.biases else -1
     f.steered = names.index("steer_offset") if "steer_offset" in model.biases else 0
+    f.mapped = names.index("map_heading") if "map_heading" in model.biases else 0
     f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
     f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
     body = make_roll_model(vehicle)
@@ -239,11 +242,12 @@ def _write_model(
             force_sd = math.hypot(force_sd, config.force_share * weight)
         if config.moment_share > 0.0:
             moment_sd = math.hypot(moment_sd, config.moment_share * weight * arm)
-        decay = math.exp(-f.step / config.disturbance_time)
-        f.decay[dense : dense + 2] = decay
-        f.Q[dense, dense] += (1.0 - decay * decay) * force_sd**2
-        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * moment_sd**2
-        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - decay * decay
+        times = config.disturbance_time, config.moment_time or config.disturbance_time
+        decay = np.array([math.exp(-f.step / time) for time in times])
+        both = range(dense, dense + 2)
+        f.decay[both], f.q_share[:] = decay, 1.0 - decay * decay
+        f.Q[both, both] += f.q_share * np.square([force_sd, moment_sd])
+        f.q_known[:] = f.Q[both, both]
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, config.noise)
@@ -314,6 +318,8 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
         if name == "camera" and "camera_yaw" in model.biases:  # it turns about the car, not y_l
             f.C[s, :2, model.names.index("camera_yaw")] = 1.0, f.preview
+        if name == "camera" and f.mapped > 0:
+            f.C[s, :2, f.mapped] = 1.0, f.preview
         if is_second_layer:
             f.r_speed = f.r[s, 0]
 

@@ -39,8 +39,8 @@ _Values = dict[str, Any]  # options by name
 
 
 _NUMBERS = (  # options that every filter has
-    *("leak", "satellites", "robust", "model_error", "accel_time", "force_share", "moment_share"),
-    *("adapt", "allow_unstable"),
+    *("leak", "satellites", "robust", "map_lag_sd", "model_error", "noise_time"),
+    *("force_share", "moment_share", "adapt", "allow_unstable"),
 )
 
 
@@ -52,6 +52,10 @@ class _Reader:
 
     def __contains__(self, key: str) -> bool:
         return key in self._unread
+
+    def add_defaults(self, defaults: Mapping[str, object]) -> None:
+        """Add options that the caller left out."""
+        self._unread = dict(defaults) | self._unread
 
     def read_raw(self, key: str, default: object = None) -> Any:
         """Read an option as it is."""
@@ -132,8 +136,9 @@ def parse_config(
     Raises:
         reader.make_error: The ValueError for poles that are not one a state.
     """
-    reader = _Reader(name, dict(row.options) | dict(options))
+    reader = _Reader(name, options)
     used = _select_slow_sensors(row, sensors, reader)
+    reader.add_defaults(_select_defaults(row, used, options))
     chosen: _Values = {"slow": used} | _parse_rules(row, used, reader)
     chosen |= _parse_inertial(row, used, reader)
     if row.model == "bicycle":
@@ -150,13 +155,13 @@ def parse_config(
         text = f"are one for each of {', '.join(states)}"
         raise reader.make_error("poles", text, chosen["poles"])
     rows = [row for sensor in models.MEASUREMENTS.values() for row in sensor.rows]
-    growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
+    growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in options]
     noise = {
         key.removesuffix("_noise"): reader.read_number(key, sd, POSITIVE)
         for key, sd in NOISE.items()
     }
     if first.forces:
-        chosen |= reader.read("force_sd", "moment_sd", "disturbance_time")
+        chosen |= reader.read("force_sd", "moment_sd", "disturbance_time", "moment_time")
     Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     chosen |= reader.read(*_NUMBERS) | _parse_gate(chosen["delay"], reader)
@@ -199,6 +204,23 @@ def _select_slow_sensors(
             present = ", ".join(available) or "none"
             raise ValueError(f"{reader.name} needs the slow sensor {sensor}; there is: {present}")
     return tuple(sensor for sensor in SLOW_NAMES if sensor in requested)
+
+
+def _select_defaults(
+    row: FilterDefinition, used: Sequence[str], options: Mapping[str, object]
+) -> _Values:
+    """Select a definition's options but those of states without a sensor or a deviation."""
+    defaults = dict(row.options)
+    fast = options.get("fast", defaults.get("fast", row.fast))
+    sensors = {*used, *(fast if isinstance(fast, list | tuple) else [fast]), ""}
+    absent = [
+        name
+        for name, sensor in BIASES.items()
+        if sensor not in sensors or options.get(f"{name}_sd") == 0.0
+    ]
+    left_out = {f"{name}_sd" for name in absent} | {f"{name}_time" for name in absent}
+    left_out |= {f"q_{name}" for name in absent}
+    return {key: value for key, value in defaults.items() if key not in left_out}
 
 
 def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> _Values:

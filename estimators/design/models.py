@@ -101,6 +101,7 @@ STATES = {
     "accel_scale": StateInfo("-", 0.0, 1.0),
     "bank": StateInfo("rad", 0.0, 1.0),
     "camera_yaw": StateInfo("rad", 0.0, 1.0),
+    "map_heading": StateInfo("rad", 0.0, 1.0),
     "steer_offset": StateInfo("rad", 0.0, 1.0),
     "front_tyres": StateInfo("-", 0.0, 5.0),
     "rear_tyres": StateInfo("-", 0.0, 5.0),
@@ -140,14 +141,15 @@ WANDER = {
     "accel_bias": "accel_y",
     "bank": "",
     "camera_yaw": "camera",
+    "map_heading": "camera",
     "steer_offset": "",
 }
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
 """States that nothing drives but noise, and the sensor that each needs, if any: biases of fast
-sensors, the road's bank, the camera's yaw against the car, what the steering sensor measures too
-much, the error of the accelerometer's scale. The tyres' states count as biases too: factors of
-stiffness, and the reciprocal of friction."""
+sensors, the road's bank, the camera's yaw against the car, what the map's heading errs, what the
+steering sensor measures too much, the error of the accelerometer's scale. The tyres' states count
+as biases too: factors of stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
 _WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 _WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)

@@ -136,8 +136,8 @@ class FilterOptions:
     bias_sds: Mapping[str, float] = _group(
         dict.fromkeys([f"{name}_sd" for name in BIASES], 0.0),
         "above 0 a state of this deviation: a bias of the gyro (rad/s) or the accelerometer "
-        "(m/s2), the road's bank (rad), the camera's yaw to the left (rad), what the steering "
-        "sensor measures too much (rad), the fraction that the accelerometer does, "
+        "(m/s2), the road's bank (rad), the camera's yaw to the left (rad), what the map's heading "
+        "errs (rad), the steering sensor measures too much (rad), the accelerometer as a fraction, "
         "factors on both axles' stiffness, the reciprocal of friction (0: tyres without a limit)",
     )
     bias_times: Mapping[str, float] = _group(
@@ -159,14 +159,16 @@ class FilterOptions:
     )
     satellites: float = _make(4.0, "that a fix needs, double-layer-gps 4.3", limits=NUMBER)
     robust: float = _add("innovation beyond which it counts less (Huber)", "standard deviations")
+    map_lag_sd: float = _add("by which the road's curvature may be late, as a camera's noise", "s")
     steer_rate: float = _add("a faster change of steering waits for the next row", "rad/s")
     model_error: float = _add("error of the tyres, added to force_sd", "shares of a force")
-    accel_time: float = _add("time over which the accelerometer's noise is found; 0: fixed", "s")
+    noise_time: float = _add("time over which the fast sensors' noise is found; 0: fixed", "s")
     force_share: float = _add("of the weight, added to force_sd as a variance", "1")
     moment_share: float = _add("of that at half the wheelbase, added to moment_sd", "1")
     force_sd: float = _make(50.0, "of disturbances that are forces", "N", POSITIVE)
     moment_sd: float = _make(20.0, "of disturbances that are forces", "N m", POSITIVE)
     disturbance_time: float = _make(0.3, "time constant of both", "s", POSITIVE)
+    moment_time: float = _add("time constant of the moment; 0: disturbance_time", "s")
     members: int = _make(
         1, "filters of which the least likely forgets the tyres twice a second", limits=_FILTERS
     )

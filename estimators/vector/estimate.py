@@ -220,7 +220,7 @@ class EstimateObservation(VectorObservation):
         N, beta, gamma = self.num_envs, infos.get("beta"), infos.get("gamma")
         has_truth = beta is not None and gamma is not None
         truth: Any = (beta, gamma) if has_truth else (np.zeros(N), np.zeros(N))
-        summary, inner = np.zeros((N, 3)), np.ascontiguousarray(obs, np.float32)
+        summary, inner = np.zeros((N, 4)), np.ascontiguousarray(obs, np.float32)
         observed = Observed(inner, self._outputs.table, truth[0], truth[1], out, summary)
         if self._arguments.is_told_truth:
             fast = calibrate(records.fast, self._calibration[:, None])

@@ -15,7 +15,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
-from ..design.models import FOREIGN_STATE, STATES
+from ..design.models import FOREIGN_STATE, STATES, TYRES
 from ..estimator import Estimator
 from ..learned.correction import LearnedEstimator
 from ..make import make_estimator
@@ -23,6 +23,7 @@ from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_la
 from ..registry import find_entry_point
 from .outputs import (
     BETA,
+    HEALTHY,
     NEES,
     STD,
     Observed,
@@ -186,6 +187,7 @@ class Arguments:
         columns = [states.index(s) for s in self.outputs], [s in _WRAPPED for s in self.outputs]
         keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
         keys += [("nees", NEES)] if any(truths) else []
+        keys += [("healthy", HEALTHY)] if TYRES[0] in states else []
         table = OutputTable(
             n_inner,
             np.array([*columns, truths], np.int64).T.copy(),
@@ -224,6 +226,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
 
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
+    `healthy` is 0 while innovations of a filter that finds its noise say that it is lost, else 1.
     An estimate that is not finite is passed on, so that controllers and the env see the failure.
     `layout` describes the whole observation, `outputs` what is appended; `estimator` is the
     estimator at work, around a user's own as a `ForeignEstimator`. In `spec` a factory that can be
@@ -279,7 +282,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         self.outputs = self._arguments.make_outputs(self.estimator.names, inner)
         self.layout = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._summary = np.zeros(3)
+        self._summary = np.zeros(4)
 
     def _update_estimator(self) -> AnyEstimator:
         """Return the estimator for the env's present spec; that at hand where nothing changed."""

@@ -15,11 +15,12 @@ from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum,
 from ...envs.task import ObservationEntry
 from ..core.filter import advance, compute_deviation, read_covariance
 from ..core.record import FILTER, FilterRecord, GainTables
+from ..core.update import is_healthy
 from ..estimator import compile_call
 from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 from ..protocol import EstimatorLike, compute_std
 
-BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
+BETA, STD, NEES, HEALTHY = range(4)  # places in the summary of a step
 _wrap = as_python(wrap, ARRAYS)
 
 
@@ -53,9 +54,9 @@ class Observed(NamedTuple):
     beta: Scalar  # true sideslip angle (rad)
     gamma: Scalar  # true yaw rate (rad/s)
     out: Vector  # float32, filled, shape (inner + m,), or (inner + 2 m,) with standard deviations
-    # filled, shape (3,): beta (the first state where there is no beta), its standard deviation, and
+    # filled, shape (4,): beta (the first state where there is no beta), its standard deviation, and
     # the normalised estimation error squared of the outputs beta and gamma per state,
-    # e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular
+    # e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular; 0 for a filter that is lost
     summary: Vector
 
 
@@ -92,7 +93,7 @@ def write_outputs(estimator: EstimatorLike, observed: Observed) -> None:
     e = x[truth_plan[:, 0]] - np.where(truth_plan[:, 2] == 1, beta, gamma)
     P_e = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
     nees = e @ np.linalg.solve(P_e, e) / len(e) if len(e) and np.linalg.det(P_e) > 0.0 else 0.0
-    summary[:] = x[first], std[first], nees
+    summary[:] = x[first], std[first], nees, 1.0
 
 
 @jit
@@ -167,6 +168,7 @@ def observe(
     f = filters[0]
     summary[0], summary[1] = f.x[0], compute_deviation(f, gains, 0)
     summary[2] = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
+    summary[3] = 1.0 if is_healthy(filters[1 if f.members > 0 else 0]) else 0.0
     return done
 
 

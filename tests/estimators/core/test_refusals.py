@@ -50,9 +50,7 @@ REFUSED: dict[str, list[Any]] = {
     "delay='buffer' is for filters that listen at every tick": [
         call("single-rate-kf", SEEN, delay="buffer")
     ],
-    "does not store the noise that accel_time=2 finds": [
-        call("joint-robust", SEEN, delay="buffer")
-    ],
+    "does not store the noise that noise_time=": [call("joint-robust", SEEN, delay="buffer")],
     f"multirate-kf{NEEDS}": [
         call("multirate-kf", gains="periodic", gate=0.99),
         call("multirate-kf", gains="periodic", adapt=0.02),

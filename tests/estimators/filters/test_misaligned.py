@@ -142,12 +142,6 @@ REFUSED: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("exact-kf", SDS | {"gains": "periodic"}, ValueError, "no settled gain"),
     ("yaw-moment-observer", {"steer_offset_sd": 0.01}, TypeError, "unknown option 'steer_offset"),
     ("multirate-kf", {"camera_yaw_sd": 0.01}, TypeError, "unknown option 'camera_yaw_sd'"),
-    (
-        "joint-robust",
-        SDS | {"fast": ["gyro", "accel_y", "roll_rate"], "bank_sd": 0.02},
-        ValueError,
-        "17 states are more than the 16 of a filter",
-    ),
 ]
 
 
