@@ -20,6 +20,13 @@ from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
 from .emulate import Emulation, compute_ground_speed, compute_heading, find_backward
+from .honesty import (
+    HONESTY,
+    SHARES,
+    compute_held_shares,
+    compute_honesty,
+    describe_innovations,
+)
 
 GYRO_ONLY = "bicycle-kf"
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -95,6 +102,12 @@ class ReplayResult:
     """Errors of one vehicle's estimators on one drive, by estimator."""
 
     squares: dict[str, Array] = field(default_factory=dict)  # by seed (rad2); empty without truth
+    # by seed: NEES, fraction of errors in the 95 % interval, mean log score; empty without truth
+    honesty: dict[str, Array] = field(default_factory=dict)
+    held: dict[str, Array] = field(default_factory=dict)  # fraction in intervals, by `_LEVELS`
+    nis: dict[str, tuple[float, int]] = field(
+        default_factory=dict
+    )  # mean, packets; of the first seed
     cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
     traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
     # states that are no motion at the end: name, value, standard deviation
@@ -106,6 +119,13 @@ class ReplayResult:
         """RMS errors over the seeds (rad), best first."""
         ranges = {name: _compute_range(np.sqrt(x)) for name, x in self.squares.items()}
         return dict(sorted(ranges.items(), key=lambda item: item[1].value))
+
+    @property
+    def ranked(self) -> list[str]:
+        """Estimators by the median log score, best first; without truth in their order."""
+        if not self.honesty:
+            return list(self.cost)
+        return sorted(self.honesty, key=lambda name: -float(np.median(self.honesty[name][:, 2])))
 
 
 def _compute_range(values: Array) -> Estimate:
@@ -159,7 +179,7 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             continue
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
-        squares = []
+        squares, honesty = [], []
         for drive in (log, *drives):  # the first run designs the gains
             start = time.process_time()
             estimates = estimator.run(drive)
@@ -167,14 +187,24 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             result.cost[name] = min(spent, result.cost.get(name, math.inf))
             beta = estimates.x[:, estimates.names.index("beta")]
             result.traces.setdefault(name, beta)
+            if np.isfinite(estimates.nis).any():
+                nis = estimates.nis[np.isfinite(estimates.nis)]
+                result.nis.setdefault(name, (float(np.mean(nis)), len(nis)))
             ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
             result.outcomes[name] = [
                 (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
             ]
             if truth is not None:
-                squares.append(np.mean((beta - truth)[counts] ** 2))
+                wrong = (beta - truth)[counts]
+                squares.append(np.mean(wrong**2))
+                deviation = estimates.std[counts, estimates.names.index("beta")]
+                honesty.append(compute_honesty(wrong, deviation))
+                result.held.setdefault(name, compute_held_shares(wrong, deviation))
         if truth is not None:
-            result.squares[name] = np.array(squares[1:])
+            result.squares[name], result.honesty[name] = (
+                np.array(squares[1:]),
+                np.array(honesty[1:]),
+            )
     return result
 
 
@@ -246,8 +276,11 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
         return format_verdict(
             f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
             "drawn, not scored.",
+            describe_innovations(result.nis),
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
+    _, held, _ = np.median(result.honesty[result.ranked[0]], axis=0)
+    believed = f"Best by the log score: {result.ranked[0]}, whose 95 % interval holds {held:.0%}."
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: _compute_ratio(result, first, name) for name in rest}
@@ -256,7 +289,7 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         f"From the recorded angle {describe_leader(first, over, 'stray')}.",
-        f"Its error: {rmse[first]:.2f} deg; brackets: range over noises.",
+        f"Its error: {rmse[first]:.2f} deg; brackets: range over noises. {believed}",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"
         + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
@@ -342,10 +375,14 @@ def _add_rows(
         if name in result.squares:
             errors = {"rmse": result.rmse[name], "ratio": _compute_ratio(result, name)}
             record |= errors | {"n": len(result.squares[name])}
+            for column, values in zip(HONESTY, result.honesty[name].T, strict=True):
+                record[column.key] = _compute_range(values)
+        if name in result.nis:
+            record["nis"] = result.nis[name][0]
         records[name] = record | {"us_per_tick": cost}
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
-    return [records[name] for name in result.rmse or records]
+    return [records[name] for name in result.ranked]
 
 
 def _make_table(
@@ -354,11 +391,13 @@ def _make_table(
     """Make the table of the estimators; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     cost = Column("us_per_tick", "us per tick", form=".3f")
+    surprise = Column("nis", "NIS", form=".2f")
     if not result.squares:
         title = f"{name}, designed from {car.name}: no truth, no score"
-        return ResultTable(title, ("estimator", cost), records, note)
+        return ResultTable(title, ("estimator", surprise, cost), records, note)
     rmse = Column("rmse", "RMSE / deg [least, most]", DEGREES, ".3f")
-    columns = "estimator", rmse, Column("ratio", "of gyro only", form=".2f", interval=False), cost
+    ratio = Column("ratio", "of gyro only", form=".2f", interval=False)
+    columns = "estimator", rmse, ratio, *HONESTY, cost
     title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
     return ResultTable(title, columns, records, note)
 
@@ -375,7 +414,7 @@ def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
 def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
     try:
-        from ..report.figures import draw_groups, draw_time_series, draw_track
+        from ..report.figures import draw_curves, draw_groups, draw_time_series, draw_track
     except ModuleNotFoundError:
         return []
     truth = log.truth.get("beta")
@@ -400,6 +439,10 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         over_time = draw_time_series(log.time, errors, f"error of the {label}", zero_line=True)
         figure = _select_traces(over_time, result)
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
+        held = {"truth": SHARES} | result.held
+        curves = draw_curves(SHARES, held, "share an interval should hold", "share it holds")
+        text = f"Below the line of truth an estimator is surer than it may be. {_HIDDEN}"
+        shown.insert(3, ("whether intervals hold", _select_traces(curves, result), text))
         groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}
         bars = draw_groups(groups, f"RMSE of the {label}", {})
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
