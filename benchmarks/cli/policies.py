@@ -16,13 +16,7 @@ from rich.table import Table
 from ... import __version__
 from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
-from .common import (
-    announce_torch,
-    get_command_line,
-    print_written,
-    show_episode,
-    write_output,
-)
+from .common import announce_torch, get_command_line, print_written, show_episode, write_output
 from .names import complete
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 

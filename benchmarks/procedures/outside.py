@@ -13,12 +13,7 @@ import numpy as np
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.outside.plants import (
-    OUTSIDE_PLANTS,
-    OutsideInputs,
-    OutsidePlant,
-    make_outside_vehicle,
-)
+from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
 from ...envs.record import Array
 from ...envs.scenarios.draws import Draws
 from ...envs.scenarios.scenario import Scenario

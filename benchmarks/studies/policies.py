@@ -19,13 +19,7 @@ from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
 from ...estimators.vector.estimate import EstimateObservation
-from ..control.entries import (
-    ADAPTIVE,
-    ORACLE_NAMES,
-    REFERENCE_FILTER,
-    ControlCase,
-    Entry,
-)
+from ..control.entries import ADAPTIVE, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import (

@@ -21,13 +21,7 @@ from ..engine.step import (
     make_step_variant,
     write_final_state,
 )
-from ..engine.tick import (
-    StepParams,
-    StepState,
-    TickInputs,
-    compute_inputs,
-    measure_tick,
-)
+from ..engine.tick import StepParams, StepState, TickInputs, compute_inputs, measure_tick
 from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
 from ..numerics.jit import as_python
 from ..numerics.packed import load_element, read, write
