@@ -36,7 +36,6 @@ from ..harness.parallel import run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
 from ..harness.verdict import format_percent, format_verdict
-from ..report.study import add_rows
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask
@@ -135,7 +134,7 @@ class PolicyEvaluation:
             metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
             numbers = {metric: interval(outcome[metric]) for metric in metrics}
             labels |= {"spec": ControlCase(task, entry).spec}
-            add_rows(suite, numbers, task.env_id, n=len(self.seeds), **labels)
+            suite.add_rows([numbers], task.env_id, n=len(self.seeds), **labels)
 
 
 def evaluate_policy(

@@ -40,26 +40,14 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How long a study is searched, and by whom.
+    """How long a study is searched, and by whom; ValueError where there are no trials."""
 
-    Attributes:
-        trials: Trials of the study, the finished ones included.
-        storage: RDB URL or SQLite file.
-        sampler: Name in `SAMPLERS`.
-        seed: Seed of the sampler.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-
-    Raises:
-        ValueError: There are no trials.
-    """
-
-    trials: int
-    storage: str = STORAGE
-    sampler: str = SAMPLERS[0]
-    seed: int = 0
-    jobs: int | None = None
-    console: Console | None = None
+    trials: int  # of the study, the finished ones included
+    storage: str = STORAGE  # RDB URL or SQLite file
+    sampler: str = SAMPLERS[0]  # name in `SAMPLERS`
+    seed: int = 0  # of the sampler
+    jobs: int | None = None  # processes, None for all processors
+    console: Console | None = None  # where progress is shown
 
     def __post_init__(self) -> None:
         if self.trials < 1:
