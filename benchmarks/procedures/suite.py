@@ -39,15 +39,8 @@ _TEXT = (
 )
 
 
-def measure(case: ProcedureCase) -> Any:
-    """Drive a case.
-
-    Args:
-        case: Procedure, car and controller.
-
-    Returns:
-        Result of its procedure.
-    """
+def _measure_case(case: ProcedureCase) -> Any:
+    """Drive a case; the result is one of its procedure's module."""
     if case.procedure == "outside":
         return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
     if case.procedure == "check":
@@ -110,7 +103,7 @@ def _make_verdict(done: CaseResults) -> str:
 def _measure(request: Request) -> CaseResults:
     """Drive every procedure with both cars and every controller, and the outside plants."""
     cases = _make_cases(request.quick)
-    return dict(zip(cases, request.run_cases(measure, cases, NAME), strict=True))
+    return dict(zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True))
 
 
 class _Table(NamedTuple):

@@ -18,7 +18,7 @@ def _ratio(squares: Mapping[str, Any], of: str, to: str) -> float:
 
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
-    squares = stack_seeds(estimation.run_filters((estimation.EXPERIMENTS[1], range(8))))
+    squares = stack_seeds(estimation._run_filters((estimation.EXPERIMENTS[1], range(8))))
     assert _ratio(squares, "dakf", "course-kf") <= 0.75
 
 
