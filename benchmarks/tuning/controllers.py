@@ -8,7 +8,7 @@ mean of `compute_log_ratios` over tasks and seeds: log(J / J_nominal), J_nominal
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -116,20 +116,6 @@ def _get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
     return tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
 
 
-def _make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float]) -> Options:
-    """Make the options of filter and controller from the values of numbers by name."""
-    options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
-    for number in numbers:
-        name, _, index = number.name.partition(".")
-        value = (round if number.is_integer else float)(values[number.name])
-        for part in number.of:
-            if index:
-                options[part].setdefault(name, []).append(value)
-            else:
-                options[part][name] = value
-    return options
-
-
 @dataclass(frozen=True)
 class ControllerTuning:
     """A search of a controller's numbers over the tasks of a class, on tuning seeds."""
@@ -166,7 +152,17 @@ class ControllerTuning:
         Returns:
             Options of filter and controller.
         """
-        return _make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
+        options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
+        for number in self.numbers:
+            name, _, index = number.name.partition(".")
+            rounded = float(f"{values[number.name]:.3g}")
+            value = round(rounded) if number.is_integer else rounded
+            for part in number.of:
+                if index:
+                    options[part].setdefault(name, []).append(value)
+                else:
+                    options[part][name] = value
+        return options
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:

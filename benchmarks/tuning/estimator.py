@@ -139,7 +139,8 @@ def make_estimator_tuning(
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
         if not _has_option(estimator, option, held, facts):
-            _build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+            wrong = {**facts, **held, option: 1.0}
+            call_quietly(make_estimator, estimator, **wrong)  # raises with what it has
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
@@ -155,13 +156,6 @@ def _check_range(option: str, limits: Range | None) -> Range:
     return float(low), float(high)
 
 
-def _build_estimator(
-    estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
-) -> Estimator:
-    """Build an estimator for an env's facts, without `UnobservableWarning`."""
-    return call_quietly(make_estimator, estimator, **facts, **options)
-
-
 def _make_unstable_option(estimator: str) -> dict[str, bool]:
     """Make the option that lets our filters be built though their error grows."""
     return {"allow_unstable": True} if estimator in FILTERS else {}
@@ -173,7 +167,7 @@ def _has_option(
     """Check whether the estimator has an option, whatever number suits it."""
     try:
         options = {**_make_unstable_option(estimator), **held, option: 1e-3}
-        _build_estimator(estimator, facts, options)
+        call_quietly(make_estimator, estimator, **facts, **options)
     except TypeError:
         return False
     except ValueError:
@@ -196,7 +190,7 @@ def _find_env(
                 env.reset(seed=FIRST_SEED)
                 facts = make_filter_arguments(env.unwrapped)
                 options = {**_make_unstable_option(estimator), **held}
-                filter_ = _build_estimator(estimator, facts, options)
+                filter_ = call_quietly(make_estimator, estimator, **facts, **options)
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
@@ -262,7 +256,7 @@ def compute_squares(
         clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
         key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
         if key not in filters:
-            filters[key] = _build_estimator(task.estimator, facts, options)
+            filters[key] = call_quietly(make_estimator, task.estimator, **facts, **options)
         late = log.time >= SETTLED - 1e-9
         with np.errstate(all="ignore"):
             error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]

@@ -23,7 +23,6 @@ from sideslip.benchmarks.tuning.controllers import (
     SearchNumber,
     _compute_objective,
     _list_contests,
-    _make_options,
     _run_contestant,
     tune,
 )
@@ -170,7 +169,8 @@ def test_numbers_become_options() -> None:
         both,
     )
     found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
-    assert _make_options(numbers, found) == {
+    task = controllers.ControllerTuning("lqr", "car-yaw", (), (0,), numbers)
+    assert task.options(found) == {
         "filter": {"disturbance_time": 0.2},
         "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
     }
