@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from safetensors.numpy import save
 
 from ... import __version__
@@ -179,11 +177,6 @@ class Policy:
     card: Card  # card of its training
 
     @property
-    def reads(self) -> npt.NDArray[np.bool_]:
-        """Whether the network reads each entry of the card's observation, shape (inputs,)."""
-        return self.network.reads
-
-    @property
     def salt(self) -> str:
         """Hexadecimal hash of the network, from which its test seeds are made."""
         digest = hashlib.sha256()
@@ -320,7 +313,7 @@ class PolicyController(Controller):
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
         name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
-        reads = self.policy.reads
+        reads = self.policy.network.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
         units = {entry.name: entry.unit for entry in facts.layout}
         wrong = [

@@ -131,7 +131,7 @@ class _Enjoy:
 def _show_card(console: Console, policy: "Policy") -> None:
     """Print a policy's card and the sizes of its network."""
     network = policy.network
-    unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
+    unread = [name for (name, _), read in zip(policy.card.observation, network.reads, strict=True)
               if not read]  # fmt: skip
     fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),

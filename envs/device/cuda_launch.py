@@ -10,8 +10,6 @@ import contextlib
 import ctypes
 import hashlib
 import json
-import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from types import SimpleNamespace
@@ -105,18 +103,6 @@ def _set_capability(capability: _Capability) -> Iterator[None]:
         yield
     finally:
         dispatcher.get_current_device = previous
-
-
-def count_opcodes(ptx: str) -> Counter[str]:
-    """Count the instructions of a PTX text.
-
-    Args:
-        ptx: PTX text.
-
-    Returns:
-        Their numbers by name.
-    """
-    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))
 
 
 def _make_context_current(device: torch.device) -> None:
