@@ -1,4 +1,4 @@
-"""Tuning of an estimator: its options and ranges, its error on drives, and the files of tunings."""
+"""Tuning of an estimator: its options and ranges, its drives, and the files of tunings."""
 
 import dataclasses
 import hashlib
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from rich.console import Console
 
 from ... import __version__
@@ -18,15 +17,13 @@ from ...agents.baselines import Options, read_tuned
 from ...agents.rollout import rollout
 from ...envs.io import to_toml
 from ...envs.numerics.kernel_cache import hash_sources
-from ...envs.record import Array
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
-from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
+from ..harness.drives import LoggedEpisode, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
-from ..harness.stats import root_mean
 from ..studies.estimation import EXPERIMENTS
 
 Range = tuple[float, float]
@@ -232,51 +229,6 @@ def simulate(
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
     done = run_cases(_simulate_case, cases, title, jobs, console)
     return [drive for drives in done for drive in drives]
-
-
-def compute_squares(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
-) -> Array:
-    """Compute the target's mean squared error from `SETTLED` s on.
-
-    Args:
-        task: Tuning.
-        drives: Drives of `simulate`.
-        values: Values of the options that are searched.
-
-    Returns:
-        Squared errors, infinite where an estimate is not finite, shape (scenarios, seeds).
-
-    Raises:
-        ValueError: The estimator fails.
-    """
-    options, turn = task.options | dict(values), 2.0 * math.pi
-    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
-    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
-        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
-        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
-        if key not in filters:
-            filters[key] = call_quietly(make_estimator, task.estimator, **facts, **options)
-        late = log.time >= SETTLED - 1e-9
-        with np.errstate(all="ignore"):
-            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
-            if task.unit == "rad":
-                error = np.remainder(error + math.pi, turn) - math.pi
-            errors[i] = np.mean(error**2)
-    finite = np.where(np.isfinite(errors), errors, np.inf)
-    return finite.reshape(len(task.scenarios), -1)
-
-
-def compute_objective(errors: Array) -> float:
-    """Compute the geometric mean of the scenarios' RMSE.
-
-    Args:
-        errors: Squared errors, shape (scenarios, seeds).
-
-    Returns:
-        Geometric mean.
-    """
-    return float(np.exp(np.mean(np.log(root_mean(errors)))))
 
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
