@@ -59,10 +59,7 @@ def _make_step(car: TestCar, steer: float) -> Fields:
 
 
 def _compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
-    """Compute the standard's numbers of a step that is held to the end; t, steer, output: (n,).
-
-    The steady state is the mean of the last half second. Raises ValueError without a step.
-    """
+    """Compute the numbers of a step that is held to the end, (n,) each; ValueError without one."""
     end = float(steer[-1])
     if end == 0.0:
         raise ValueError("a step response needs a steering angle at its end, got 0")

@@ -106,18 +106,6 @@ class Request:
         return [[item for _ in chunks for item in next(results)] for _ in conditions]
 
 
-def stack_seeds(drives: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, Array]:
-    """Stack the numbers of entries over seeds.
-
-    Args:
-        drives: Numbers of each entry by name, of every seed.
-
-    Returns:
-        Numbers by name, shape (seeds, numbers).
-    """
-    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
-
-
 class CaseStorage(NamedTuple, Generic[Case, Result]):
     """Finished cases as arrays in files, whose names are hashes of all that they depend on."""
 

@@ -20,7 +20,7 @@ from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
-from ..report.study import Request, Study, stack_seeds
+from ..report.study import Request, Study
 
 _CHUNK = 5
 _COLUMNS = (
@@ -103,7 +103,12 @@ def _run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple
 def _measure(request: Request) -> Results:
     seeds = request.episodes or 0
     drives = request.run_seeds(_run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
-    return list(map(stack_seeds, drives))
+    return list(map(_stack_seeds, drives))
+
+
+def _stack_seeds(drives: Sequence[Mapping[str, tuple[float, float]]]) -> dict[str, Array]:
+    """Stack the numbers of every seed to (seeds, 2), by name."""
+    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
 
 
 def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:
