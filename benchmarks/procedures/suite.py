@@ -88,7 +88,7 @@ def _make_verdict(done: CaseResults) -> str:
         failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
         runs = results[iso3888.TRACKS[0]]
-        speeds = {c.agent: 3.6 * iso3888.find_highest_speed(item) for c, item in runs.items()}
+        speeds = {c.agent: 3.6 * _find_highest_speed(item) for c, item in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
         lanes.append(f"{car} {max_speed:.0f} with {fast} (none {speeds['none']:.0f})")
@@ -98,6 +98,11 @@ def _make_verdict(done: CaseResults) -> str:
         f"Fastest clean lane change, km/h: {'; '.join(lanes)}.",
         "Not covered: a real car; outside plants, on equations that are not ours, have a table.",
     )
+
+
+def _find_highest_speed(runs: Sequence[iso3888.TrackRun]) -> float:
+    """Find the highest speed (m/s) of a clean run; 0 where there is none."""
+    return max((run.speed for run in runs if run.passed), default=0.0)
 
 
 def _measure(request: Request) -> CaseResults:
@@ -164,7 +169,7 @@ def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
     lines: dict[tuple[str, str], dict[str, object]] = {}
     for track, results in done.items():
         for case, runs in results.items():
-            speed = iso3888.find_highest_speed(runs)
+            speed = _find_highest_speed(runs)
             suite.add_rows([_make_record(case, speed=speed, n=len(runs))])
             line = lines.setdefault((case.agent, case.car), _make_record(case))
             line[track] = 3.6 * speed if speed else "none clean"
