@@ -73,7 +73,7 @@ class Card:
             raise ValueError("observation names an entry twice")
         check_types(Card, vars(self), "the card")
         check_names_no_code(self.env_id, self.estimator, self.estimator_options)
-        self.to_json()
+        self._to_json()
 
     @classmethod
     def from_env_id(
@@ -120,18 +120,8 @@ class Card:
         rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
         return cls(control_period=int(facts.control_period), reference=facts.reference, **rest)
 
-    def to_json(self, **extra: Any) -> str:
-        """Convert the card to a JSON object.
-
-        Args:
-            extra: Further fields.
-
-        Returns:
-            Text of the object.
-
-        Raises:
-            ValueError: The card or a field has a value that JSON does not have.
-        """
+    def _to_json(self, **extra: Any) -> str:
+        """Convert the card, with further fields, to a JSON object; ValueError for other types."""
         try:
             return json.dumps(asdict(self) | extra, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -235,7 +225,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
             f"the card's observation has {len(card.observation)} entries, "
             f"the network takes {network.inputs}"
         )
-    metadata = {"format": str(FORMAT), "card": card.to_json(network=network.description)}
+    metadata = {"format": str(FORMAT), "card": card._to_json(network=network.description)}
     write_atomic(target, save(network.tensors, metadata))
 
 

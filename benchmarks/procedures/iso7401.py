@@ -88,9 +88,7 @@ def _estimate_frequency_response(t: Array, steer: Array, output: Array) -> Frequ
     rate = (len(t) - 1) / duration
     length = round(_SEGMENT * rate)
     if length > len(t):
-        raise ValueError(
-            f"a segment of {_SEGMENT} s is longer than the {duration:.1f} s driven"
-        )
+        raise ValueError(f"a segment of {_SEGMENT} s is longer than the {duration:.1f} s driven")
     options = {"fs": rate, "nperseg": length, "detrend": False}
     frequency, S_xx = welch(steer, **options)
     S_yy, S_xy = welch(output, **options)[1], csd(steer, output, **options)[1]

@@ -143,15 +143,8 @@ class ControllerTuning:
         """Value of each number at which the search starts."""
         return {number.name: number.start for number in self.numbers}
 
-    def options(self, values: dict[str, float]) -> Options:
-        """Make the options from values of the numbers, rounded to three digits.
-
-        Args:
-            values: Value of each number by name.
-
-        Returns:
-            Options of filter and controller.
-        """
+    def _make_options(self, values: dict[str, float]) -> Options:
+        """Make the options of filter and controller from numbers, rounded to three digits."""
         options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
         for number in self.numbers:
             name, _, index = number.name.partition(".")
@@ -209,7 +202,7 @@ def _compute_objective(
     task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
-    options, log_ratios = task.options(values), []
+    options, log_ratios = task._make_options(values), []
     for contest in task.contests:
         result = _run_contestant(contest, task.name, options, seeds)
         if result.error:
@@ -253,7 +246,7 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
         ValueError: The controller cannot drive a task, the storage fails, or no trial that drove
             all seeds is finite.
     """
-    options = task.options(task.start)
+    options = task._make_options(task.start)
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
         if error := _run_contestant(contest, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
@@ -286,7 +279,7 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
         "seeds": list(task.seeds),
         "start": rows[0]["objective"],
         "best": best,
-        "options": task.options(best["numbers"]),
+        "options": task._make_options(best["numbers"]),
         "trials": rows,
     }
 

@@ -30,7 +30,7 @@ def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
     found = _count_opcodes(text)
     assert ".target sm_90" in text
     head = text[text.index(f".visible .entry {NAME}(") :].partition(")")[0]
-    kinds = re.findall(r"\.param \.(\w+)", head)  # what `DriverKernel` hands over
+    kinds = re.findall(r"\.param \.(\w+)", head)  # what `_DriverKernel` hands over
     assert kinds == ["u64", "u8", *["u64"] * len(DeviceArrays._fields)]
     assert not [each for each in found if each.startswith(("fma", "mad"))]
     floats = [each for each in found if re.match(r"(add|sub|mul|div|rcp|sqrt)\S*\.f", each)]
