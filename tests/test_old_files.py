@@ -157,10 +157,10 @@ def test_a_training_goes_on_from_its_checkpoint(
 ) -> None:
     pytest.importorskip("stable_baselines3")
     from sideslip.agents.training import trainer
-    from sideslip.agents.training.callbacks import read_state
+    from sideslip.agents.training.callbacks import CHECKPOINT, read_state
 
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
-    state = read_state(folder / trainer.CHECKPOINT)
+    state = read_state(folder / CHECKPOINT)
     monkeypatch.setattr(trainer, "__version__", state["sideslip"])
     task = trainer.read_training(folder).task
     found = trainer.Trainer(task, state["steps"], folder, resume=True).train()

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from safetensors.numpy import save
 
 from ... import __version__
@@ -75,7 +73,7 @@ class Card:
             raise ValueError("observation names an entry twice")
         check_types(Card, vars(self), "the card")
         check_names_no_code(self.env_id, self.estimator, self.estimator_options)
-        self.to_json()
+        self._to_json()
 
     @classmethod
     def from_env_id(
@@ -122,18 +120,8 @@ class Card:
         rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
         return cls(control_period=int(facts.control_period), reference=facts.reference, **rest)
 
-    def to_json(self, **extra: Any) -> str:
-        """Convert the card to a JSON object.
-
-        Args:
-            extra: Further fields.
-
-        Returns:
-            Text of the object.
-
-        Raises:
-            ValueError: The card or a field has a value that JSON does not have.
-        """
+    def _to_json(self, **extra: Any) -> str:
+        """Convert the card, with further fields, to a JSON object; ValueError for other types."""
         try:
             return json.dumps(asdict(self) | extra, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -177,11 +165,6 @@ class Policy:
     name: str  # name of the file without its ending
     network: Network  # network that computes the action
     card: Card  # card of its training
-
-    @property
-    def reads(self) -> npt.NDArray[np.bool_]:
-        """Whether the network reads each entry of the card's observation, shape (inputs,)."""
-        return self.network.reads
 
     @property
     def salt(self) -> str:
@@ -242,7 +225,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
             f"the card's observation has {len(card.observation)} entries, "
             f"the network takes {network.inputs}"
         )
-    metadata = {"format": str(FORMAT), "card": card.to_json(network=network.description)}
+    metadata = {"format": str(FORMAT), "card": card._to_json(network=network.description)}
     write_atomic(target, save(network.tensors, metadata))
 
 
@@ -320,7 +303,7 @@ class PolicyController(Controller):
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
         name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
-        reads = self.policy.reads
+        reads = self.policy.network.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
         units = {entry.name: entry.unit for entry in facts.layout}
         wrong = [

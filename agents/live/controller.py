@@ -89,23 +89,19 @@ class OnboardController:
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
         self._estimates: tuple[Array, ...] = tuple(np.zeros((2, 1, len(self.names))))
         self.x, self.std = (values[0] for values in self._estimates)
-        self.begin(0)
+        self._begin(0)
         row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
             self.take(Tick(number, row, 0.0, packet, number == 0))
-        self.begin(0)
+        self._begin(0)
 
     @property
     def refused(self) -> dict[str, int]:
         """Counts of packets that a compiled `Estimator` did not use, by reason; else empty."""
         return self.estimator.counts if self._is_native else {}
 
-    def begin(self, first: int) -> None:
-        """Clear all memory.
-
-        Args:
-            first: Number of the next tick.
-        """
+    def _begin(self, first: int) -> None:
+        """Clear all memory; the next tick has the number `first`."""
         self.estimator.reset(self.sensors, first)
         self._z = np.zeros(STATE_WIDTH)  # packed state, laid out as `Z`; no measurement
         self._refs = None
@@ -123,7 +119,7 @@ class OnboardController:
             tick: Data of the tick.
         """
         if tick.begins:
-            self.begin(tick.number)
+            self._begin(tick.number)
         n, row = self.facts.control_period, tick.row
         if self._is_native:
             packets = tick.packets

@@ -35,27 +35,6 @@ clock = time.monotonic_ns
 """Time of the monotonic clock, which is never set (ns)."""
 
 
-def parse_address(text: str) -> Address:
-    """Parse HOST:PORT or PORT to an IPv4 address.
-
-    Args:
-        text: Text of the address; without a host it is `LOOPBACK`'s.
-
-    Returns:
-        Host as an IPv4 address, and port.
-
-    Raises:
-        ValueError: The text is no address, or the host is unknown.
-    """
-    host, _, number = text.rpartition(":")
-    if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
-        raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
-    try:
-        return socket.gethostbyname(host or LOOPBACK), int(number)
-    except OSError as error:
-        raise ValueError(f"{text!r} is no address of IPv4: {error}") from None
-
-
 def wait_until(deadline: int) -> None:
     """Wait until a point in time.
 

@@ -331,10 +331,7 @@ def _compute_equal_weights(costs: Array) -> Array:
 
 
 def _compute_scenario_weights(task: TrainingTask, first: int = _WEIGHT_SEEDS) -> Array:
-    """Compute each scenario's weight by the uncontrolled cost of a control period, from a seed on.
-
-    The weight is 1, shape (1,), for a task without a mixture.
-    """
+    """Compute scenarios' weights by uncontrolled costs of a period; without a mixture 1, (1,)."""
     k = len(task.scenarios)
     if not k:
         return np.ones(1)

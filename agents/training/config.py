@@ -16,7 +16,6 @@ from typing import Any
 from ...envs.numerics import require_extra
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.validation import check_choice, is_finite
-from .. import zoo
 from ..env_info import CarVectorEnv
 from ..vec_env import make_native_env
 from .export import list_activations
@@ -291,34 +290,3 @@ class TrainingTask:
         policy_kwargs["features_extractor_kwargs"] = scaling._asdict()
         options |= {"policy_kwargs": policy_kwargs, "stats_window_size": env.num_envs}
         return self.algorithm.load()(self.settings["policy"], env, **options, **rest)
-
-    def find_zoo_folder(self, logs: Path) -> Path:
-        """Find the folder that rl-baselines3-zoo would use for the next training of this kind.
-
-        Args:
-            logs: Folder of all trainings.
-
-        Returns:
-            Path of the folder.
-
-        Raises:
-            ValueError: The zoo does not have the algorithm.
-        """
-        if self.algorithm.on_tensors:
-            raise ValueError(f"rl-baselines3-zoo has no {self.algo}: its folder is no use")
-        return zoo.find_next_folder(logs, self.algorithm.zoo, self.env_id)
-
-    def describe_for_zoo(self, folder: Path, steps: int, eval_freq: int) -> None:
-        """Make a folder of `find_zoo_folder` with the files of the zoo's `enjoy`.
-
-        Args:
-            folder: Folder to make.
-            steps: Steps of the training.
-            eval_freq: Steps between two evaluations.
-        """
-        first = {"scenario": self.scenarios[0]} if self.scenarios else {}
-        arguments = dict[str, Any](algo=self.algorithm.zoo, env=self.env_id)
-        arguments |= {"env_kwargs": self.env_options | first, "eval_freq": eval_freq}
-        arguments |= {"n_eval_envs": self.n_eval_envs, "n_timesteps": steps, "seed": self.seed}
-        settings = self.settings | {"n_envs": self.num_envs}
-        zoo.describe(folder, settings, self.estimator_kwargs, arguments)

@@ -24,15 +24,11 @@ from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy
 from ..rollout import COST_FLOOR
 from ..vec_env import make_vec_env
 from .callbacks import (
-    BEST,
     CHECKPOINT,
-    CURVE,
-    POLICY,
     WARM_START_FILE,
     Checkpoint,
     EvalCallback,
     Evaluation,
-    Progress,
     RunOptions,
     RunRecord,
     read_state,
@@ -54,10 +50,6 @@ if TYPE_CHECKING:
     from .. import Agent
     from .gradient import TrainingSource
 
-__all__ = [
-    "BEST", "CHECKPOINT", "CURVE", "POLICY", "EvalCallback", "Progress", "RunOptions", "RunRecord",
-    "TrainResult", "Trainer", "TrainingTask", "read_training",
-]  # fmt: skip
 _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e

@@ -351,10 +351,7 @@ class _MemoryObservation(
 
 
 def _measure_whitening(env: CarVectorEnv, network: Network, seed: int) -> tuple[Array, Array]:
-    """Measure mean and whitening of what a network remembers in its own drives.
-
-    They are one episode of each row from a seed on.
-    """
+    """Measure mean and whitening of a network's memory in an episode a row, from a seed on."""
     collected, agent = [], _NetworkAgent(network.dense)
     drive = iterate_steps(_MemoryObservation(env, network), agent, seed)
     for step in itertools.islice(drive, 0, None, SAMPLE_STRIDE):

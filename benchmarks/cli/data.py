@@ -20,16 +20,7 @@ from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
 from .common import print_written, write_output
 from .names import complete
-from .options import (
-    File,
-    Text,
-    Texts,
-    check_file,
-    parse_options,
-    register,
-    take,
-    take_argument,
-)
+from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
     from ...envs.sensors.camera.images import Image

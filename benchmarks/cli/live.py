@@ -3,6 +3,7 @@
 import json as writer  # a command's option is called json
 import os
 import signal
+import socket
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -62,16 +63,16 @@ class _Live:
     trust: bool
 
     def run(self) -> None:
-        from ...agents.live.loop import LOOPBACK, parse_address
+        from ...agents.live.loop import LOOPBACK
 
-        target = parse_address(self.to) if self.to else (LOOPBACK, self.port)
+        target = _parse_address(self.to) if self.to else (LOOPBACK, self.port)
         setup = make_setup(vars(self))
         if self.relay is not None:
             self._relay(self.relay, target)
         elif self.replay is not None:
             self._replay(self.replay, setup)
         elif self.estimator is not None:
-            self._run_loop(setup, [parse_address(text) for text in self.publish or []])
+            self._run_loop(setup, [_parse_address(text) for text in self.publish or []])
         elif self.simulate:
             self._simulate(setup, target)
         else:
@@ -181,6 +182,17 @@ class _Live:
         if self.json is not None:
             write_atomic(self.json, (writer.dumps(numbers, indent=1) + "\n").encode())
             print_written(console, self.json)
+
+
+def _parse_address(text: str) -> tuple[str, int]:
+    """Parse HOST:PORT, or PORT of this machine, to an address of IPv4."""
+    host, _, number = text.rpartition(":")
+    if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
+        raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
+    try:
+        return socket.gethostbyname(host or "127.0.0.1"), int(number)
+    except OSError as error:
+        raise ValueError(f"{text!r} is no address of IPv4: {error}") from None
 
 
 def _watch_signals() -> list[int]:

@@ -1,5 +1,6 @@
 """The command line `sideslip`: all commands, with `list`, `run` and `bench` themselves."""
 
+import copy
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -115,16 +116,27 @@ class _Run:
     trust: bool
 
     def run(self) -> None:
+        from ...agents import make_agent
         from ...agents.rollout import rollout
-        from ..report.film import FilmDriver, check_film, write_drive_film
+        from ..report.film import FilmDriver, check_film, write_film
 
         check_film(self.video)
+        if self.beside is not None and self.video is None:
+            text = "can only drive beside in a film: --video names its file"
+            raise ValueError(f"{self.beside!r} {text}")
         driver = FilmDriver(self.agent, *make_driver(make_setup(vars(self)), self.trust))
         if self.env is None and driver.env.spec is not None:
             console.print(f"on {driver.env.spec.id}", highlight=False)
         drive = rollout(driver.env, driver.agent, self.seed)
         show_episode(console, drive, self.agent, vars(self))
-        write_drive_film(self.video, driver, self.beside, self.seed, console)
+        if self.video is not None:
+            drivers = [driver]
+            if self.beside is not None:
+                env = copy.deepcopy(driver.env)
+                name = "no control" if self.beside == "none" else self.beside
+                drivers.append(FilmDriver(name, env, make_agent(self.beside, env)))
+            write_film(self.video, drivers, self.seed, console)
+            print_written(console, self.video)
 
 
 @register("bench", "Compare estimators and controllers.")

@@ -16,13 +16,7 @@ from rich.table import Table
 from ... import __version__
 from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
-from .common import (
-    announce_torch,
-    get_command_line,
-    print_written,
-    show_episode,
-    write_output,
-)
+from .common import announce_torch, get_command_line, print_written, show_episode, write_output
 from .names import complete
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
@@ -137,7 +131,7 @@ class _Enjoy:
 def _show_card(console: Console, policy: "Policy") -> None:
     """Print a policy's card and the sizes of its network."""
     network = policy.network
-    unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
+    unread = [name for (name, _), read in zip(policy.card.observation, network.reads, strict=True)
               if not read]  # fmt: skip
     fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),

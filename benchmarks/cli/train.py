@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -119,7 +119,7 @@ class _Train:
                 eval_freq, self.device, self.tensorboard_log, show, command, project
             )
             if logs is not None:
-                task.describe_for_zoo(folder, steps, eval_freq)
+                _describe_for_zoo(task, folder, steps, eval_freq)
             try:
                 training = task, steps, folder, resume, run_options, agent, self.trust
                 trained = trainer.Trainer(*training).train()
@@ -187,7 +187,11 @@ def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Pat
     if logs is not None:
         if out is not None:
             raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")
-        return task.find_zoo_folder(logs)
+        from ...agents import zoo
+
+        if task.algorithm.on_tensors:
+            raise ValueError(f"rl-baselines3-zoo has no {task.algo}: its folder is no use")
+        return zoo.find_next_folder(logs, task.algorithm.zoo, task.env_id)
     if out is not None:
         return out
     env_options = task.env_options.items()
@@ -195,3 +199,15 @@ def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Pat
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
+
+
+def _describe_for_zoo(task: "TrainingTask", folder: Path, steps: int, eval_freq: int) -> None:
+    """Make a folder of `_choose_folder` with the files of the zoo's `enjoy`."""
+    from ...agents import zoo
+
+    first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+    arguments = dict[str, Any](algo=task.algorithm.zoo, env=task.env_id)
+    arguments |= {"env_kwargs": task.env_options | first, "eval_freq": eval_freq}
+    arguments |= {"n_eval_envs": task.n_eval_envs, "n_timesteps": steps, "seed": task.seed}
+    settings = task.settings | {"n_envs": task.num_envs}
+    zoo.describe(folder, settings, task.estimator_kwargs, arguments)

@@ -71,17 +71,6 @@ class Metric:
     digits: int = 1  # decimal places of a number there
     turning: bool = False  # whether it is meaningful only where the reference has a yaw rate
 
-    def text(self, value: float) -> str:
-        """Format a value for the metric's column.
-
-        Args:
-            value: Number in the metric's unit.
-
-        Returns:
-            Text in the column's unit.
-        """
-        return f"{self.scale * value:.{self.digits}f}"
-
 
 def _make_error(name: str) -> Callable[[StepSample], Array]:
     return lambda m: m.info[name] - m.info[f"{name}_ref"]

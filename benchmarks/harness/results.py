@@ -55,20 +55,6 @@ class ResultRow:
         check_choice("metric", self.metric, METRICS)
         check_choice("verdict", self.verdict, VERDICTS)
 
-    @classmethod
-    def from_estimate(cls, metric: str, number: Estimate, **columns: Any) -> "ResultRow":
-        """Make a row from a number with its interval.
-
-        Args:
-            metric: Name of the metric.
-            number: Number and interval.
-            columns: Other fields of the row.
-
-        Returns:
-            Row.
-        """
-        return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
-
 
 _COLUMNS = {item.name for item in fields(ResultRow)} - {"suite", "metric", "value", "low", "high"}
 
@@ -207,8 +193,8 @@ class Suite:
                     continue
                 number = Estimate(*cell) if isinstance(cell, tuple) else Estimate(float(cell))
                 if math.isfinite(number.value):
-                    row = ResultRow.from_estimate(metric, number, suite=self.name, **columns)
-                    self.rows.append(row)
+                    columns |= number._asdict() | {"suite": self.name, "metric": metric}
+                    self.rows.append(ResultRow(**columns))
 
     def to_pandas(self) -> "DataFrame":
         """Convert the rows to a pandas table (needs the extra `report`)."""

@@ -29,19 +29,6 @@ class Estimate(NamedTuple):
     low: float = math.nan
     high: float = math.nan
 
-    def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
-        """Format number and interval as two cells of a table.
-
-        Args:
-            scale: Factor of the numbers.
-            digits: Format of the numbers.
-
-        Returns:
-            Number and interval, "" without one.
-        """
-        value, low, high = (f"{scale * number:{digits}}" for number in self)
-        return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
-
     def rescale(self, factor: float) -> "Estimate":
         """Multiply number and interval.
 

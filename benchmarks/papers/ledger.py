@@ -102,15 +102,8 @@ class ClaimPart:
     pick: Callable[..., Array] = np.min  # the best of the rivals; `np.max`: the poorest
     is_pooled: bool = False  # RMS values over all seeds together are divided
 
-    def measure(self, results: Results) -> Array:
-        """Measure the number of each seed.
-
-        Args:
-            results: Results of all simulations.
-
-        Returns:
-            Numbers, shape (seeds,).
-        """
+    def _measure(self, results: Results) -> Array:
+        """Measure the number of each seed, shape (seeds,)."""
         numbers = results[self.scenario].numbers
         one = numbers[self.subject, self.quantity]
         others = [numbers[rival, self.quantity] for rival in self.rivals]
@@ -209,7 +202,7 @@ class Claim:
         """
         parts = []
         for part in self.parts:
-            values = np.atleast_1d(np.asarray(part.measure(results), np.float64))
+            values = np.atleast_1d(np.asarray(part._measure(results), np.float64))
             if values.ndim != 1 or not len(values):
                 raise ValueError(
                     f"{self.paper} {self.source}, {part.label}: {values.shape} numbers"

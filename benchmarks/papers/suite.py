@@ -41,8 +41,6 @@ _TEXT = (
     "plant has: Fiala tyres, lags, roll, wandering HDOP."
 )
 
-Case = tuple[str, tuple[int, ...]]
-
 
 class LedgerResults(NamedTuple):
     """The measured claims, and the signals of simulations by name."""
@@ -51,15 +49,8 @@ class LedgerResults(NamedTuple):
     examples: dict[str, Example | None]
 
 
-def measure(case: Case) -> SimulationResult:
-    """Measure one simulation on a few of its seeds.
-
-    Args:
-        case: Name and seeds.
-
-    Returns:
-        Numbers of the seeds.
-    """
+def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
+    """Measure one simulation on a few of its seeds; case: its name and the seeds."""
     name, seeds = case
     return SIMULATIONS[name].measure(seeds)
 
@@ -69,7 +60,7 @@ def _measure(request: Request) -> LedgerResults:
     seeds = request.episodes or 0
     cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
     results: dict[str, SimulationResult] = {}
-    for (name, _), result in zip(cases, request.run_cases(measure, cases, NAME), strict=True):
+    for (name, _), result in zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True):
         results[name] = results[name] + result if name in results else result
     ledger = [claim.measure(results) for claim in CLAIMS]
     return LedgerResults(ledger, {name: result.example for name, result in results.items()})

@@ -157,6 +157,8 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
 
     Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
     """
+    import control
+
     hits = []
     for values in itertools.product(*_GRID.values()):
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
@@ -168,18 +170,13 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
                 break
             loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = _compute_gain_margin(loop)
-            if abs(omega * dt - math.pi) > 1e-9 or not _is_stable(loop):
+            is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
+            if abs(omega * dt - math.pi) > 1e-9 or not is_stable:
                 break
             margins.append(decibels)
         if len(margins) == len(PRINTED):
             hits.append(_LoopMatch(design, (margins[0], margins[1])))
     return sorted(hits, key=lambda hit: hit.off)
-
-
-def _is_stable(loop: "StateSpace") -> bool:
-    import control
-
-    return bool(np.abs(control.feedback(loop, 1).poles()).max() < 1.0)
 
 
 # Gain margins: how much the loops of the paper's Table II may grow until they reach -1.

@@ -71,10 +71,7 @@ def _make_slow_steer(car: TestCar, side: float) -> Fields:
 
 
 def _fit_reference_angle(series: Series, ratio: float) -> float:
-    """Fit |A| (rad at the steering wheel): where the line through 0.1 to 0.375 g crosses 0.3 g.
-
-    Raises ValueError where the car never gets there.
-    """
+    """Fit |A| (rad): where a line through 0.1 to 0.375 g crosses 0.3 g; ValueError below these."""
     a_y = np.abs(series.a_y)
     past_range = np.flatnonzero(a_y > A_TO)
     if not len(past_range):

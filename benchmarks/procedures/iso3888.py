@@ -149,15 +149,3 @@ def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float])
         Run of the best driver at each speed.
     """
     return [_try_speed(drive, car, track, speed) for speed in speeds]
-
-
-def find_highest_speed(runs: Sequence[TrackRun]) -> float:
-    """Find the highest speed of a clean run.
-
-    Args:
-        runs: Runs through one track at several speeds.
-
-    Returns:
-        Speed (m/s); 0 where there is none.
-    """
-    return max((track_run.speed for track_run in runs if track_run.passed), default=0.0)

@@ -41,10 +41,7 @@ def compute_understeer_gradient(vehicle: Vehicle) -> float:
 
 
 def _compute_handling(series: Series, vehicle: Vehicle) -> Handling:
-    """Compute the handling diagram of a circle, and the slope in its linear range.
-
-    Raises ValueError where the car does not reach the end of that range.
-    """
+    """Compute a circle's handling diagram and slope; ValueError where it stays below 0.25 g."""
     settled = series.t >= _SETTLE
     side = np.sign(np.mean(series.gamma[settled]))
     a_y = side * (series.v_x * series.gamma)[settled]  # quasi-steady: v_y' is left out

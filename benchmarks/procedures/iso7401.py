@@ -59,10 +59,7 @@ def _make_step(car: TestCar, steer: float) -> Fields:
 
 
 def _compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
-    """Compute the standard's numbers of a step that is held to the end; t, steer, output: (n,).
-
-    The steady state is the mean of the last half second. Raises ValueError without a step.
-    """
+    """Compute the numbers of a step that is held to the end, (n,) each; ValueError without one."""
     end = float(steer[-1])
     if end == 0.0:
         raise ValueError("a step response needs a steering angle at its end, got 0")
@@ -83,20 +80,19 @@ def _find_crossing(t: Array, values: Array, level: float) -> float:
     return float(t[k - 1] + part * (t[k] - t[k - 1]))
 
 
-def _estimate_frequency_response(
-    t: Array, steer: Array, output: Array, segment: float = _SEGMENT
-) -> FrequencyResponse:
+def _estimate_frequency_response(t: Array, steer: Array, output: Array) -> FrequencyResponse:
     """Estimate the frequency response of output to steering from 0.2 to 2 Hz; arrays: (n,)."""
     from scipy.signal import csd, welch
 
-    rate = (len(t) - 1) / float(t[-1] - t[0])
-    length = round(segment * rate)
+    duration = float(t[-1] - t[0])
+    rate = (len(t) - 1) / duration
+    length = round(_SEGMENT * rate)
     if length > len(t):
-        raise ValueError(f"a segment of {segment} s is longer than the {t[-1] - t[0]:.1f} s driven")
+        raise ValueError(f"a segment of {_SEGMENT} s is longer than the {duration:.1f} s driven")
     options = {"fs": rate, "nperseg": length, "detrend": False}
     frequency, S_xx = welch(steer, **options)
     S_yy, S_xy = welch(output, **options)[1], csd(steer, output, **options)[1]
-    half = 0.5 / segment  # between two lines: rounding decides nothing
+    half = 0.5 / _SEGMENT  # between two lines: rounding decides nothing
     in_range = (frequency > LOWEST - half) & (frequency < HIGHEST + half)
     H = (S_xy / S_xx)[in_range]
     coherence = (np.abs(S_xy) ** 2 / (S_xx * S_yy))[in_range]

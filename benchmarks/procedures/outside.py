@@ -13,12 +13,7 @@ import numpy as np
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.outside.plants import (
-    OUTSIDE_PLANTS,
-    OutsideInputs,
-    OutsidePlant,
-    make_outside_vehicle,
-)
+from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
 from ...envs.record import Array
 from ...envs.scenarios.draws import Draws
 from ...envs.scenarios.scenario import Scenario
@@ -64,14 +59,11 @@ def _compute_limited_moment(motion: Motion, steer: float) -> float:
 
 
 def _make_plant_drive(model: str, law: Law | None = None) -> DriveFunction:
-    """Make drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
-
-    The scenario's field `acceleration` None holds the speed, 0 lets the car coast.
-    """
+    """Make drives of an outside plant alone, its steering prescribed and no actuator's lag."""
 
     def run_drive(fields: Fields) -> Series:
         scenario = Scenario(**(CALM | dict(fields)))
-        profile, hold = _make_steering_profile(scenario), scenario.acceleration is None
+        profile, hold = _make_steering_profile(scenario), scenario.acceleration is None  # 0: coasts
         return _simulate_plant(
             OUTSIDE_PLANTS[model](None),
             lambda t: float(compute_steering(t / TICK, profile)),
@@ -89,13 +81,10 @@ def _simulate_plant(
     steering: Callable[[float], float],
     speed: float,
     duration: float,
-    hold: bool = False,
+    hold: bool = False,  # a force keeps the speed (m/s); otherwise the car coasts
     law: Law | None = None,
 ) -> Series:
-    """Simulate an outside plant from straight ahead under a steering angle (rad) over time (s).
-
-    hold: a force keeps the speed (m/s); otherwise the car coasts.
-    """
+    """Simulate an outside plant from straight ahead under a steering angle (rad) over time (s)."""
     plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     rows = [[0.0, steering(0.0), *plant.motion[:POSE], 0.0]]
     for k in range(round(duration / TICK)):
@@ -111,10 +100,7 @@ def _simulate_plant(
 
 
 def _make_steering_profile(scenario: Scenario) -> Array:
-    """Make the numbers that `compute_steering` reads, of a scenario that draws nothing.
-
-    Raises ValueError for a range: a procedure leaves nothing to the seed.
-    """
+    """Make the numbers that `compute_steering` reads; ValueError for a scenario that draws some."""
     low, high = scenario.get_draw_ranges()
     if (low != high).any():
         raise ValueError(f"scenario {scenario.name!r} draws; a procedure gives numbers")

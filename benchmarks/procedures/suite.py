@@ -39,15 +39,8 @@ _TEXT = (
 )
 
 
-def measure(case: ProcedureCase) -> Any:
-    """Drive a case.
-
-    Args:
-        case: Procedure, car and controller.
-
-    Returns:
-        Result of its procedure.
-    """
+def _measure_case(case: ProcedureCase) -> Any:
+    """Drive a case; the result is one of its procedure's module."""
     if case.procedure == "outside":
         return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
     if case.procedure == "check":
@@ -95,7 +88,7 @@ def _make_verdict(done: CaseResults) -> str:
         failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
         runs = results[iso3888.TRACKS[0]]
-        speeds = {c.agent: 3.6 * iso3888.find_highest_speed(item) for c, item in runs.items()}
+        speeds = {c.agent: 3.6 * _find_highest_speed(item) for c, item in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
         lanes.append(f"{car} {max_speed:.0f} with {fast} (none {speeds['none']:.0f})")
@@ -107,10 +100,15 @@ def _make_verdict(done: CaseResults) -> str:
     )
 
 
+def _find_highest_speed(runs: Sequence[iso3888.TrackRun]) -> float:
+    """Find the highest speed (m/s) of a clean run; 0 where there is none."""
+    return max((run.speed for run in runs if run.passed), default=0.0)
+
+
 def _measure(request: Request) -> CaseResults:
     """Drive every procedure with both cars and every controller, and the outside plants."""
     cases = _make_cases(request.quick)
-    return dict(zip(cases, request.run_cases(measure, cases, NAME), strict=True))
+    return dict(zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True))
 
 
 class _Table(NamedTuple):
@@ -171,7 +169,7 @@ def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
     lines: dict[tuple[str, str], dict[str, object]] = {}
     for track, results in done.items():
         for case, runs in results.items():
-            speed = iso3888.find_highest_speed(runs)
+            speed = _find_highest_speed(runs)
             suite.add_rows([_make_record(case, speed=speed, n=len(runs))])
             line = lines.setdefault((case.agent, case.car), _make_record(case))
             line[track] = 3.6 * speed if speed else "none clean"

@@ -1,6 +1,5 @@
 """Films of drives, with other cars as ghosts, as MP4 or GIF; and tracks for map programs (KML)."""
 
-import copy
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ...agents import Agent, make_agent
+from ...agents import Agent
 from ...agents.rollout import iterate_steps
 from ...envs.io import atomic_file
 from ...envs.numerics import require_extra
@@ -52,34 +51,6 @@ def check_film(path: Path | None) -> None:
     with require_extra("render", "a film needs {}"):
         import moviepy  # noqa: F401
         import pygame  # noqa: F401
-
-
-def write_drive_film(
-    path: Path | None, driver: FilmDriver, beside: str | None, seed: int | None, console: Console
-) -> None:
-    """Write the film of a drive, where there is a path, with another agent as a ghost.
-
-    Args:
-        path: File, None for none.
-        driver: Agent and env of the drive.
-        beside: Name of the ghost's agent, None for none.
-        seed: Seed of the episode.
-        console: Console to print to.
-
-    Raises:
-        ValueError: There is a ghost without a film, or as `write_film` and `make_agent`.
-    """
-    if path is None:
-        if beside is not None:
-            raise ValueError(f"{beside!r} can only drive beside in a film: --video names its file")
-        return
-    drivers = [driver]
-    if beside is not None:
-        env = copy.deepcopy(driver.env)
-        name = "no control" if beside == "none" else beside
-        drivers.append(FilmDriver(name, env, make_agent(beside, env)))
-    write_film(path, drivers, seed, console)
-    console.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
 def write_film(

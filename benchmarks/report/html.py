@@ -46,7 +46,7 @@ def _format_table(table: ResultTable) -> str:
     cells = [_format_column(column, i == 0, table.keyed) for i, column in enumerate(columns)]
     body = "\n".join(f"<tr>{''.join(line)}</tr>" for line in zip(*cells, strict=True))
     title = escape(table.title)
-    note = f'\n<p class="note">{inline(table.note)}</p>' if table.note else ""
+    note = f'\n<p class="note">{_mark_code(table.note)}</p>' if table.note else ""
     return (
         f"<details><summary>{title}</summary>\n"
         f'<div class="scroll" role="region" tabindex="0" aria-label="{title}">\n'
@@ -80,15 +80,8 @@ def _format_key(cell: str) -> str:
     return f'<i class="key" style="background:{"var(--ink)" if shade == INK else shade}"></i>'
 
 
-def inline(text: str) -> str:
-    """Escape a text; what stands in backticks becomes code.
-
-    Args:
-        text: Text with code in backticks.
-
-    Returns:
-        HTML.
-    """
+def _mark_code(text: str) -> str:
+    """Escape a text; what stands in backticks becomes code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
@@ -240,7 +233,7 @@ def write_report(
         contents="\n".join(
             f'<li><a href="#{link}">{escape(suite.title)}</a></li>' for link, suite in linked
         ),
-        answer=" ".join(inline(line) for line in lead.headlines[:3]),
+        answer=" ".join(_mark_code(line) for line in lead.headlines[:3]),
         picture="".join(_format_figure(*item) for item in lead.answers[:1]),
         sections="\n".join(_format_section(*item, int(item[1] is lead)) for item in linked),
     )
@@ -251,14 +244,14 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
     """Format a suite; opened: how many of its answers' pictures the page opens with."""
     blocks = [f"<h2>{escape(suite.title)}</h2>"]
     if suite.headlines:
-        lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.headlines)
+        lines = "\n".join(f"<li>{_mark_code(line)}</li>" for line in suite.headlines)
         blocks.append(f'<ul class="verdict">\n{lines}\n</ul>')
     answers = sorted(suite.answers[opened:], key=lambda item: bool(item[1].layout.meta))
     pictures = [_format_figure(*item) for item in answers]  # the wide ones below
     pictures += [_format_explorer(item) for item in suite.explorers]
     if pictures:
         blocks.append('<div class="pictures">\n' + "\n".join(pictures) + "\n</div>")
-    blocks += [f"<p>{inline(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
+    blocks += [f"<p>{_mark_code(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
     figures = [_format_figure(*item) for item in suite.figures]
     if len(figures) > _FEW:
         inside = "\n".join(figures)
@@ -276,7 +269,7 @@ def _format_figure(title: str, figure: "Figure", caption: str) -> str:
         f'<figure class="{kind}">\n<h3>{escape(title)}</h3>\n<div class="frame">'
         f'<div class="plot" role="img" aria-label="{escape(title)}"></div></div>\n'
         f"{_format_data('figure', _encode_figure(figure))}\n"
-        f"<figcaption>{inline(caption)}</figcaption>\n</figure>"
+        f"<figcaption>{_mark_code(caption)}</figcaption>\n</figure>"
     )
 
 
@@ -299,7 +292,7 @@ def _format_explorer(explorer: Explorer) -> str:
     return (
         f'<figure class="explorer wide">\n<h3>{escape(explorer.title)}</h3>\n'
         f"{_format_data('explorer', json.dumps(content, separators=(',', ':')))}\n"
-        f"<figcaption>{inline(explorer.caption)}</figcaption>\n</figure>"
+        f"<figcaption>{_mark_code(explorer.caption)}</figcaption>\n</figure>"
     )
 
 

@@ -23,7 +23,7 @@ from rich.console import Console
 from ...envs.io import atomic_file
 from ...envs.record import Array
 from ..harness.parallel import run_cases, split_seeds
-from ..harness.results import Line, Suite
+from ..harness.results import Suite
 
 Case = TypeVar("Case")
 Condition = TypeVar("Condition")
@@ -35,25 +35,15 @@ _LENGTH = 24  # hexadecimal digits of a finished case's file name
 
 @dataclass(frozen=True)
 class Request:
-    """The options of a run.
+    """The options of a run."""
 
-    Attributes:
-        quick: Whether few seeds are run.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-        episodes: Episodes of a cell of the matrix, or seeds; None for the suite's number.
-        keep: Folder of finished cases, so that a stopped run goes on.
-        clairvoyant: File of `sideslip calibrate`, None for the package's.
-        salt: Salt of the seeds of salted suites, "" for the one of the contestants' sources.
-    """
-
-    quick: bool = False
-    jobs: int | None = None
-    console: Console | None = None
-    episodes: int | None = None
-    keep: Path | None = None
-    clairvoyant: Path | None = None
-    salt: str = ""
+    quick: bool = False  # whether few seeds are run
+    jobs: int | None = None  # processes, None for all processors
+    console: Console | None = None  # where progress is shown
+    episodes: int | None = None  # of a cell of the matrix, or seeds; None for the suite's number
+    keep: Path | None = None  # folder of finished cases, so that a stopped run goes on
+    clairvoyant: Path | None = None  # file of `sideslip calibrate`, None for the package's
+    salt: str = ""  # of the seeds of salted suites, "" for the one of the contestants' sources
 
     def choose(self, usual: Choice, quick: Choice) -> Choice:
         """Choose by whether the run is quick.
@@ -116,18 +106,6 @@ class Request:
         return [[item for _ in chunks for item in next(results)] for _ in conditions]
 
 
-def stack_seeds(drives: Sequence[Mapping[str, Sequence[float]]]) -> dict[str, Array]:
-    """Stack the numbers of entries over seeds.
-
-    Args:
-        drives: Numbers of each entry by name, of every seed.
-
-    Returns:
-        Numbers by name, shape (seeds, numbers).
-    """
-    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
-
-
 class CaseStorage(NamedTuple, Generic[Case, Result]):
     """Finished cases as arrays in files, whose names are hashes of all that they depend on."""
 
@@ -162,29 +140,18 @@ class StoredFunction(Generic[Case, Result]):
 
 @dataclass(frozen=True)
 class Study(Generic[Results]):
-    """A suite of the benchmark.
-
-    Attributes:
-        name: Name of the suite.
-        title: Question that it answers.
-        text: What was measured, and how; paragraphs are separated by an empty line.
-        seeds: Number of seeds of a usual and of a quick run, in place of a request's None.
-        measure: Drives, and returns the results.
-        add_tables: Adds rows and tables of the results to a suite.
-        compose_verdict: Composes the answer from the results.
-        add_figures: Adds pictures of the results with `report.figures`, its last argument.
-        needs: Optional module, and the verdict where it is not installed.
-    """
+    """A suite of the benchmark."""
 
     name: str
-    title: str
-    text: str
-    seeds: tuple[int, int]
-    measure: Callable[[Request], Results]
-    add_tables: Callable[[Suite, Results], None]
-    compose_verdict: Callable[[Results], str]
+    title: str  # question that it answers
+    text: str  # what was measured, and how; paragraphs are separated by an empty line
+    seeds: tuple[int, int]  # of a usual and of a quick run, in place of a request's None
+    measure: Callable[[Request], Results]  # drives, and returns the results
+    add_tables: Callable[[Suite, Results], None]  # adds rows and tables of the results to a suite
+    compose_verdict: Callable[[Results], str]  # composes the answer from the results
     add_figures: Callable[[Suite, Results, ModuleType], None] | None = None
-    needs: tuple[str, str] = ("", "")
+    """Adds pictures of the results with `report.figures`, its last argument."""
+    needs: tuple[str, str] = ("", "")  # optional module, and the verdict where it is not installed
 
     def run(self, request: Request) -> Suite:
         """Run the study.
@@ -215,15 +182,3 @@ def import_figures() -> ModuleType | None:
         return import_module(".figures", __package__)
     except ModuleNotFoundError:
         return None
-
-
-def add_rows(suite: Suite, numbers: Line, env_id: str = "", **columns: str | int) -> None:
-    """Add a row of each number of a record, as `Suite.add_rows`.
-
-    Args:
-        suite: Suite to which the rows are added.
-        numbers: Numbers with their intervals by metric.
-        env_id: Id of the env, "" where rows have the package's version alone.
-        **columns: Other columns of `ResultRow`, which all rows share.
-    """
-    suite.add_rows([numbers], env_id, **columns)

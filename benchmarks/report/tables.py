@@ -36,25 +36,18 @@ def format_columns(table: ResultTable) -> list[TextColumn]:
     """
     columns = []
     for column, cells in table.split():
-        texts = [format_cell(cell, column) for cell in cells]
+        texts = [_format_cell(cell, column) for cell in cells]
         values = [_get_value(cell, column.scale) for cell in cells]
         columns.append(TextColumn(column.heading or column.key, texts, values))
     return columns
 
 
-def format_cell(cell: Cell, column: Column) -> str:
+def _format_cell(cell: Cell, column: Column) -> str:
     """Format a cell: a number with its interval in brackets, nothing for NaN.
 
-    Args:
-        cell: Text or number.
-        column: Its column.
-
-    Returns:
-        Text.
-
-    >>> format_cell(Estimate(0.0312, 0.03, 0.0325), Column("rmse", "RMSE / mrad", 1e3, ".1f"))
+    >>> _format_cell(Estimate(0.0312, 0.03, 0.0325), Column("rmse", "RMSE / mrad", 1e3, ".1f"))
     '31.2 [30.0, 32.5]'
-    >>> format_cell((2.0, 3.5), Column("x", form="{:.0f} of {:.1f}")), format_cell(7, Column("n"))
+    >>> _format_cell((2.0, 3.5), Column("x", form="{:.0f} of {:.1f}")), _format_cell(7, Column("n"))
     ('2 of 3.5', '7')
     """
     if isinstance(cell, str):

@@ -25,13 +25,7 @@ from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
-from ...envs.vehicle.tyres import (
-    FIALA,
-    PlantVariant,
-    TyreInputs,
-    compute_tyre_load,
-    has_load_shift,
-)
+from ...envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load, has_load_shift
 from .timing import AbsentError, Workload, WorkloadSet
 
 _FLAGS = ("-O3", "-march=native", "-ffp-contract=off")

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,16 +17,22 @@ import typer
 from rich.console import Console
 
 from ...envs.device.cuda_kernel import make_constants
-from ...envs.device.cuda_launch import count_opcodes, get_ptx
+from ...envs.device.cuda_launch import get_ptx
 from ...envs.vector import StabilityVectorEnv
 from ..harness.results import check_writable, write_text
 
 _ARITHMETIC = "add|sub|mul|fma|div|rcp|sqrt"
 
 
+def _count_opcodes(text: str) -> Counter[str]:
+    """Count the instructions of a PTX text by name."""
+    opcode = r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]"
+    return Counter(re.findall(opcode, text, re.M))
+
+
 def _count_by_kind(text: str) -> dict[str, Any]:
     """Count the instructions of a PTX text by kind."""
-    totals = count_opcodes(text)
+    totals = _count_opcodes(text)
 
     def count_matching(pattern: str) -> int:
         return sum(count for name, count in totals.items() if re.match(pattern, name))

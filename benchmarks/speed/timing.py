@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate
-from ..report.study import add_rows
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Taken(list[float]):
             Itself.
         """
         columns = {"salt": "", "env_version": "", "scenario": name}
-        add_rows(suite, {metric: self.range}, n=len(self), **columns)
+        suite.add_rows([{metric: self.range}], n=len(self), **columns)
         return self
 
 

@@ -20,7 +20,7 @@ from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
-from ..report.study import Request, Study, stack_seeds
+from ..report.study import Request, Study
 
 _CHUNK = 5
 _COLUMNS = (
@@ -33,7 +33,7 @@ BOUND = "the bound"
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
 Results = list[dict[str, Array]]
-"""Of each experiment by filter and `BOUND`: numbers of `run_filters`, shape (seeds, 2)."""
+"""Of each experiment by filter and `BOUND`: numbers of `_run_filters`, shape (seeds, 2)."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +79,8 @@ def _make_env(experiment: Experiment) -> Any:
     return gym.make(experiment.env_id, scenario=experiment.scenario, control_period=1)
 
 
-def run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple[float, float]]]:
-    """Drive some seeds of an experiment once and run every filter over the same records.
-
-    Args:
-        case: Experiment and seeds.
-
-    Returns:
-        Mean squared error of beta (rad2) and CPU time per tick (us), by filter and `BOUND`.
-    """
+def _run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple[float, float]]]:
+    """Drive some seeds, and run filters: MSE of beta (rad2) and CPU time a tick (us), by name."""
     experiment, seeds = case
     env, results = _make_env(experiment), []
     base = env.unwrapped
@@ -109,8 +102,13 @@ def run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple[
 
 def _measure(request: Request) -> Results:
     seeds = request.episodes or 0
-    drives = request.run_seeds(run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
-    return list(map(stack_seeds, drives))
+    drives = request.run_seeds(_run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
+    return list(map(_stack_seeds, drives))
+
+
+def _stack_seeds(drives: Sequence[Mapping[str, tuple[float, float]]]) -> dict[str, Array]:
+    """Stack the numbers of every seed to (seeds, 2), by name."""
+    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
 
 
 def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:

@@ -81,16 +81,8 @@ class _OutsideTask(ControlTask):
         }
 
 
-def make_outside_task(kind: str, model: str) -> _OutsideTask:
-    """Make a class's task of `MANOEUVRE` with a model as the car.
-
-    Args:
-        kind: Class of tasks.
-        model: Name of the model.
-
-    Returns:
-        Task.
-    """
+def _make_outside_task(kind: str, model: str) -> _OutsideTask:
+    """Make a class's task of `MANOEUVRE` with a model as the car."""
     like = STEERING if kind.endswith("steering") else YAW
     return _OutsideTask("", OUTSIDE_ID, "", "lagged", MANOEUVRE, model, like)
 
@@ -116,7 +108,7 @@ def _measure(request: Request) -> list[TransferResult]:
     """Run every class of `KINDS` on every model; ValueError: an entry cannot drive."""
     models, salt = request.choose(list(OUTSIDE_PLANTS), ["drift"]), request.salt or make_salt()
     cases = [
-        (make_outside_task(kind, model), entry)
+        (_make_outside_task(kind, model), entry)
         for model in models
         for kind in KINDS
         for entry in list_entries(kind)
@@ -128,7 +120,7 @@ def _measure(request: Request) -> list[TransferResult]:
     remark, scenarios = "No training met any.", f"{MANOEUVRE} on a straight road"
     transfers = []
     for kind in KINDS:
-        tasks = {model: make_outside_task(kind, model) for model in models}
+        tasks = {model: _make_outside_task(kind, model) for model in models}
         drives = {x: [collect_results(results, task, x)] for x, task in tasks.items()}
         where = (OUTSIDE_ID, f"{kind} in a BMW", scenarios, f"Other seeds on each model. {remark}")
         transfers.append(TransferResult(kind, drives, salt, *where))

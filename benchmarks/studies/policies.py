@@ -19,13 +19,7 @@ from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
 from ...estimators.vector.estimate import EstimateObservation
-from ..control.entries import (
-    ADAPTIVE,
-    ORACLE_NAMES,
-    REFERENCE_FILTER,
-    ControlCase,
-    Entry,
-)
+from ..control.entries import ADAPTIVE, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import (
@@ -42,7 +36,6 @@ from ..harness.parallel import run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
 from ..harness.verdict import format_percent, format_verdict
-from ..report.study import add_rows
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask
@@ -141,7 +134,7 @@ class PolicyEvaluation:
             metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
             numbers = {metric: interval(outcome[metric]) for metric in metrics}
             labels |= {"spec": ControlCase(task, entry).spec}
-            add_rows(suite, numbers, task.env_id, n=len(self.seeds), **labels)
+            suite.add_rows([numbers], task.env_id, n=len(self.seeds), **labels)
 
 
 def evaluate_policy(

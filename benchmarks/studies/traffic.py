@@ -16,11 +16,7 @@ from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.task import FAILURES
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..control.entries import (
-    REFERENCE_FILTER,
-    ControlCase,
-    Entry,
-)
+from ..control.entries import REFERENCE_FILTER, ControlCase, Entry
 from ..control.tasks import ORACLES, STATE, ControlTask
 from ..harness.drives import call_quietly, make_env
 from ..harness.results import Column, Line, ResultTable, Suite

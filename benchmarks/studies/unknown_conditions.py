@@ -294,9 +294,7 @@ def _stack_results(
     )
 
 
-def _measure_seeds(
-    case: tuple[Condition, Sequence[int]],
-) -> list[dict[str, list[float]] | None]:
+def _measure_seeds(case: tuple[Condition, Sequence[int]]) -> list[dict[str, list[float]] | None]:
     """Drive some seeds of a condition, and run its filters over the records; None: ended early.
 
     Mean squared error, NEES, variance and fractions within `LEVELS` of each filter; the mean square

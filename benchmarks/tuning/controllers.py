@@ -8,7 +8,7 @@ mean of `compute_log_ratios` over tasks and seeds: log(J / J_nominal), J_nominal
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -116,20 +116,6 @@ def _get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
     return tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
 
 
-def _make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float]) -> Options:
-    """Make the options of filter and controller from the values of numbers by name."""
-    options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
-    for number in numbers:
-        name, _, index = number.name.partition(".")
-        value = (round if number.is_integer else float)(values[number.name])
-        for part in number.of:
-            if index:
-                options[part].setdefault(name, []).append(value)
-            else:
-                options[part][name] = value
-    return options
-
-
 @dataclass(frozen=True)
 class ControllerTuning:
     """A search of a controller's numbers over the tasks of a class, on tuning seeds."""
@@ -157,16 +143,19 @@ class ControllerTuning:
         """Value of each number at which the search starts."""
         return {number.name: number.start for number in self.numbers}
 
-    def options(self, values: dict[str, float]) -> Options:
-        """Make the options from values of the numbers, rounded to three digits.
-
-        Args:
-            values: Value of each number by name.
-
-        Returns:
-            Options of filter and controller.
-        """
-        return _make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
+    def _make_options(self, values: dict[str, float]) -> Options:
+        """Make the options of filter and controller from numbers, rounded to three digits."""
+        options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
+        for number in self.numbers:
+            name, _, index = number.name.partition(".")
+            rounded = float(f"{values[number.name]:.3g}")
+            value = round(rounded) if number.is_integer else rounded
+            for part in number.of:
+                if index:
+                    options[part].setdefault(name, []).append(value)
+                else:
+                    options[part][name] = value
+        return options
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
@@ -213,7 +202,7 @@ def _compute_objective(
     task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
-    options, log_ratios = task.options(values), []
+    options, log_ratios = task._make_options(values), []
     for contest in task.contests:
         result = _run_contestant(contest, task.name, options, seeds)
         if result.error:
@@ -257,7 +246,7 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
         ValueError: The controller cannot drive a task, the storage fails, or no trial that drove
             all seeds is finite.
     """
-    options = task.options(task.start)
+    options = task._make_options(task.start)
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
         if error := _run_contestant(contest, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
@@ -290,7 +279,7 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
         "seeds": list(task.seeds),
         "start": rows[0]["objective"],
         "best": best,
-        "options": task.options(best["numbers"]),
+        "options": task._make_options(best["numbers"]),
         "trials": rows,
     }
 

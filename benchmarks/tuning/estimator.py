@@ -1,4 +1,4 @@
-"""Tuning of an estimator: its options and ranges, its error on drives, and the files of tunings."""
+"""Tuning of an estimator: its options and ranges, its drives, and the files of tunings."""
 
 import dataclasses
 import hashlib
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from rich.console import Console
 
 from ... import __version__
@@ -18,15 +17,13 @@ from ...agents.baselines import Options, read_tuned
 from ...agents.rollout import rollout
 from ...envs.io import to_toml
 from ...envs.numerics.kernel_cache import hash_sources
-from ...envs.record import Array
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
-from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
+from ..harness.drives import LoggedEpisode, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
-from ..harness.stats import root_mean
 from ..studies.estimation import EXPERIMENTS
 
 Range = tuple[float, float]
@@ -40,26 +37,14 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How long a study is searched, and by whom.
+    """How long a study is searched, and by whom; ValueError where there are no trials."""
 
-    Attributes:
-        trials: Trials of the study, the finished ones included.
-        storage: RDB URL or SQLite file.
-        sampler: Name in `SAMPLERS`.
-        seed: Seed of the sampler.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-
-    Raises:
-        ValueError: There are no trials.
-    """
-
-    trials: int
-    storage: str = STORAGE
-    sampler: str = SAMPLERS[0]
-    seed: int = 0
-    jobs: int | None = None
-    console: Console | None = None
+    trials: int  # of the study, the finished ones included
+    storage: str = STORAGE  # RDB URL or SQLite file
+    sampler: str = SAMPLERS[0]  # name in `SAMPLERS`
+    seed: int = 0  # of the sampler
+    jobs: int | None = None  # processes, None for all processors
+    console: Console | None = None  # where progress is shown
 
     def __post_init__(self) -> None:
         if self.trials < 1:
@@ -151,7 +136,8 @@ def make_estimator_tuning(
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
         if not _has_option(estimator, option, held, facts):
-            _build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+            wrong = {**facts, **held, option: 1.0}
+            call_quietly(make_estimator, estimator, **wrong)  # raises with what it has
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
@@ -167,13 +153,6 @@ def _check_range(option: str, limits: Range | None) -> Range:
     return float(low), float(high)
 
 
-def _build_estimator(
-    estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
-) -> Estimator:
-    """Build an estimator for an env's facts, without `UnobservableWarning`."""
-    return call_quietly(make_estimator, estimator, **facts, **options)
-
-
 def _make_unstable_option(estimator: str) -> dict[str, bool]:
     """Make the option that lets our filters be built though their error grows."""
     return {"allow_unstable": True} if estimator in FILTERS else {}
@@ -185,7 +164,7 @@ def _has_option(
     """Check whether the estimator has an option, whatever number suits it."""
     try:
         options = {**_make_unstable_option(estimator), **held, option: 1e-3}
-        _build_estimator(estimator, facts, options)
+        call_quietly(make_estimator, estimator, **facts, **options)
     except TypeError:
         return False
     except ValueError:
@@ -208,7 +187,7 @@ def _find_env(
                 env.reset(seed=FIRST_SEED)
                 facts = make_filter_arguments(env.unwrapped)
                 options = {**_make_unstable_option(estimator), **held}
-                filter_ = _build_estimator(estimator, facts, options)
+                filter_ = call_quietly(make_estimator, estimator, **facts, **options)
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
@@ -250,51 +229,6 @@ def simulate(
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
     done = run_cases(_simulate_case, cases, title, jobs, console)
     return [drive for drives in done for drive in drives]
-
-
-def compute_squares(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
-) -> Array:
-    """Compute the target's mean squared error from `SETTLED` s on.
-
-    Args:
-        task: Tuning.
-        drives: Drives of `simulate`.
-        values: Values of the options that are searched.
-
-    Returns:
-        Squared errors, infinite where an estimate is not finite, shape (scenarios, seeds).
-
-    Raises:
-        ValueError: The estimator fails.
-    """
-    options, turn = task.options | dict(values), 2.0 * math.pi
-    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
-    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
-        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
-        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
-        if key not in filters:
-            filters[key] = _build_estimator(task.estimator, facts, options)
-        late = log.time >= SETTLED - 1e-9
-        with np.errstate(all="ignore"):
-            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
-            if task.unit == "rad":
-                error = np.remainder(error + math.pi, turn) - math.pi
-            errors[i] = np.mean(error**2)
-    finite = np.where(np.isfinite(errors), errors, np.inf)
-    return finite.reshape(len(task.scenarios), -1)
-
-
-def compute_objective(errors: Array) -> float:
-    """Compute the geometric mean of the scenarios' RMSE.
-
-    Args:
-        errors: Squared errors, shape (scenarios, seeds).
-
-    Returns:
-        Geometric mean.
-    """
-    return float(np.exp(np.mean(np.log(root_mean(errors)))))
 
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")

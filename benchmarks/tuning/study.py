@@ -5,6 +5,7 @@ share one. It is searched on training seeds and judged on test seeds. Needs the 
 """
 
 import contextlib
+import dataclasses
 import functools
 import math
 import tempfile
@@ -19,7 +20,9 @@ import numpy as np
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...estimators.design.options import TUNINGS
-from ..harness.drives import LoggedEpisode
+from ...estimators.estimator import Estimator
+from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, LoggedEpisode, call_quietly
 from ..harness.parallel import Bar, count_cores, run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
@@ -28,8 +31,6 @@ from .estimator import (
     STORAGE,
     EstimatorTuning,
     SearchOptions,
-    compute_objective,
-    compute_squares,
     simulate,
 )
 
@@ -59,12 +60,48 @@ def _load_drives(path: str) -> list[LoggedEpisode]:
     return drives
 
 
+def _compute_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
+    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds).
+
+    It is infinite where an estimate is not finite; ValueError where the estimator fails.
+    """
+    options, turn = task.options | dict(values), 2.0 * math.pi
+    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
+    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
+        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
+        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
+        if key not in filters:
+            filters[key] = call_quietly(make_estimator, task.estimator, **facts, **options)
+        late = log.time >= SETTLED - 1e-9
+        with np.errstate(all="ignore"):
+            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
+            if task.unit == "rad":
+                error = np.remainder(error + math.pi, turn) - math.pi
+            errors[i] = np.mean(error**2)
+    finite = np.where(np.isfinite(errors), errors, np.inf)
+    return finite.reshape(len(task.scenarios), -1)
+
+
+def _compute_stable_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
+    """Compute the squared errors, infinite where the estimator diverges."""
+    try:
+        return _compute_squares(task, drives, values)
+    except ValueError:  # a filter that diverges, a covariance that is none
+        return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
+
+
+def _compute_objective(errors: Array) -> float:
+    """Compute the geometric mean of the scenarios' RMSE from squares (scenarios, seeds)."""
+    return float(np.exp(np.mean(np.log(root_mean(errors)))))
+
+
 def _evaluate_file(path: str, task: EstimatorTuning, values: dict[str, float]) -> float:
     """Evaluate the objective of some numbers on a file's drives; infinite if unstable."""
-    try:
-        return compute_objective(compute_squares(task, _load_drives(path), values))
-    except ValueError:  # a filter that diverges, a covariance that is none
-        return math.inf
+    return _compute_objective(_compute_stable_squares(task, _load_drives(path), values))
 
 
 def create_study(
@@ -123,7 +160,7 @@ def _search(
     with _convert_storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):
-        compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
+        _compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
         text = f"none of {search.trials} trials of {task.estimator} gave finite estimates"
         raise ValueError(text)
     return {name: float(f"{v:.3g}") for name, v in best.params.items()}
@@ -268,8 +305,8 @@ def _make_comparisons(
     numbers: dict[str, float],
 ) -> list[ResultTable]:
     """Make a table of errors before and after for each scenario."""
-    default = [_compute_squares(task, drives, {}) for drives in (training, test)]
-    tuned = [_compute_squares(task, drives, numbers) for drives in (training, test)]
+    default = [_compute_stable_squares(task, drives, {}) for drives in (training, test)]
+    tuned = [_compute_stable_squares(task, drives, numbers) for drives in (training, test)]
     tables = []
     for i, scenario in enumerate(task.scenarios):
         before, after = [values[i] for values in default], [values[i] for values in tuned]
@@ -287,16 +324,6 @@ def _make_comparisons(
             )
         )
     return tables
-
-
-def _compute_squares(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], numbers: dict[str, float]
-) -> Array:
-    """Compute the squared errors, infinite where the estimator diverges."""
-    try:
-        return compute_squares(task, drives, numbers)
-    except ValueError:
-        return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
 
 
 def _format_spread(errors: Array) -> str:

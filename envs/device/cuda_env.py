@@ -1,9 +1,11 @@
 """`CudaVectorEnv`: many cars in one CUDA kernel a step, with state and resets on the device."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 
@@ -20,8 +22,6 @@ from .cuda_kernel import (
     KernelConstants,
     make_constants,
     make_specification,
-    pack_starts,
-    read_words,
 )
 from .cuda_launch import load_kernel
 from .cuda_text import SIMULATED
@@ -109,12 +109,13 @@ class CudaVectorEnv(TensorVectorEnv):
                     f"{self._constants.width} parameters; scenario {config.scenario.name!r} "
                     f"has {kind} with {width}"
                 )
-        words = read_words([seeding.np_random(seed)[0] for seed in seeds.values()])
+        words = _read_words([seeding.np_random(seed)[0] for seed in seeds.values()])
         self._memory.generators[:, list(seeds)] = torch.as_tensor(words, device=self.device)
         start_index = np.zeros(self.num_envs, np.int64)  # 0: without options
         start_index[chosen] = 1 + index
         starts = [config.start for config in (self.config.base, *configs)]
-        packed, switches = pack_starts(starts)
+        packed = np.stack([np.concatenate([x.params, x.low, x.high, x.motion]) for x in starts])
+        switches = np.stack([start.switches for start in starts])
         self._memory = self._memory._replace(
             which=torch.as_tensor(start_index, device=self.device),
             starts=torch.as_tensor(packed).to(self.device, self.dtype),
@@ -170,6 +171,16 @@ class CudaVectorEnv(TensorVectorEnv):
         copies = (array.to(self.device, copy=True) for array in snapshot.memory)
         self._memory = DeviceArrays(*copies)
         self._started = snapshot.started
+
+
+def _read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
+    """Read the words (WORDS, N) of N generators of NumPy's PCG64."""
+    words = np.empty((WORDS, len(generators)), np.int64)
+    for i, generator in enumerate(generators):
+        state: Any = generator.bit_generator.state["state"]
+        for k, number in enumerate((state["state"], state["inc"])):
+            words[4 * k : 4 * k + 4, i] = [number >> 32 * part & 0xFFFFFFFF for part in range(4)]
+    return words
 
 
 def _check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None:

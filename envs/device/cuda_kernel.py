@@ -8,11 +8,9 @@ Space-Efficient Statistically Good Algorithms for Random Number Generation", 201
 increment, each of four words of 32 bits, the lowest first.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import cuda, types
 from numba.cuda.np.numpy_support import carray
 
@@ -25,7 +23,7 @@ from ..engine.step import clip_action, get_start_variant, integrate_step, reject
 from ..engine.window import make_window, precompute_window
 from ..numerics.jit import copy_into
 from ..numerics.primitives import Matrix, Vector
-from ..record import FAST_WIDTH, PACKET_WIDTH, Array
+from ..record import FAST_WIDTH, PACKET_WIDTH
 from ..scenarios.draws import DRAWS_WIDTH
 from ..task import REPORT
 from ..vehicle.dynamics import Motion
@@ -60,23 +58,6 @@ def _draw_key(words: Vector) -> tuple[int, int]:
 def _extract_high(product: int) -> int:
     """Extract the upper 32 of 64 bits."""
     return (product >> 32) & _MASK
-
-
-def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
-    """Read the words of generators.
-
-    Args:
-        generators: N generators of NumPy's PCG64.
-
-    Returns:
-        Words, shape (WORDS, N).
-    """
-    words = np.empty((WORDS, len(generators)), np.int64)
-    for i, generator in enumerate(generators):
-        state: Any = generator.bit_generator.state["state"]
-        for k, number in enumerate((state["state"], state["inc"])):
-            words[4 * k : 4 * k + 4, i] = [number >> 32 * part & _MASK for part in range(4)]
-    return words
 
 
 NAME = "sideslip_step"
@@ -185,19 +166,6 @@ def make_specification(
         packets=(real, (constants.packets, PACKET_WIDTH, n_record)),
         counts=(np.int64, (2, n_record)),
     )  # fmt: skip
-
-
-def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Pack starts.
-
-    Args:
-        starts: Starts of episodes.
-
-    Returns:
-        `DeviceArrays.starts` and `DeviceArrays.switches`.
-    """
-    packed = [np.concatenate([x.params, x.low, x.high, x.motion]) for x in starts]
-    return np.stack(packed), np.stack([start.switches for start in starts])
 
 
 def _step_row(

@@ -10,8 +10,6 @@ import contextlib
 import ctypes
 import hashlib
 import json
-import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from types import SimpleNamespace
@@ -107,33 +105,13 @@ def _set_capability(capability: _Capability) -> Iterator[None]:
         dispatcher.get_current_device = previous
 
 
-def count_opcodes(ptx: str) -> Counter[str]:
-    """Count the instructions of a PTX text.
-
-    Args:
-        ptx: PTX text.
-
-    Returns:
-        Their numbers by name.
-    """
-    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))
-
-
 def _make_context_current(device: torch.device) -> None:
     """Make torch's context on the device the current one."""
     torch.empty(1, device=device)
 
 
-class DriverKernel:
-    """The kernel of a PTX text on a GPU.
-
-    Raises RuntimeError where the GPU refuses it, MemoryError where its memory does not suffice.
-
-    Args:
-        ptx: PTX text.
-        device: GPU.
-        driver: Module `cuda.bindings.driver`.
-    """
+class _DriverKernel:
+    """The kernel of a PTX text on a GPU; RuntimeError where that refuses it, or MemoryError."""
 
     def __init__(self, ptx: str, device: torch.device, driver: Any) -> None:
         self._driver, self._device = driver, device
@@ -185,7 +163,7 @@ def load_kernel(
     from cuda.bindings import driver
 
     ptx = get_ptx(constants, real, torch.cuda.get_device_capability(device))
-    return DriverKernel(ptx, device, driver)
+    return _DriverKernel(ptx, device, driver)
 
 
 class _SimulatedKernel:
@@ -195,7 +173,7 @@ class _SimulatedKernel:
         self._kernel: Any = cuda.jit(make_kernel(constants, real))
 
     def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
-        """Step or reset rows as `DriverKernel` does."""
+        """Step or reset rows as `_DriverKernel` does."""
         blocks = -(-count // _SIMULATED_BLOCK)
         pointers = [SimpleNamespace(numbers=array.numpy()) for array in arrays]
         self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *pointers)

@@ -21,13 +21,7 @@ from ..engine.step import (
     make_step_variant,
     write_final_state,
 )
-from ..engine.tick import (
-    StepParams,
-    StepState,
-    TickInputs,
-    compute_inputs,
-    measure_tick,
-)
+from ..engine.tick import StepParams, StepState, TickInputs, compute_inputs, measure_tick
 from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
 from ..numerics.jit import as_python
 from ..numerics.packed import load_element, read, write
@@ -112,11 +106,6 @@ class PlantEnv(StabilityEnv):
 
     _has_tyre_forces = False
     plant: PlantProtocol
-
-    def _refuse_world(self) -> None:
-        """Raise ValueError for what the plant cannot have."""
-        if not self.config.world.is_ideal or self.config.lead_in:
-            raise ValueError("world and lead_in are of our own plant; an outside one has neither")
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive one control period of the plant: `step_vehicle` with another motion."""
@@ -219,7 +208,8 @@ class OutsideEnv(PlantEnv):
         self.model = model
         _check_scenario(make_scenario(scenario), model)
         super().__init__(sensors, scenario, make_outside_vehicle(), reference=reference, **options)
-        self._refuse_world()
+        if not self.config.world.is_ideal or self.config.lead_in:
+            raise ValueError("world and lead_in are of our own plant; an outside one has neither")
         self.plant = OUTSIDE_PLANTS[model]()
 
     def reset(

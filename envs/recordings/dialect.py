@@ -129,10 +129,7 @@ def read_text(
 
 
 def _find_encoding(data: bytes) -> str:
-    """Find the encoding: by its mark, by its zeros, UTF-8, or else Windows-1252.
-
-    A binary file raises ValueError.
-    """
+    """Find the encoding by its mark or zeros, else UTF-8 or Windows-1252; ValueError: binary."""
     head = data[:_HEAD_BYTES]
     even, odd = head[::2].count(0), head[1::2].count(0)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):

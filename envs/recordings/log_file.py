@@ -1,7 +1,4 @@
-"""Recorded drives from files: the same record that the simulated car writes.
-
-`read_log` takes a drive as it is, `read_parts` fills short holes and divides it at long ones.
-"""
+"""Recorded drives from files: the same record that the simulated car writes."""
 
 import dataclasses
 import math
@@ -30,41 +27,13 @@ _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
-def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
-    """Read a recorded drive from a table: CSV, Parquet, MATLAB or MDF (needs the extra `report`).
-
-    The record's dt is the mean step of time, its first tick that of the first row (0 where time
-    starts below 0: ticks are never negative). A logged input (steering, torque, command) acts from
-    its row to the next, so it stands one row later in the record. Without both wheel speeds both
-    wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN between their samples. One is
-    captured and arrives in its row, and the sensor's period is the longest that has every sample on
-    its clock. truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only that is
-    logged; 0 at 0.5 m/s and below, NaN where unknown, left out where the log has neither. The name
-    is the file's with its folder's.
-
-    Args:
-        path: Table with columns named as in `tables.COLUMNS`; unknown ones are ignored.
-        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
-            `tables.parse_mapping` makes it.
-
-    Returns:
-        The log.
-
-    Raises:
-        ValueError: For a file that is no table, a missing column, a value that is no number, fewer
-            than two rows, and a clock that runs backward, stands still, jumps or is uneven. Rows in
-            messages count from 1 below the header.
-    """
-    source = Path(path)
-    values, _ = read_quantities(source, mapping or {}, _NEEDED, _GAPS)
-    try:
-        return _make_log(values, source)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
-
-
 def _make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
-    """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s)."""
+    """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
+
+    Its first tick is that of the first row, 0 where time starts below 0: ticks are never negative.
+    A logged input (steering, torque, command) acts from its row to the next, so it stands one row
+    later in the record. The name is the file's with its folder's.
+    """
     dt = find_step(values["time"]) if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _make_fast_rows(values)
@@ -201,7 +170,13 @@ def read_parts(
     start: float = 0.0,
     end: float | None = None,
 ) -> tuple[list[Log], list[str]]:
-    """Read a recorded drive as `read_log` does, but mend its clock and divide it at long holes.
+    """Read a recorded drive from a table: CSV, Parquet, MATLAB or MDF (needs the extra `report`).
+
+    Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
+    between their samples. One is captured and arrives in its row, and the sensor's period is the
+    longest that has every sample on its clock. truth["beta"] is the sideslip angle, or
+    atan2(speed_y, speed_x) where only that is logged; 0 at 0.5 m/s and below, NaN where unknown,
+    left out where the log has neither.
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
@@ -211,8 +186,9 @@ def read_parts(
     sample lacks the sensor.
 
     Args:
-        path: Table as `read_log` reads it.
-        mapping: Our column names, unit included, to the log's.
+        path: Table with columns named as in `tables.COLUMNS`; unknown ones are ignored.
+        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
+            `tables.parse_mapping` makes it.
         start: Time after the first row from which it is read (s).
         end: Time after the first row up to which it is read (s); None: to its end.
 
@@ -220,7 +196,8 @@ def read_parts(
         Whole drives, and sentences on what was done.
 
     Raises:
-        ValueError: If no part is left, and for all else that `read_log` refuses.
+        ValueError: For a file that is no table, a missing column, a value that is no number, and
+            where no part is left. Rows in messages count from 1 below the header.
     """
     source = Path(path)
     values, remarks = read_quantities(source, mapping or {}, _NEEDED, None)

@@ -46,10 +46,7 @@ class _Sentence(NamedTuple):
 
 
 def _read_sentence(text: bytes) -> _Sentence | None:
-    """Read and check the bytes between "$" and the line's end; None for a wrong checksum.
-
-    Raises ValueError for a sentence without a checksum.
-    """
+    """Read the bytes from "$" to the line's end; None for a wrong checksum, ValueError for none."""
     try:
         content, talker, kind, fields, checksum = get_parts(text)
     except NMEAMessageError:

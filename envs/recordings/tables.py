@@ -148,10 +148,7 @@ def _make_column_name(quantity: str) -> str:
 
 
 def _parse_column_name(name: str) -> tuple[str, float]:
-    """Parse a column's name in lower case to its quantity and the unit's factor to SI.
-
-    Raises ValueError if it is none of ours.
-    """
+    """Parse a name in lower case to quantity and factor to SI; ValueError if it is none of ours."""
     if name in _NAMES:
         return _NAMES[name]
     known = [_make_column_name(q) for q in COLUMNS]
@@ -246,10 +243,7 @@ def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> N
 
 
 def _match_column(name: str, unit: str) -> str:
-    """Match a file's column to our name, in upper or lower case, "" where it is none of ours.
-
-    Its unit may be in the name, in brackets or beside it.
-    """
+    """Match a column, its unit in the name, in brackets or beside it, to our name; "" for none."""
     folded = name.casefold()
     if folded not in _NAMES:
         base, _, bracket = folded.rstrip("])").replace("(", "[").partition("[")
@@ -260,10 +254,7 @@ def _match_column(name: str, unit: str) -> str:
 def _find_columns(
     table: _LogTable, mapping: Mapping[str, str], remarks: list[str]
 ) -> dict[str, tuple[int, str]]:
-    """Find the place and our name of each quantity's column, and add to the remarks.
-
-    The mapping comes first, then our names, then names with units.
-    """
+    """Find each quantity's place and name: by the mapping, by ours, by names with units; remark."""
     names, quantities = [str(name) for name in table.frame.columns], set()
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):

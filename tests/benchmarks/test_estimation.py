@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.papers.ledger import make_filters
-from sideslip.benchmarks.report.study import Request, stack_seeds
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import estimation
 
 
@@ -18,7 +18,9 @@ def _ratio(squares: Mapping[str, Any], of: str, to: str) -> float:
 
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
-    squares = stack_seeds(estimation.run_filters((estimation.EXPERIMENTS[1], range(8))))
+    squares = estimation._stack_seeds(
+        estimation._run_filters((estimation.EXPERIMENTS[1], range(8)))
+    )
     assert _ratio(squares, "dakf", "course-kf") <= 0.75
 
 

@@ -29,8 +29,8 @@ from sideslip.benchmarks.studies.learned_outside import (
     KINDS,
     MANOEUVRE,
     OUTSIDE_ID,
+    _make_outside_task,
     _run_chunk,
-    make_outside_task,
 )
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS, make_outside_vehicle
 from sideslip.envs.scenarios.manoeuvres import make_scenario
@@ -40,7 +40,7 @@ FLAT = {"name", "road", "bank", "vehicle", "nominal"}
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_the_car_and_the_road_are_others(kind: str) -> None:
-    contest = make_outside_task(kind, "drift")
+    contest = _make_outside_task(kind, "drift")
     like = ControlTask("", contest.like, "passenger-car", contest.reference, MANOEUVRE)
     assert contest.kind == kind == like.kind
     ours, theirs = (make_scenario(c.env_options["scenario"]) for c in (like, contest))
@@ -59,7 +59,7 @@ def test_only_the_car_and_the_road_are_others(kind: str) -> None:
 
 def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> None:
     for kind, width in zip(KINDS, (2, 1), strict=True):
-        env: Any = make_env(OUTSIDE_ID, **make_outside_task(kind, "single-track").env_options)
+        env: Any = make_env(OUTSIDE_ID, **_make_outside_task(kind, "single-track").env_options)
         assert env.action_space.shape == (width,)
         assert env.unwrapped.nominal.mass == make_outside_vehicle().mass
         assert env.unwrapped.nominal.friction == 0.65
@@ -67,7 +67,7 @@ def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> N
 
 def test_a_finished_case_is_found_again(tmp_path: Path) -> None:
     """Though it has neither series nor all numbers; by another driver it is another case."""
-    cell, driven = (make_outside_task("car-yaw", "drift"), Entry(NOMINAL)), list[Chunk]()
+    cell, driven = (_make_outside_task("car-yaw", "drift"), Entry(NOMINAL)), list[Chunk]()
 
     def drive_it(chunk: Chunk) -> DriveResult:
         driven.append(chunk)
@@ -86,7 +86,7 @@ def test_a_finished_case_is_found_again(tmp_path: Path) -> None:
 
 def test_a_drive_costs_what_the_single_car_s_costs() -> None:
     """On a road so narrow that the cars leave it one after the other: what follows is no cost."""
-    contest, seeds = make_outside_task("car-yaw", "drift"), (3, 5)
+    contest, seeds = _make_outside_task("car-yaw", "drift"), (3, 5)
     narrow = {"scenario": contest.env_options["scenario"] | {"half_width": 0.5}}
     task = dataclasses.replace(contest, changes=narrow)
     driven = _run_chunk(Chunk(task, Entry("raw-car-yaw"), seeds))
@@ -99,7 +99,7 @@ def test_a_drive_costs_what_the_single_car_s_costs() -> None:
 
 
 def test_a_reason_is_the_drive_s_error() -> None:
-    driven = _run_chunk(Chunk(make_outside_task("car-yaw", "drift"), Entry("lqr"), (0,)))
+    driven = _run_chunk(Chunk(_make_outside_task("car-yaw", "drift"), Entry("lqr"), (0,)))
     assert "beta_hat" in driven.error and np.isnan(driven.costs).all()
 
 

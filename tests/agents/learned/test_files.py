@@ -108,7 +108,8 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
         "from sideslip.agents.learned.policy import load_policy, save_policy\n"
         "policy = load_policy(sys.argv[1])\n"
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "save_policy(sys.argv[1], policy.network.select_inputs(policy.reads), policy.card)\n"
+        "net = policy.network\n"
+        "save_policy(sys.argv[1], net.select_inputs(net.reads), policy.card)\n"
     )
     command = [sys.executable, "-c", code, str(file)]
     env = os.environ | {"PYTHONPATH": ":".join(sys.path)}

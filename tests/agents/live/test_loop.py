@@ -15,7 +15,6 @@ from sideslip.agents.live.loop import (
     Port,
     _Histogram,
     clock,
-    parse_address,
 )
 from sideslip.agents.live.messages import (
     FIELDS,
@@ -26,6 +25,7 @@ from sideslip.agents.live.messages import (
     StreamSynchroniser,
     decode,
 )
+from sideslip.benchmarks.cli.live import _parse_address
 from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial
 
 ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
@@ -163,13 +163,13 @@ def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
     ],
 )
 def test_addresses(text: str, found: Any) -> None:
-    assert parse_address(text) == found
+    assert _parse_address(text) == found
 
 
 @pytest.mark.parametrize("text", ["", "h", "h:", "h:x", "h:70000", "h:-1", "[::1]:2"])
 def test_what_is_no_address(text: str) -> None:
     with pytest.raises(ValueError, match="address"):
-        parse_address(text)
+        _parse_address(text)
 
 
 def test_a_thread_that_stops_leaves_the_collector_as_it_was() -> None:

@@ -71,7 +71,7 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     card, kept = policy.policy.card, min(lines, key=lambda line: line["cost"])
     assert (card.steps, card.cpu_seconds) == (kept["steps"], kept["cpu_seconds"])
     assert card.env_id == TINY.env_id and card.env_options == TINY.env_options
-    assert not policy.policy.reads[-1]  # gamma_ref: with zero slip it never varies
+    assert not policy.policy.network.reads[-1]  # gamma_ref: with zero slip it never varies
     still: Any = type("Still", (), {"predict": lambda *_, **__: (np.zeros((4, 1)), None)})()
     none = evaluate_costs(env, still, seeds).mean()
     assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)

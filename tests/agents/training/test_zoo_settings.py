@@ -15,6 +15,7 @@ from sideslip.agents.training.callbacks import POLICY, RunOptions
 from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
 from sideslip.agents.training.trainer import Trainer
 from sideslip.agents.training.warm_start import _NetworkAgent
+from sideslip.benchmarks.cli.train import _choose_folder, _describe_for_zoo
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}
@@ -51,8 +52,8 @@ def test_the_zoo_finds_and_drives_what_we_left(algo: str, tmp_path: Path) -> Non
     """The best model, on seed 0, at the cost of our own file of it."""
     few: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "estimator": "exact-kf"}
     task = TrainingTask(algo=algo, env_options={"scenario": "sine-with-dwell"}, **few)
-    folder = task.find_zoo_folder(tmp_path)
-    task.describe_for_zoo(folder, 64, 64)
+    folder = _choose_folder(task, "", None, tmp_path)
+    _describe_for_zoo(task, folder, 64, 64)
     Trainer(task, 64, folder, run_options=RunOptions(eval_freq=64)).train()
     agent = _NetworkAgent(load_policy(folder / POLICY).network)
     cost = evaluate_costs(task.vector_env(1), agent, [0])[0]

@@ -18,6 +18,7 @@ from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import Trainer
+from sideslip.benchmarks.cli.train import _choose_folder, _describe_for_zoo
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"
@@ -38,8 +39,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training of two evaluations."""
     patch = pytest.MonkeyPatch()
     patch.setattr(trainer, "_SCALING_ENVS", 8)
-    place = TASK.find_zoo_folder(tmp_path_factory.mktemp("logs"))
-    TASK.describe_for_zoo(place, 256, 128)
+    place = _choose_folder(TASK, "", None, tmp_path_factory.mktemp("logs"))
+    _describe_for_zoo(TASK, place, 256, 128)
     Trainer(TASK, 128, place, run_options=RunOptions(eval_freq=128)).train()
     patch.undo()
     return place
@@ -122,4 +123,4 @@ def test_another_folder_gets_none_of_it(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_an_algorithm_of_ours_alone_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="rl-baselines3-zoo has no gradient"):
-        TrainingTask(algo="gradient").find_zoo_folder(tmp_path)
+        _choose_folder(TrainingTask(algo="gradient"), "", None, tmp_path)

@@ -13,6 +13,8 @@ from sideslip.agents.learned.policy import load_policy
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import trainer
+from sideslip.agents.training.callbacks import CURVE, POLICY
+from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.cli import train as train_command
 from sideslip.benchmarks.cli.options import parse_options
 from sideslip.benchmarks.cli.train import _choose_folder, _make_command
@@ -37,8 +39,8 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> None:
     status, out, err = run(*TINY, "--steps", 256, "--out", "here")
     assert status == 0, err
-    assert "best" in out and f"here/{trainer.POLICY}" in out and "of none's" in out
-    card = load_policy(f"here/{trainer.POLICY}").card
+    assert "best" in out and f"here/{POLICY}" in out and "of none's" in out
+    card = load_policy(f"here/{POLICY}").card
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
@@ -57,7 +59,7 @@ def test_it_goes_on_with_what_the_folder_holds(
     assert run(*TINY, "--steps", 256, "--eval-freq", 256)[0] == 0
     status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
     assert status == 0, err
-    assert len((tmp_path / folder / trainer.CURVE).read_text().splitlines()) == 3
+    assert len((tmp_path / folder / CURVE).read_text().splitlines()) == 3
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
     aim = trainer.read_training(folder).record
@@ -106,7 +108,7 @@ def test_without_the_extra_the_command_names_it(
 
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
-    task = trainer.TrainingTask(estimator="exact-kf", estimator_options=told)
+    task = TrainingTask(estimator="exact-kf", estimator_options=told)
     words = _make_command(task, 10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
     assert parse_options(found) == told
@@ -115,7 +117,7 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
-    task = trainer.TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
+    task = TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
     assert _choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
     assert _choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
     assert _choose_folder(task, "", Path("here"), None) == Path("here")
@@ -130,7 +132,7 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     for number in (1, 2):
         status, out, err = run(*TINY, "--steps", 64, "-f", "logs")
         assert status == 0, err
-        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{trainer.POLICY}" in out
+        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{POLICY}" in out
     params = tmp_path / "logs/ppo/sideslip-YawVision-v0_2/sideslip-YawVision-v0"
     assert "scenario: sine-with-dwell" in (params / "args.yml").read_text()
     status, _, err = run(*TINY, "-f", "logs", "--out", "here")
@@ -160,11 +162,11 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err
     assert "of its start's" in out and " 1.000" in out and "judged" in out
-    assert asked == [(Path("on") / trainer.POLICY, "coms-zero-slip", 32)]
+    assert asked == [(Path("on") / POLICY, "coms-zero-slip", 32)]
     task = trainer.read_training("on").task
     known = [each.scenario for each in _list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
-    words = shlex.split(load_policy(f"on/{trainer.POLICY}").card.command)[2:]
+    words = shlex.split(load_policy(f"on/{POLICY}").card.command)[2:]
     assert words[-2:] == ["--trained-agent", "distill-coms-yaw"]
     status, _, err = run("-i", "distill-coms-yaw", "--algo", "sac", "--out", "off")
     assert status == 2 and "sac begins with a zip, not with policy distill-coms-yaw" in err

@@ -26,7 +26,7 @@ from sideslip.benchmarks.control.tasks import (
 )
 from sideslip.benchmarks.report import study
 from sideslip.benchmarks.studies import recovery_region
-from sideslip.benchmarks.studies.learned_outside import KINDS, make_outside_task
+from sideslip.benchmarks.studies.learned_outside import KINDS, _make_outside_task
 from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suites
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 from sideslip.estimators.learned.network import SUFFIX
@@ -180,7 +180,7 @@ def digest(seeds: list[list[int]]) -> str:
 def test_seeds_stay_whatever_the_fields_of_a_contest_are_called() -> None:
     """The files of calibrations and baselines hold costs on these seeds."""
     every = [ControlTask(), *list_candidates()]
-    every += [make_outside_task(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
+    every += [_make_outside_task(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
     drawn = [make_task_seeds(ONE, 4)(each) for each in every]
     assert digest(drawn) == "0240b08b3f564e85"
     assert digest([calibration.derive_seeds(each, 4) for each in every]) == "9149ee64ab99e5e3"

@@ -10,7 +10,6 @@ from sideslip.benchmarks.harness.metrics import (
     EPISODE,
     METRICS,
     REDUCTIONS,
-    Metric,
     compute_dissipation,
 )
 
@@ -39,7 +38,6 @@ def test_every_metric_of_an_episode_has_a_unit_and_a_fold() -> None:
     assert len(set(names)) == len(names)
     for metric in EPISODE:
         assert METRICS[metric.name] == metric.unit and metric.reduction in REDUCTIONS
-    assert Metric("x", "rad", lambda m: m.reward, "sum", scale=1e3).text(0.01234) == "12.3"
 
 
 NOTHING = ("acceleration", "disturbance_force", "disturbance_moment", "onset")

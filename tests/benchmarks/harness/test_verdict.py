@@ -137,7 +137,7 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
         return SineDwellResult(0.3, runs)
 
     track = next(iter(iso3888.TRACKS))
-    monkeypatch.setattr(iso3888, "find_highest_speed", lambda runs: runs)
+    monkeypatch.setattr(procedures, "_find_highest_speed", lambda runs: runs)
     done: dict[ProcedureCase, Any] = {}
     for car in CARS:
         for k in range(len(ENTRIES)):

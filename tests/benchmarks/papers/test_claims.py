@@ -67,9 +67,9 @@ def test_ratios_are_taken_seed_by_seed() -> None:
         (("b", "c"), np.max, [0.25, 0.25]),
         (("b", "c"), np.min, [0.5, 2.0]),
     ):
-        found = ClaimPart("l", "s", "a", rivals=rivals, pick=pick).measure(results)
+        found = ClaimPart("l", "s", "a", rivals=rivals, pick=pick)._measure(results)
         np.testing.assert_array_equal(found, expected)
-    pooled = ClaimPart("l", "s", "a", rivals=("c",), is_pooled=True).measure(results)
+    pooled = ClaimPart("l", "s", "a", rivals=("c",), is_pooled=True)._measure(results)
     assert pooled == pytest.approx([0.25])
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.procedures import iso3888
+from sideslip.benchmarks.procedures import iso3888, suite
 from sideslip.benchmarks.procedures.drive import Fields, Series, TestCar
 from sideslip.envs import PASSENGER_CAR
 from sideslip.envs.record import Array
@@ -100,5 +100,5 @@ def test_the_highest_speed_is_that_of_a_clean_run_of_any_driver(track: str) -> N
     runs = iso3888.run(drive, CAR, track, [11.0, 12.0, 13.0])
     assert [speed for speed, _ in driven] == [11.0] + 3 * [12.0] + len(iso3888.DRIVERS) * [13.0]
     assert [run.passed for run in runs] == [True, True, False]
-    assert iso3888.find_highest_speed(runs) == 12.0
-    assert iso3888.find_highest_speed(runs[-1:]) == 0.0
+    assert suite._find_highest_speed(runs) == 12.0
+    assert suite._find_highest_speed(runs[-1:]) == 0.0

@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
 from sideslip.benchmarks.recorded.suite import _compute_path
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
-from sideslip.envs.recordings.log_file import read_log
+from tests.envs.recordings.drives import read_log
 
 from .slalom import DT, ROWS, SPEED, columns, saved
 

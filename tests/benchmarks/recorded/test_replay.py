@@ -14,9 +14,9 @@ from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, corners, replay
 from sideslip.envs.record import Log
-from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators import make_estimator
+from tests.envs.recordings.drives import read_log
 
 from .slalom import ROWS, VEHICLE, columns, saved
 

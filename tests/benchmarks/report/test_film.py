@@ -21,7 +21,6 @@ from sideslip.benchmarks.report.film import (
     _render_frames,
     check_film,
     make_track_kml,
-    write_drive_film,
     write_film,
 )
 from sideslip.envs.rendering.palette import GREY
@@ -40,7 +39,7 @@ def test_a_film_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
     with VideoFileClip(str(mp4)) as clip:
         assert clip.size == [960, 540] and clip.fps == 50.0
         assert clip.duration == pytest.approx(0.42, abs=0.021)
-    write_drive_film(gif, driver(), "none", 1, Console(quiet=True))
+    write_film(gif, [driver(), driver()], 1, Console(quiet=True))
     with Image.open(gif) as picture:
         assert picture.size == (960, 540) and picture.n_frames == 6
         assert picture.info["duration"] == 80

@@ -9,21 +9,13 @@ import pytest
 
 pytest.importorskip("plotly")
 pytest.importorskip("moviepy")
-from rich.console import Console
-
 from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.report import figures
-from sideslip.benchmarks.report.film import (
-    FilmDriver,
-    check_film,
-    make_track_kml,
-    write_drive_film,
-)
+from sideslip.benchmarks.report.film import check_film, make_track_kml
 from sideslip.benchmarks.report.html import check_page, write_report
 
 FEW, MANY, NAN = np.arange(2.0), np.arange(3.0), np.array([0.0, np.nan])
 SHORT_ROW = Suite("s", "S", "", tables=[ResultTable("short row", ("a", "b"), [["1"]])])
-NOBODY = FilmDriver("none", None, None)
 
 
 def write_unmarked_page(folder: Path) -> None:
@@ -46,8 +38,6 @@ def write_unmarked_page(folder: Path) -> None:
          r"a film ends in .mp4 or .gif, got '.*film.avi'"),
         (lambda at: check_film(at / "a"), ValueError, "a film ends in .mp4 or .gif"),
         (lambda at: check_film(at / "none/a.mp4"), FileNotFoundError, "no such folder"),
-        (lambda _: write_drive_film(None, NOBODY, "none", 0, Console(quiet=True)), ValueError,
-         "'none' can only drive beside in a film: --video names"),
         (lambda _: make_track_kml("x", {}), ValueError, "track"),
         (lambda _: make_track_kml("x", {"short": (MANY, FEW)}), ValueError, "track"),
         (lambda _: make_track_kml("x", {"lost": (NAN, FEW)}), ValueError, "track"),

@@ -22,13 +22,13 @@ from sideslip.benchmarks.report.html import (
     _encode_figure,
     _encode_steps,
     _format_page_table,
+    _mark_code,
     _pack_text,
     check_page,
-    inline,
     write_page,
     write_report,
 )
-from sideslip.benchmarks.report.tables import format_cell, format_columns
+from sideslip.benchmarks.report.tables import _format_cell, format_columns
 
 from .demo import COMMAND, HOSTILE, VERSIONS, answered, control, estimation, matrix
 
@@ -91,8 +91,8 @@ def test_one_answer_with_one_picture_comes_first_and_each_verdict_with_its_suite
         "First. It is so.  Second, <code>lqr</code>. Third."
     ]
     assert opening.count("<figure") == 1 and "Fourth." not in opening
-    assert all(inline(line) in first for line in suites[0].verdict.splitlines())
-    assert all(inline(line) in second for line in suites[1].verdict.splitlines())
+    assert all(_mark_code(line) in first for line in suites[0].verdict.splitlines())
+    assert all(_mark_code(line) in second for line in suites[1].verdict.splitlines())
     assert second.count("<figure") == 1  # the other one
     asked = [title for title, *_ in suites[0].answers]
     assert asked == re.findall("<h3>(.*?)</h3>", first)[: len(asked)]
@@ -206,7 +206,7 @@ def test_columns_of_numbers_are_marked_for_sorting(tmp_path: Path) -> None:
     ],
 )
 def test_a_cell_is_formatted_as_its_column_says(cell: Any, column: Column, text: str) -> None:
-    assert format_cell(cell, column) == text
+    assert _format_cell(cell, column) == text
 
 
 @pytest.mark.parametrize("failing", ["drawing", "disk"])

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.study import CaseStorage, Request, Study, stack_seeds
+from sideslip.benchmarks.report.study import CaseStorage, Request, Study
 
 
 def run(request: Request, **options: Any) -> Suite:
@@ -59,9 +59,9 @@ def test_seeds_are_run_in_chunks_of_each_condition() -> None:
         assert len(case[1]) <= 2
         return [{"a": (case[0], seed), "b": (0.0, 1.0)} for seed in case[1]]
 
-    one, other = map(stack_seeds, Request(jobs=1).run_seeds(square, (3, 4), 5, 2, ""))
-    assert one["a"].tolist() == [[3, 0], [3, 1], [3, 2], [3, 3], [3, 4]]
-    assert other["a"][:, 0].tolist() == [4] * 5 and other["b"].shape == (5, 2)
+    one, other = Request(jobs=1).run_seeds(square, (3, 4), 5, 2, "")
+    assert [drive["a"] for drive in one] == [(3, 0), (3, 1), (3, 2), (3, 3), (3, 4)]
+    assert [drive["a"][0] for drive in other] == [4] * 5 and other[0]["b"] == (0.0, 1.0)
 
 
 def test_finished_cases_are_taken_from_the_folder(tmp_path: Path) -> None:

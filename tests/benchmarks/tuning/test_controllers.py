@@ -23,7 +23,6 @@ from sideslip.benchmarks.tuning.controllers import (
     SearchNumber,
     _compute_objective,
     _list_contests,
-    _make_options,
     _run_contestant,
     tune,
 )
@@ -76,7 +75,7 @@ def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
     asked: list[ControlCase] = []
     monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
     asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
-    options = asked_of.options(asked_of.start | {"force_sd": 77.0})
+    options = asked_of._make_options(asked_of.start | {"force_sd": 77.0})
     _run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
     ((contest, entry),) = asked
     other = replace(entry, agent="lqr")
@@ -170,7 +169,8 @@ def test_numbers_become_options() -> None:
         both,
     )
     found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
-    assert _make_options(numbers, found) == {
+    task = controllers.ControllerTuning("lqr", "car-yaw", (), (0,), numbers)
+    assert task._make_options(found) == {
         "filter": {"disturbance_time": 0.2},
         "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
     }

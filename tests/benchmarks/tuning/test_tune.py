@@ -48,7 +48,7 @@ def test_error_is_the_mean_square_from_two_seconds_on(
         filter_ = make_estimator("bicycle-kf", **(drive.facts | found))
         error = filter_.run(drive.log)["beta"] - drive.log.truth["beta"]
         wanted = np.mean(error[drive.log.time > 1.9995] ** 2)
-        assert tune_task.compute_squares(task, drives, found)[0, i] == pytest.approx(
+        assert tune_study._compute_squares(task, drives, found)[0, i] == pytest.approx(
             wanted, rel=1e-12
         )
 
@@ -59,7 +59,7 @@ def test_angles_are_compared_on_the_circle(
     log = drives[0].log
     turned = dataclasses.replace(log, truth={"beta": log.truth["beta"] + 4.0 * np.pi})
     there, back = (
-        tune_task.compute_squares(task, [LoggedEpisode(each, drives[0].facts)], {})
+        tune_study._compute_squares(task, [LoggedEpisode(each, drives[0].facts)], {})
         for each in (log, turned)
     )
     assert back == pytest.approx(there, rel=1e-9)
@@ -79,7 +79,7 @@ def test_found_is_the_best_that_was_tried(
         low, high = task.search[name]
         assert low <= value <= high
         assert value == pytest.approx(best.params[name], rel=5e-3)  # three digits
-    error = np.sqrt(tune_task.compute_squares(task, drives, best.params).mean())
+    error = np.sqrt(tune_study._compute_squares(task, drives, best.params).mean())
     assert best.value == pytest.approx(error, rel=1e-12)
 
 
@@ -104,7 +104,7 @@ def test_the_shipped_tuning_of_the_bicycle_model_is_found_again(tmp_path: Path) 
     study = tune_study.create_study(task, storage(tmp_path), "tpe", seed=1)
     found = tune_study._search(study, task, drives, SearchOptions(120, jobs=1))
     error, shipped = (
-        tune_task.compute_squares(task, drives, numbers).mean() for numbers in (found, {})
+        tune_study._compute_squares(task, drives, numbers).mean() for numbers in (found, {})
     )
     assert error == pytest.approx(shipped, rel=0.02)
 
@@ -290,15 +290,15 @@ def test_several_scenarios_count_alike() -> None:
     names = ("tie-vision-fig8", "sine")
     task = tune_task.make_estimator_tuning("bicycle-kf", names, seeds=2)
     drives = tune_task.simulate(task, task.seeds, "", 1, None)
-    both = tune_task.compute_squares(task, drives, {})
+    both = tune_study._compute_squares(task, drives, {})
     alone = []
     for name in names:
         single = dataclasses.replace(task, scenarios=(name,))
         own = tune_task.simulate(single, task.seeds, "", 1, None)
-        alone.append(tune_task.compute_squares(single, own, {})[0])
+        alone.append(tune_study._compute_squares(single, own, {})[0])
     assert np.array_equal(both, alone)
     roots = np.sqrt(np.mean(alone, axis=1))
-    assert tune_task.compute_objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
+    assert tune_study._compute_objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
     assert task.study != dataclasses.replace(task, scenarios=names[::-1]).study
     with pytest.raises(ValueError, match="scenarios are one or more, each once, got sine, sine"):
         tune_task.make_estimator_tuning("bicycle-kf", ("sine", "sine"))

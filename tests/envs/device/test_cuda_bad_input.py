@@ -84,7 +84,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
 
 def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(driver: Any) -> None:
     fake = driver()
-    loaded = cuda_launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)
+    loaded = cuda_launch._DriverKernel("// PTX", torch.device("cuda:0"), fake)
     assert fake.calls["cuModuleLoadData"] == (b"// PTX\0",)
     assert fake.calls["cuModuleGetFunction"] == ("module", b"sideslip_step")
     arrays = [torch.zeros(3), torch.zeros(0)]
@@ -108,4 +108,4 @@ def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(drive
 def test_what_the_driver_refuses_is_said(driver: Any, call: str, code: str, error: Any) -> None:
     fake = driver(**{call: code})
     with pytest.raises(error, match=f"on cuda:0: {code}"):
-        cuda_launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])
+        cuda_launch._DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])

@@ -5,16 +5,17 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from sideslip.envs.device.cuda_kernel import _draw_key, read_words
+from sideslip.envs.device.cuda_env import _read_words
+from sideslip.envs.device.cuda_kernel import _draw_key
 
 pytestmark = pytest.mark.plain
 
 
 def test_keys_are_those_of_numpys_generator() -> None:
     generators = [np.random.default_rng(seed) for seed in range(200)]
-    words = read_words(generators)
+    words = _read_words(generators)
     for i, generator in enumerate(generators):
         for _ in range(5):
             key = int(generator.integers(0, 2**64, dtype=np.uint64))
             assert _draw_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
-    assert np.array_equal(words, read_words(generators))  # and it stands where NumPy's does
+    assert np.array_equal(words, _read_words(generators))  # and it stands where NumPy's does

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
+from sideslip.benchmarks.speed.ptx import _count_opcodes
 from sideslip.envs import StabilityVectorEnv
 from sideslip.envs.device import cuda_launch
 from sideslip.envs.device.cuda_kernel import NAME, DeviceArrays, KernelConstants, make_constants
@@ -26,10 +27,10 @@ def how() -> KernelConstants:
 
 def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
     text = cuda_launch.get_ptx(how(), np.float64, H200)
-    found = cuda_launch.count_opcodes(text)
+    found = _count_opcodes(text)
     assert ".target sm_90" in text
     head = text[text.index(f".visible .entry {NAME}(") :].partition(")")[0]
-    kinds = re.findall(r"\.param \.(\w+)", head)  # what `DriverKernel` hands over
+    kinds = re.findall(r"\.param \.(\w+)", head)  # what `_DriverKernel` hands over
     assert kinds == ["u64", "u8", *["u64"] * len(DeviceArrays._fields)]
     assert not [each for each in found if each.startswith(("fma", "mad"))]
     floats = [each for each in found if re.match(r"(add|sub|mul|div|rcp|sqrt)\S*\.f", each)]
@@ -42,7 +43,7 @@ def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
 
 def test_float32_has_no_double_in_the_ticks() -> None:
     text = cuda_launch.get_ptx(how(), np.float32, H200)
-    assert cuda_launch.count_opcodes(text)["fma.rn.f32"] > 500
+    assert _count_opcodes(text)["fma.rn.f32"] > 500
     kinds = ARITHMETIC.findall(text)
     assert kinds.count("f64") < 0.02 * kinds.count("f32")
     longest = max("".join("s" if each == "f32" else " " for each in kinds).split(), key=len)

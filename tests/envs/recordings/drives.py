@@ -1,9 +1,14 @@
-"""A small drive as a table, and on disk."""
+"""A small drive as a table, on disk, and read as it is: without mending its clock."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+
+from sideslip.envs.record import Log
+from sideslip.envs.recordings.log_file import _GAPS, _NEEDED, _make_log
+from sideslip.envs.recordings.tables import read_quantities
 
 
 def drive(rows: int = 50, dt: float = 0.01, start: float = 3.0) -> pd.DataFrame:
@@ -26,3 +31,12 @@ def saved(table: pd.DataFrame, folder: Path, name: str = "drive.csv", sep: str =
     path = folder / name
     table.to_csv(path, index=False, sep=sep)
     return path
+
+
+def read_log(path: Path, mapping: Mapping[str, str] | None = None) -> Log:
+    """The drive of a table that `read_parts` would leave whole."""
+    values, _ = read_quantities(path, mapping or {}, _NEEDED, _GAPS)
+    try:
+        return _make_log(values, path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -10,10 +10,10 @@ import pytest
 
 from sideslip.envs.record import FAST, Log
 from sideslip.envs.recordings.dialect import _UNITS, find_unit, to_degrees, to_metres
-from sideslip.envs.recordings.log_file import read_log, read_parts
+from sideslip.envs.recordings.log_file import read_parts
 from sideslip.envs.recordings.tables import COLUMNS, read_quantities
 
-from .drives import drive, saved
+from .drives import drive, read_log, saved
 
 DEG = np.pi / 180.0
 BARE = ["Time", "Speed X", "speed_y", "Yaw rate", "Accel X", "Accel Y", "STEER", "Sideslip"]

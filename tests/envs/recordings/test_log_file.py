@@ -11,11 +11,10 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.recordings.tables import COLUMNS, _make_column_name, parse_mapping
 from sideslip.envs.sensors.slow import GPS
 
-from .drives import drive, saved
+from .drives import drive, read_log, saved
 
 STANFORD = Path(__file__).parents[3] / "shared" / "data" / "stanford_250lm" / "log.csv"
 DEG = np.pi / 180.0

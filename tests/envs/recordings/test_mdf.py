@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.recordings.log_file import read_log, read_parts
+from sideslip.envs.recordings.log_file import read_parts
 
-from .drives import drive, saved
+from .drives import drive, read_log, saved
 
 asammdf = pytest.importorskip("asammdf")
 

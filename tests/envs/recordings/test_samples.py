@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, PACKET, Log
-from sideslip.envs.recordings.log_file import read_log, read_parts
+from sideslip.envs.recordings.log_file import read_parts
 
-from .drives import drive, saved
+from .drives import drive, read_log, saved
 
 DEG = np.pi / 180.0
 ROWS, EVERY = 1200, 20

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.harness.drives import LoggedEpisode, make_filter_arguments
-from sideslip.benchmarks.tuning.estimator import compute_squares, make_estimator_tuning
+from sideslip.benchmarks.tuning.estimator import make_estimator_tuning
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, EstimatorFactory, EstimatorLike, make_estimator
 from sideslip.estimators.make import ESTIMATORS, register_estimator
@@ -205,13 +205,16 @@ def test_a_spec_of_anything_else_is_no_json() -> None:
 def test_it_can_be_tuned() -> None:
     """By its own options; a smaller error of the sideslip angle is a smaller number."""
     ukf()
+    pytest.importorskip("optuna")
+    from sideslip.benchmarks.tuning.study import _compute_squares
+
     search: dict[str, Any] = {"gyro": None}
     task = make_estimator_tuning(UKF, "tie-vision-fig7", search=search, seeds=1)
     assert (task.unit, task.env_id) == ("rad", VISION)
     log = rollout(gym.make(VISION, **FIG7), seed=3, options={"duration": 2.05}).log
     base: Any = gym.make(VISION, **FIG7).unwrapped
     drives = [LoggedEpisode(log, make_filter_arguments(base))]
-    assert compute_squares(task, drives, {"gyro": 0.005}) < compute_squares(
+    assert _compute_squares(task, drives, {"gyro": 0.005}) < _compute_squares(
         task, drives, {"gyro": 1.0}
     )
     with pytest.raises(ValueError, match="has no process noise to search; name the options"):
