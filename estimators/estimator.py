@@ -360,7 +360,7 @@ class Estimator:
         return dict(zip(SkipCounters._fields, map(int, self._f.counts), strict=True))
 
     @property
-    def healthy(self) -> bool:
+    def is_healthy(self) -> bool:
         """Whether innovations are about as large as expected; False for a filter that is lost.
 
         Filters whose noise is fixed (`noise_time=0`) keep no account of it and say True.

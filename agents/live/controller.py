@@ -165,7 +165,7 @@ class OnboardController:
         observe(EpisodeArrays(*numbers, np.empty((0, 0))), shown, len(packets), self._refs)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
         # the true beta and gamma (0.0) serve the summary of errors alone, which nobody reads here
-        observed = Observed(obs, outputs.table, 0.0, 0.0, out, np.zeros(3))
+        observed = Observed(obs, outputs.table, 0.0, 0.0, out, np.zeros(4))
         if self._is_native:  # `take` has given it all: no rows and no packets here
             record = StepRecord(self._rows, 0, NO_PACKETS, 0)
             compile_observe()(estimator.filters, estimator.gains, record, 0, observed)

@@ -156,3 +156,20 @@ def find_backward(log: Log) -> npt.NDArray[np.bool_]:
     """
     turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
     return np.asarray((compute_ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
+
+
+def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
+    """Compute a drive's path by dead reckoning.
+
+    Args:
+        log: Recorded drive.
+        beta: Sideslip angle (rad), shape (rows,).
+
+    Returns:
+        x and y (m), shape (rows,) each.
+    """
+    psi, v_x = compute_heading(log), compute_ground_speed(log)
+    v_y = v_x * np.tan(np.nan_to_num(beta))
+    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
+    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
+    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt

@@ -66,3 +66,16 @@ def describe_innovations(nis: Mapping[str, tuple[float, int]]) -> str:
         return ""
     judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"
     return f"By squared innovations over their variance, which should be 1: {judged}."
+
+
+def rank_by_score(honesty: Mapping[str, Array]) -> list[str]:
+    """Rank filters by their median log score.
+
+    Args:
+        honesty: Rows of `compute_honesty` by filter, shape (seeds, 3).
+
+    Returns:
+        Names, the best first.
+    """
+    scores = {name: -float(np.median(rows[:, 2])) for name, rows in honesty.items()}
+    return sorted(scores, key=scores.__getitem__)

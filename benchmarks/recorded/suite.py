@@ -19,13 +19,14 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
-from .emulate import Emulation, compute_ground_speed, compute_heading, find_backward
+from .emulate import Emulation, compute_path, find_backward
 from .honesty import (
     HONESTY,
     SHARES,
     compute_held_shares,
     compute_honesty,
     describe_innovations,
+    rank_by_score,
 )
 
 GYRO_ONLY = "bicycle-kf"
@@ -119,13 +120,6 @@ class ReplayResult:
         """RMS errors over the seeds (rad), best first."""
         ranges = {name: _compute_range(np.sqrt(x)) for name, x in self.squares.items()}
         return dict(sorted(ranges.items(), key=lambda item: item[1].value))
-
-    @property
-    def ranked(self) -> list[str]:
-        """Estimators by the median log score, best first; without truth in their order."""
-        if not self.honesty:
-            return list(self.cost)
-        return sorted(self.honesty, key=lambda name: -float(np.median(self.honesty[name][:, 2])))
 
 
 def _compute_range(values: Array) -> Estimate:
@@ -221,6 +215,8 @@ def _make_estimator(
         options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
     if "gyro_noise" in settings.noise and name != _OWN_NOISE:
         options["gyro_noise"] = max(settings.noise["gyro_noise"], _MIN_GYRO_NOISE)
+    if name == _OWN_NOISE and slow is not None and "accel_y" not in log.record.present:
+        options["fast"] = ("gyro",)
     options |= settings.options.get(name, {})
     facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
     return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
@@ -279,8 +275,9 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
             describe_innovations(result.nis),
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
-    _, held, _ = np.median(result.honesty[result.ranked[0]], axis=0)
-    believed = f"Best by the log score: {result.ranked[0]}, whose 95 % interval holds {held:.0%}."
+    honest = rank_by_score(result.honesty)[0]
+    _, held, _ = np.median(result.honesty[honest], axis=0)
+    believed = f"Best by the log score: {honest}, whose 95 % interval holds {held:.0%}."
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: _compute_ratio(result, first, name) for name in rest}
@@ -382,7 +379,7 @@ def _add_rows(
         records[name] = record | {"us_per_tick": cost}
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
-    return [records[name] for name in result.ranked]
+    return [records[name] for name in rank_by_score(result.honesty) or records]
 
 
 def _make_table(
@@ -402,15 +399,6 @@ def _make_table(
     return ResultTable(title, columns, records, note)
 
 
-def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
-    """Compute x and y (m) by dead reckoning with a sideslip angle (rad), shape (rows,) each."""
-    psi, v_x = compute_heading(log), compute_ground_speed(log)
-    v_y = v_x * np.tan(np.nan_to_num(beta))
-    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
-    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
-    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
-
-
 def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
     try:
@@ -424,7 +412,7 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
     near = np.abs(log.time - peak_time) <= _WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
-    paths = {name: _compute_path(log, beta) for name, beta in traces.items()}
+    paths = {name: compute_path(log, beta) for name, beta in traces.items()}
     overview = _select_traces(draw_time_series(log.time, slips, label), result)
     shown = [
         ("the sideslip angle and its estimates", overview, _HIDDEN),

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -23,7 +23,7 @@ from ..tuning.levels import draw_drive, run_filter
 
 FIRST_SEED = 100_000  # no drive of the search
 _NO_TYRES = {"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "inverse_friction_sd": 0.0}
-PARTS: dict[str, Mapping[str, Any]] = {
+PARTS: dict[str, Mapping[str, object]] = {
     "joint-robust": {},
     "without the accelerometer": {"fast": ("gyro",)},
     "without a time of the moment's own": {"moment_time": 0.0},
@@ -42,7 +42,7 @@ PARTS: dict[str, Mapping[str, Any]] = {
 """Filters by name, as options over the defaults."""
 
 
-def _judge(seed: int, names: tuple[str, ...]) -> list[tuple[float, ...]]:
+def _measure(seed: int, names: tuple[str, ...]) -> list[tuple[float, ...]]:
     """Judge all filters on a drive: RMS error (rad), NEES, coverage, log score of each."""
     episode, judged = draw_drive(seed), list[tuple[float, ...]]()
     for name in names:
@@ -60,7 +60,7 @@ def main(
     """Compare `joint-robust` with itself, one part less at a time."""
     console, names = Console(), tuple(PARTS)
     seeds = range(FIRST_SEED, FIRST_SEED + drives)
-    judged = run_cases(partial(_judge, names=names), seeds, "the next car", jobs, console)
+    judged = run_cases(partial(_measure, names=names), seeds, "the next car", jobs, console)
     numbers = np.array([row for row in judged if row])  # (drives, filters, 4)
     rows = []
     for i, name in enumerate(names):

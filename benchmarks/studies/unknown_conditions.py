@@ -64,7 +64,6 @@ class Condition:
 LATE = 0.06  # s
 _FIND = {"latency": {"gyro": "find"}}
 _FOUR = {"members": 4}
-_SUDDEN = {"sudden": True}
 _THREE = {"levels": (0.5, 1.0, 2.0)}
 _LIMITED = {"inverse_friction_sd": 0.5}
 _BIASED = {"bias_sd": 0.01}
@@ -94,7 +93,6 @@ def _make_rolling(
 FIALA = {"tyres": "fiala", "friction": 0.9}
 _SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
 _LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank of filters
-_LATER_GUST = _GUST | {"wind_start": 4.13}
 CAR = {"speed": 80.0 * _KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
 """The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
 _CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
@@ -126,17 +124,13 @@ CONDITIONS = (
     Condition("twice the disturbances, three levels", CAMERA, _TWICE, _THREE),
     Condition("a gust of unknown strength", CAMERA, MIX | _GUST, modelled=False),
     Condition("the same gust, for a gust", CAMERA, MIX | _GUST, _GUSTY, modelled=False),
-    Condition("the same gust, sudden", CAMERA, MIX | _GUST, _SUDDEN, modelled=False),
-    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | _LATER_GUST, _SUDDEN, modelled=False),
     _make_rolling("the gust, car that rolls", {}),
     _make_rolling("the same, accelerometer", _INERTIAL),
     _make_rolling("the same, accelerometer, for a gust", _INERTIAL | _GUSTY),
     _make_rolling("no gust, accelerometer, for a gust", _INERTIAL | _GUSTY, {}),
     Condition("camera, four members", CAMERA, MIX, _FOUR),
     Condition("camera, three levels", CAMERA, MIX, _THREE),
-    Condition("camera, sudden", CAMERA, MIX, _SUDDEN),
     Condition("tyres change at 5 s, four members", CAMERA, MIX | _CHANGE, _FOUR),
-    Condition("the same, sudden", CAMERA, MIX | _CHANGE, _SUDDEN),
     Condition("the same, three levels", CAMERA, MIX | _CHANGE, _THREE),
     Condition("the same, one filter", CAMERA, MIX | _CHANGE, modelled=False),
     Condition("from the change on, four members", CAMERA, MIX | _CHANGE, _FOUR, _CHANGED),
@@ -145,7 +139,6 @@ CONDITIONS = (
         "from the change on, one filter", CAMERA, MIX | _CHANGE, {}, _CHANGED, modelled=False
     ),
     Condition("tyres change at 5.37 s, four members", CAMERA, MIX | _CHANGE | _LATER, _FOUR),
-    Condition("tyres change at 5.37 s, sudden", CAMERA, MIX | _CHANGE | _LATER, _SUDDEN),
     Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, _LIMITED, bounded=False),
     Condition("slalom, Fiala tyres, friction 0.5", CAMERA, _SLALOM, _LIMITED, bounded=False),
 )

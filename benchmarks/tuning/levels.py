@@ -65,13 +65,15 @@ def _draw_steering(rng: np.random.Generator, amplitude: float, duration: float) 
     return np.asarray(angle * np.minimum(1.0, time / 0.5))
 
 
-def _draw_event(rng: np.random.Generator, is_small: bool) -> dict[str, Any]:
+def _draw_event(rng: np.random.Generator, is_small: bool) -> dict[str, object]:
     """Draw what happens in half of the drives, as fields of a scenario."""
     when = float(rng.uniform(5.0, 12.0))
     force = (150.0, 500.0) if is_small else (500.0, 2000.0)
-    changes = {f"{axle}_change": float(rng.uniform(0.6, 1.2)) for axle in ("front", "rear")}
-    events: tuple[dict[str, Any], ...] = (
-        {"tyre_change_time": when} | changes,
+    changes: dict[str, object] = {
+        f"{axle}_change": float(rng.uniform(0.6, 1.2)) for axle in ("front", "rear")
+    }
+    events: tuple[dict[str, object], ...] = (
+        changes | {"tyre_change_time": when},
         {"wind_force": force, "wind_arm": 0.3, "wind_start": when, "wind_length": 3.0},
         {"gps_outage": (6.0, 16.0)},
         {"initial_beta": float(rng.uniform(-0.1, 0.1)), "friction": 0.5},
@@ -94,7 +96,7 @@ def _draw_data_sheet(rng: np.random.Generator, vehicle: Vehicle) -> Vehicle:
     )
 
 
-def _thin(log: Log, every: int, sensors: Iterable[str]) -> Log:
+def _reduce_rate(log: Log, every: int, sensors: Iterable[str]) -> Log:
     """Keep every so manieth row, as a slower logger does, and the packets of some sensors."""
     record, step = log.record, log.record.dt * every
     packets = np.concatenate([record.packets[:0], *map(record.select_packets, sensors)])
@@ -139,7 +141,7 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
     speed = float(rng.uniform(5.0, 11.0) if is_small else rng.uniform(14.0, 30.0))
     amplitude = float((0.12 if is_small else 0.05) * rng.choice([0.15, 0.4, 0.7, 1.0, 1.3]))
     amplitude *= min(1.0, (16.0 / speed) ** 1.2)
-    scenario: dict[str, Any] = {
+    scenario: dict[str, object] = {
         "base": "random-steering", "steering": "trace", "trace_step": 0.01, "onset": 0.0,
         "trace": tuple(_draw_steering(rng, amplitude, duration)), "duration": duration,
         "speed": speed, "front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4),
@@ -152,8 +154,13 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
         scenario |= {"road": "nominal-path", "camera_heading": 0.5, "camera_offset": 4.0}
     sensors = {"camera": "Vision", "camera and gps": "Fusion"}.get(kind, "Gps")
     vehicle = "coms" if is_small else "passenger-car"
-    how: dict[str, Any] = {"scenario": scenario, "vehicle": vehicle, "control_period": 10}
-    env = gym.make(f"sideslip/Yaw{sensors}-v1", world=world, **how)
+    env = gym.make(
+        f"sideslip/Yaw{sensors}-v1",
+        world=world,
+        scenario=scenario,
+        vehicle=vehicle,
+        control_period=10,
+    )
     base: Any = env.unwrapped
     records, times, slips = [], [], []
     for step in iterate_steps(env, None, seed):
@@ -166,14 +173,14 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
     )
     facts = make_filter_arguments(base)
     if "100 Hz" in kind:
-        log = _thin(log, 10, ("gps",) if "gps" in kind else ())
+        log = _reduce_rate(log, 10, ("gps",) if "gps" in kind else ())
         facts |= {"dt": log.record.dt, "sensors": log.slow}
     facts |= {"vehicle": _draw_data_sheet(rng, facts["vehicle"])}
     env.close()
     return LoggedEpisode(log, facts)
 
 
-def run_filter(episode: LoggedEpisode, options: Mapping[str, Any]) -> tuple[Array, Array]:
+def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[Array, Array]:
     """Run `joint-robust` over a drive.
 
     Args:
@@ -196,7 +203,7 @@ def run_filter(episode: LoggedEpisode, options: Mapping[str, Any]) -> tuple[Arra
     return error, estimates.std[rows, column]
 
 
-def convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, Any]:
+def convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, float]:
     """Convert levels to options of a filter for a drive.
 
     Args:

@@ -17,7 +17,7 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import BETA, CURVATURE, LATERAL, build_model, is_finite
-from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
+from .multiple_model import compute_mixture, replace_least_likely
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
@@ -300,10 +300,7 @@ def advance(
                 _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            if layers[0].burst[0] > 0.0:  # only members that interact have gusts
-                run_imm_step(layers)
-            else:
-                replace_least_likely(layers)
+            replace_least_likely(layers)
         if first > 0 and (len(X) > 0 or j == rows - 1):
             compute_mixture(layers)
         if len(X) > 0:

@@ -131,7 +131,6 @@ _FIELDS = [
     ("spread", _FLOAT),  # variance by which a new member forgets the tyres
     ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
     ("alert", _FLOAT),  # value of `fresh` for a new member
-    ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
     # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),

@@ -13,7 +13,7 @@ from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import innovation as rule
 from ..core import record as size
 from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
-from ..core.multiple_model import CHANGED, GUSTY, MIN_LOG_WEIGHT
+from ..core.multiple_model import MIN_LOG_WEIGHT
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from . import models
 from .kalman import kalman_gain
@@ -104,8 +104,6 @@ HAZARD = 0.2  # 1/s, rate at which tyres change
 _TYRE_VARIANCE = 0.06  # variance that a change adds to the factors on the stiffness
 # 1/s, variance per second of a new member's factors until the next one: the change may be later
 _TYRE_WALK = 0.02
-_IMM_TIME = 0.2  # s between two steps of members that interact
-_GUST = (8.0, 2.0)  # standard deviations of a gust's force and moment over those configured
 
 
 def assemble(
@@ -170,13 +168,6 @@ def _build_bank(layers: FilterRecords, config: FilterConfig, dt: float) -> Filte
             f.q_known *= f.level
             f.Q[both, both] *= f.level
             f.prior[both, both] *= f.level
-    if config.sudden:  # what the interacting members differ in
-        bank.respawn = round(_IMM_TIME / dt)
-        for f in bank:
-            f.burst[:] = np.square(_GUST) * f.q_known / f.q_share
-        gusty, changed = bank[GUSTY], bank[CHANGED]
-        gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
-        changed.q_tyres[:2] += _TYRE_WALK * changed.step
     return bank
 
 

@@ -34,7 +34,6 @@ from .options import (
 _GATE_PROBABILITY = 1.0 - 1e-9
 _MAX_LATENCY = 0.5  # s, largest latency that may be configured
 _LATENCY = NumberRule(f"is 0 to {_MAX_LATENCY} s or {FIND!r}", lambda v: 0.0 <= v <= _MAX_LATENCY)
-_N_IMM_MEMBERS = 4
 _Values = dict[str, Any]  # options by name
 
 
@@ -326,7 +325,7 @@ def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[flo
 
 
 def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader) -> _Values:
-    """Parse `members`, `levels` and `sudden`."""
+    """Parse `members` and `levels`."""
     value = reader.read_raw("levels", (1.0,))
     levels = reader.read_array("levels", value)
     pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
@@ -339,11 +338,7 @@ def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader
         raise reader.make_error("members", "is 1 where tyres are known", count)
     if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
         raise reader.make_error("levels", "need disturbances='forces' and a member each", value)
-    sudden = reader.read("sudden")["sudden"]
-    if sudden and not (count == 1 and TYRES[0] in states and forces and delay == "clone"):
-        expected = "needs unknown tyres, disturbances='forces', delay='clone', no members or levels"
-        raise reader.make_error("sudden", expected, sudden)
-    return {"members": _N_IMM_MEMBERS if sudden else int(count), "levels": pairs, "sudden": sudden}
+    return {"members": int(count), "levels": pairs}
 
 
 def _parse_process_noise(

@@ -175,10 +175,6 @@ class FilterOptions:
     levels: npt.ArrayLike = _make(  # noqa: RUF009
         (1.0,), "factors on force_sd, moment_sd, or pairs, of members in turn"
     )
-    sudden: bool = _make(
-        False,
-        "four filters that interact: nothing happens, a gust, tyres just changed, they settle",
-    )
     gate: float | None = _make(
         None, "a sample less likely than 1 - gate is skipped; with wary 1 - 1e-9", "", _PROBABILITY
     )

@@ -226,7 +226,7 @@ def make_empty_outputs(count: int) -> Observed:
     """
     empty, truth = np.zeros((count, 0), np.float32), np.zeros(count)
     table = OutputTable(0, np.zeros((0, 3), np.int64), np.zeros(0))
-    return Observed(empty, table, truth, truth, empty, np.zeros((count, 3)))
+    return Observed(empty, table, truth, truth, empty, np.zeros((count, 4)))
 
 
 _INTEGERS, _CUBE = np.zeros(1, np.int64), np.zeros((1, 1, 1))

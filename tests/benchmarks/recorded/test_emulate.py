@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
-from sideslip.benchmarks.recorded.suite import _compute_path
+from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading, compute_path
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from tests.envs.recordings.drives import read_log
 
@@ -79,6 +78,6 @@ def test_a_path_of_a_circle() -> None:
     fast[:, FAST.gyro] = 0.1
     fast[:, [FAST.wheel_left, FAST.wheel_right]] = 10.0
     drive = Log(Record(fast, np.zeros((0, PACKET_WIDTH))), {})
-    x, y = _compute_path(drive, np.zeros(20_001))
+    x, y = compute_path(drive, np.zeros(20_001))
     radius = np.hypot(x, y - 100.0)
     np.testing.assert_allclose(radius, 100.0, atol=0.01)

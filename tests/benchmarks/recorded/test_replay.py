@@ -90,20 +90,20 @@ def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
 def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     suite = replay(log, PASSENGER_CAR, stiffness_factor=0.7, seeds=2)
     assert suite.name == "replay"
-    served = set(ESTIMATORS) - {"joint-robust"}  # the slalom has no accelerometer
+    served = set(ESTIMATORS)
     assert set(values(suite, "rmse")) == served == set(values(suite, "us_per_tick"))
     table, found = suite.tables
     joint = [line[1] for line in found.cells if line[0] == "joint"]
     assert joint == ["front_tyres", "rear_tyres"]
     assert {line["estimator"] for line in table.cells} == served
-    assert "`joint-robust` left out: needs the column accel_y" in table.note
-    numbers = [line["rmse"].value for line in table.cells]
-    assert numbers == sorted(numbers)
+    assert {"nees", "coverage", "log_score"} <= table.cells[0].keys()
+    scores = [line["log_score"].value for line in table.cells]
+    assert scores == sorted(scores, reverse=True)
     assert "cannot see" in table.note  # dakf's unobservable direction
     ((question, bars, closest),) = suite.answers
     assert log.name in question and len(bars.data) > 0
     assert closest.startswith("From the recorded angle ")
-    assert len(suite.figures) == 4
+    assert len(suite.figures) == 5
     for title, figure, text in suite.figures:
         assert title.startswith(log.name)
         assert len(figure.data) > 0
@@ -134,7 +134,7 @@ def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
     suite = replay(log, PASSENGER_CAR, figures=False)
     assert "Slow sensors are the log's own: gps" in suite.text
     rmse = values(suite, "rmse")
-    assert set(rmse) == set(ESTIMATORS) - {"joint-robust"}  # no accelerometer
+    assert set(rmse) == set(ESTIMATORS)
     assert rmse["course-kf"] < 0.01 * DEG
     assert {row.n for row in suite.rows} == {1}
     blind = read_log(saved(tmp_path, course_rad=course, sideslip_rad=None))
@@ -172,7 +172,7 @@ def test_files_in_rows_out(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"estimators": ["multirate-kf"], "seeds": 1, "figures": False}
     suite = replay_file(drive, vehicle, mapping=["steer_deg=Delta"], **settings)
     assert len(suite.tables) == 2
-    assert len(suite.rows) == (1 + 4) * 2 * 3
+    assert len(suite.rows) == (1 + 4) * 2 * 4
     write_json(tmp_path / "rows.json", suite.rows)
     assert len(read_json(tmp_path / "rows.json")) == len(suite.rows)
     anyway = replay_file(drive, mapping=["steer_deg=Delta"], **settings)

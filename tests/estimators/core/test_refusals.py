@@ -72,8 +72,6 @@ REFUSED: dict[str, list[Any]] = {
         joint(levels=(0.5, 1.0), disturbances="walk"),
         joint(levels=(0.5, 1.0, 2.0), members=2),
     ],
-    "no members or levels": [joint(sudden=True, members=2)],
-    "delay='clone'": [joint(sudden=True, delay="buffer")],
     "accel_scale_sd needs tyres": [exact(fast=["gyro", "accel_y"], accel_scale_sd=0.1)],
     "accel_scale_sd needs accel_y among fast": [joint(accel_scale_sd=0.1)],
 }

@@ -100,7 +100,7 @@ def test_a_filter_says_when_it_is_lost() -> None:
             )
             chosen = np.ascontiguousarray(packets[arrives])
             filter_.take(record.fast[start : start + 500].copy(), 500, chosen, len(chosen))
-            told.append(filter_.healthy)
+            told.append(filter_.is_healthy)
         return told
 
     course = log.record.select_packets("gps")

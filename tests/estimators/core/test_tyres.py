@@ -211,7 +211,7 @@ def test_a_bank_that_begins_again_is_the_one_that_was_made(options: dict[str, An
     assert np.array_equal(first.x, again.x) and np.array_equal(first.std, again.std)
 
 
-@pytest.mark.parametrize("options", [{"members": 3}, {"sudden": True}])
+@pytest.mark.parametrize("options", [{"members": 3}])
 def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same(options: dict[str, Any]) -> None:
     base, ((log, _), *_) = drives(1, **CHANGED)
     whole, parts = built(base, log, **options), built(base, log, **options)

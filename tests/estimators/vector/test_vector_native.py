@@ -38,13 +38,6 @@ def test_every_filter_says_the_same(name: Any, mode: str) -> None:
     assert drive_both(alone, together, 60, seed=[11, 5, 7]) > 6
 
 
-def test_members_that_interact_have_the_same_bits() -> None:
-    """Over several steps of their chain."""
-    layer = {"estimator": "joint", "options": {"sudden": True}}
-    alone, together = wrapped(home("joint")[0], 3, MODES[0], layer)
-    drive_both(alone, together, 60, seed=[1, 2, 3])
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("env_id", "mode"), [*zip(IDS, itertools.cycle(MODES), strict=False)])
 def test_so_it_does_over_many_episodes(env_id: str, mode: str) -> None:
