@@ -196,7 +196,7 @@ def _simulate_run(
     base = _get_base(env)
     applied = np.array(actions, np.float32)
     states, cost, length = np.empty((len(actions) + 1, len(PlanState._fields))), 0.0, 0
-    states[0] = read_plan_state(base.get_state()["state"])
+    states[0] = read_plan_state(base.packed_state)
     for k in range(len(applied)):
         if feedback is not None:
             planned, gains = feedback
@@ -204,10 +204,11 @@ def _simulate_run(
             applied[k] = np.clip(corrected, -1.0, 1.0)
         _, reward, terminated, truncated, _ = env.step(applied[k])
         cost -= float(reward)
-        states[k + 1 :] = read_plan_state(base.get_state()["state"])
         length = k + 1
+        states[length] = read_plan_state(base.packed_state)
         if terminated or truncated:
             break
+    states[length:] = states[length]
     return PlanRun(states, applied.astype(np.float64), cost, length)
 
 
