@@ -290,7 +290,8 @@ def measure_regrets(
     Returns:
         log(J / J_clairvoyant) on the seeds that an entry survives, shape (n,), by case; episodes.
     """
-    selected = [case for task in records for case in cases if case.task == task]
+    # as they were calibrated: tasks are equal whatever their changes are, a short lead-in too
+    selected = [case._replace(task=task) for task in records for case in cases if case.task == task]
     title = "control, the clairvoyant's seeds"
     results = measure(selected, lambda task: records[task].seeds, title=title, **options)
     regrets = {}

@@ -143,7 +143,8 @@ def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
 ) -> None:
     (entry,) = Calibration([GUST], tmp_path, 4).run(jobs=1)
     none = ControlCase(GUST, Entry("none"))
-    cases = [none, ControlCase(SINE, Entry("none"))]
+    changed = dataclasses.replace(GUST, changes={"reference": "model"})
+    cases = [ControlCase(changed, Entry("none")), ControlCase(SINE, Entry("none"))]
     regrets, there = measure_regrets({GUST: entry}, cases, jobs=1)
     assert list(there) == [none]
     costs = measure([none], derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
