@@ -103,9 +103,10 @@ class CameraSimulator:
         if not is_captured.any():
             return
         key = int(z[Z.clock.key_low]), int(z[Z.clock.key_high])
-        yaw, pitch = float(p[P.errors.camera_yaw]), float(p[P.errors.camera_pitch])
-        heading = math.remainder(motion.psi - motion.theta + yaw, 2.0 * PI)
-        scene = self._scene_class(heading, motion.y, motion.s, motion.phi, pitch, read(p, P.road))
+        errors, road = read(p, P.errors), read(p, P.road)
+        heading = math.remainder(motion.psi - motion.theta + errors.camera_yaw, 2.0 * PI)
+        mounting = errors.camera_pitch, 1.0 / (1.0 + errors.camera_height)
+        scene = self._scene_class(heading, motion.y, motion.s, motion.phi, *mounting, road)
         self.picture = self.renderer.render_picture(scene, (key[0] | key[1] << 32, tick))
         self.finder.view = read(p, P.field_of_view)
         start = time.perf_counter()

@@ -324,6 +324,11 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         return read(self._row.z, Z.motion)
 
     @property
+    def packed_state(self) -> Array:
+        """The packed state now, shape (STATE_WIDTH,) as of `envs.engine.layout.Z`, a copy."""
+        return np.array(self._row.z)
+
+    @property
     def true_state(self) -> Array:
         """The `TrueState` now, shape (len(TrueState),); no sensor measures these."""
         row = self._row

@@ -14,7 +14,7 @@ from ...envs.numerics.jit import as_python
 from ...envs.numerics.primitives import Scalar
 from ...envs.record import Array
 from ...envs.scenarios.road import NOMINAL_PATH
-from ...envs.task import LAGGED, compute_cost_rate, compute_reference
+from ...envs.task import LAGGED, RATE_TICKS, compute_cost_rate, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment
 from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle, rk4
@@ -32,13 +32,16 @@ _uncapped_cost_rate = as_python(
     compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
 )
 
-_TORQUES = ("T_l", "T_r")
+_COMMANDS = ("command_l", "command_r")
+_TORQUES = ("T_l", "T_r", *_COMMANDS)
 
 
 def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
     """List the states that matter to an episode's cost, in the order of `PlanState`."""
     road = fixed.road
-    active = {"v_x", "v_y", "gamma", *_TORQUES}
+    active = {"v_x", "v_y", "gamma", "T_l", "T_r"}
+    if fixed.task.moment_rate or fixed.task.torque_slew:
+        active |= {*_COMMANDS}
     if fixed.kind.roll:
         active |= {"phi", "phi_dot"}
     if fixed.kind.law == MAGIC_FORMULA and fixed.car.relaxation:
@@ -47,7 +50,7 @@ def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
         active |= {"integral"}
     if fixed.width > 1:
         active |= {"slewing", "added"}
-    if road.curvature or road.lateral or road.longitudinal:
+    if road.curvature or road.lateral or road.longitudinal or road.wave:
         active |= {"psi", "s", "y", "theta"}
     return tuple(name for name in PlanState._fields if name in active)
 
@@ -59,7 +62,7 @@ def _compute_node_errors(
     kind = fixed.kind
     beta = _sideslip(x.v_x, x.v_y, kind.small_angle)
     beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
-    if kind.reference != LAGGED:
+    if kind.reference != LAGGED and not kind.has_errors:
         beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
     return beta - beta_ref, x.gamma - gamma_ref
 
@@ -69,6 +72,22 @@ def _compute_node_cost(
 ) -> Scalar:
     """Compute the weighted cost of a step's first errors, without the cap."""
     return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
+
+
+def _compute_mean_command(end: Scalar, start: Scalar, slew: Scalar, ticks: int) -> Scalar:
+    """Compute the mean over ticks of a command that moves at `slew` a tick and then rests."""
+    # m = |moved| / slew ticks, of which the first moves at its start: m (m - 1) slew / 2 are missed
+    moved = end - start
+    return end - moved * ca.fmax(ca.fabs(moved) / slew - 1.0, 0.0) / (2.0 * ticks)
+
+
+def _compute_moments(
+    fixed: PlanParams, command: Scalar, moment: Scalar, ticks: Sequence[int]
+) -> list[Scalar]:
+    """Compute the mean yaw moment over ticks (of full scale) from command and moment at tick 0."""
+    lag = fixed.motor_tick
+    rests = [lag.mean * lag.end**tick if lag.end else 0.0 for tick in ticks]
+    return [_apply_lag(command, moment, rest) / fixed.task.yaw_scale for rest in rests]
 
 
 def _advance(
@@ -81,13 +100,14 @@ def _advance(
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
     speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
-    held = x.v_x, x.integral, speed_profile, car, task.yaw_first
-    T_l, T_r, _, integral = _motor_torques(action[0] * task.yaw_scale, 0.0, *held)
+    start = x.v_x, x.integral, speed_profile, car, task.yaw_first
+    *commands, _, integral = _motor_torques(action[0] * task.yaw_scale, 0.0, *start)
+    T_l, T_r = commands
+    if task.torque_slew:
+        T_l = _compute_mean_command(T_l, x.command_l, task.torque_slew, q)
+        T_r = _compute_mean_command(T_r, x.command_r, task.torque_slew, q)
     slewing = action[1] * task.authority if fixed.width > 1 else 0.0
-    moved = slewing - x.slewing if fixed.width > 1 else 0.0
-    # The command (rad) moves at `slew` (rad a tick) and then rests. Its mean over q ticks is
-    # command - moved |moved| / (2 q slew), for |moved| <= q slew.
-    mean_added = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
+    mean_added = _compute_mean_command(slewing, x.slewing, task.slew, q)
     motor, steering, road = fixed.motor, fixed.steering, fixed.road
     if kind.road == NOMINAL_PATH:
         road = road._replace(turn=known.turn)
@@ -99,22 +119,28 @@ def _advance(
             (known.steer_end, steering.end, motor.end),
         )
     )
-    start = Motion(*x[: len(Motion._fields)])
+    motion = Motion(*x[: len(Motion._fields)])
     forces = DisturbanceForces(known.F_d, known.N_d, known.N_x)
-    motion = _rk4(start, loads, forces, car, road, q * TICK, kind)
-    effort = 0.0
+    motion = _rk4(motion, loads, forces, car, road, q * TICK, kind)
+    # a rate is taken over `RATE_TICKS`, in shorter periods over one of them
+    span = min(q, RATE_TICKS)
+    held, command, moment = (
+        _yaw_moment(*sides, car)
+        for sides in ((x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r))
+    )
+    moments = _compute_moments(fixed, held, moment, range(-span, 0))
+    moments += _compute_moments(fixed, command, moment, range(q))
+    effort, steering_tick = 0.0, fixed.steering_tick
     for tick in range(q):
-        motor_tick, steering_tick = fixed.motor_tick, fixed.steering_tick
-        rest = motor_tick.mean * motor_tick.end**tick
-        moment = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
         added = _apply_lag(mean_added, x.added, steering_tick.mean * steering_tick.end**tick)
-        share = moment / task.yaw_scale
-        effort += TICK * _uncapped_cost_rate(0.0, 0.0, share, added, kind.reference)
-    torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
+        change = (moments[tick + span] - moments[tick]) / (span * TICK)
+        shares = moments[tick + span], added, kind.reference, task.moment_rate * change * change
+        effort += TICK * _uncapped_cost_rate(0.0, 0.0, *shares)
+    new_torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
     new_integral = x.integral + q * (integral - x.integral)
     new_added = _apply_lag(mean_added, x.added, steering.end)
-    next_state = PlanState._make((*motion, *torques, new_integral, slewing, new_added))
-    return next_state, effort
+    new_actuators = (*new_torques, new_integral, slewing, new_added, *commands)
+    return PlanState._make((*motion, *new_actuators)), effort
 
 
 def _get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
@@ -179,7 +205,7 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     error_hessian, error_gradient = ca.hessian(node_cost, e)
     error_jacobian = ca.jacobian(errors, w)
     # the effort is a sum of squares of nearly linear terms
-    effort_hessian, effort_gradient = ca.hessian(effort, w)
+    effort_hessian, effort_gradient = ca.hessian(step_inputs.effort * effort, w)
     gradient = error_jacobian.T @ ca.substitute(error_gradient, e, errors) + effort_gradient
     hessian = error_jacobian.T @ error_hessian @ error_jacobian + effort_hessian
     derivatives = [ca.jacobian(next_state, w), gradient, hessian]

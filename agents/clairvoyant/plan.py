@@ -31,7 +31,7 @@ from .linearisation import (
     linearise_run,
     make_problem,
 )
-from .preview import Forecast, PlanState, make_forecast, read_plan_state
+from .preview import Forecast, PlanParams, PlanState, make_forecast, read_plan_state
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
@@ -44,6 +44,31 @@ _DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left
 _DAMPING_FACTOR = 4.0  # from one damping to the next
 MAX_ITERATIONS = 60
 _STALL_RULE = (1e-3, 3)  # settled: a smaller fraction of the cost gained in so many steps in a row
+
+
+class _ManoeuvreEnv(gym.Wrapper[Actions, Actions, Actions, Actions]):
+    """An episode from its lead-in's end on, which is computed once; `lost` is what losing cost."""
+
+    snapshot: Mapping[str, object] | None = None
+    lost: float = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Actions, dict[str, object]]:
+        """Return to the start of the manoeuvre."""
+        base = _get_base(self)
+        if self.snapshot is not None:
+            base.set_state(self.snapshot)
+            return np.zeros(0, np.float32), {}
+        result = self.env.reset(seed=seed, options=options)
+        nothing = np.zeros(base.action_space.shape or (), np.float32)
+        for _ in range(_count_lead_steps(base)):
+            _, reward, terminated, _, _ = self.env.step(nothing)
+            self.lost -= float(reward)
+            if terminated:
+                break
+        self.snapshot = base.get_state()
+        return result
 
 
 class Limits(NamedTuple):
@@ -62,9 +87,15 @@ def _compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> L
     fixed, K = problem.fixed, problem.fixed.periods
     low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
     low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0
+    task = fixed.task
+    if task.torque_slew:  # of the run's commands: they move from iteration to iteration
+        share = _compute_commanded_share(fixed, run.states[:K])
+        max_change = task.torque_slew * fixed.ticks * fixed.car.d_r / (fixed.car.r * task.yaw_scale)
+        low[:, 0] = np.maximum(low[:, 0], share - max_change)
+        high[:, 0] = np.minimum(high[:, 0], share + max_change)
     if fixed.width < N_INPUTS:
         return Limits(low, high, zero, zero, 0, 0.0)
-    task, column = fixed.task, problem.names.index("slewing")
+    column = problem.names.index("slewing")
     clip_angle = as_python(limit_angle, ARRAYS)
     low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
     high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
@@ -72,6 +103,13 @@ def _compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> L
     max_change = task.slew * fixed.ticks / task.authority
     slope = problem.scale[column] / task.authority
     return Limits(low, high, position - max_change, position + max_change, column, slope)
+
+
+def _compute_commanded_share(fixed: PlanParams, states: Array) -> Array:
+    """Compute the motors' commanded yaw moment as a fraction of full scale, shape (K,)."""
+    left, right = (states[:, PlanState._fields.index(name)] for name in ("command_l", "command_r"))
+    share = 0.5 * (right - left) * fixed.car.d_r / (fixed.car.r * fixed.task.yaw_scale)
+    return np.asarray(np.clip(share, -1.0, 1.0))
 
 
 @jit
@@ -158,7 +196,7 @@ def _simulate_run(
     base = _get_base(env)
     applied = np.array(actions, np.float32)
     states, cost, length = np.empty((len(actions) + 1, len(PlanState._fields))), 0.0, 0
-    states[0] = read_plan_state(base.get_state()["state"])
+    states[0] = read_plan_state(base.packed_state)
     for k in range(len(applied)):
         if feedback is not None:
             planned, gains = feedback
@@ -166,10 +204,11 @@ def _simulate_run(
             applied[k] = np.clip(corrected, -1.0, 1.0)
         _, reward, terminated, truncated, _ = env.step(applied[k])
         cost -= float(reward)
-        states[k + 1 :] = read_plan_state(base.get_state()["state"])
         length = k + 1
+        states[length] = read_plan_state(base.packed_state)
         if terminated or truncated:
             break
+    states[length:] = states[length]
     return PlanRun(states, applied.astype(np.float64), cost, length)
 
 
@@ -189,7 +228,8 @@ def _solve_ilqr(
     problem, best = make_problem(forecast.fixed), _simulate_run(env, seed, actions)
     damping, n_stalled = _FIRST_DAMPING, 0
     for iteration in range(MAX_ITERATIONS):
-        if forecast.fixed.kind.has_driver:  # the driver answers to the newest run
+        kind = forecast.fixed.kind
+        if kind.has_driver or kind.has_errors:  # what answers to the newest run
             env.reset(seed=seed)
             forecast = make_forecast(_get_base(env), best.actions)
         previous_cost = best.cost
@@ -212,7 +252,7 @@ def _run_line_search(
 ) -> tuple[PlanRun, float]:
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
-    nominal_run = _use_achieved_steering(problem, run)
+    nominal_run = _use_achieved_inputs(problem, run)
     linearisation = linearise_run(problem, forecast.known, nominal_run)
     limits = _compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
@@ -234,12 +274,14 @@ def _run_line_search(
     return run, damping
 
 
-def _use_achieved_steering(problem: IlqrProblem, run: PlanRun) -> PlanRun:
-    """Replace a run's steering by what its rate achieved: the linearisation has no rate limit."""
-    if run.actions.shape[1] < N_INPUTS:
-        return run
-    actions, column = run.actions.copy(), PlanState._fields.index("slewing")
-    actions[:, 1] = run.states[1:, column] / problem.fixed.task.authority
+def _use_achieved_inputs(problem: IlqrProblem, run: PlanRun) -> PlanRun:
+    """Replace a run's inputs by what their rates achieved: the linearisation has no rate limit."""
+    actions, fixed = run.actions.copy(), problem.fixed
+    if fixed.task.torque_slew:
+        actions[:, 0] = _compute_commanded_share(fixed, run.states[1:])
+    if fixed.width == N_INPUTS:
+        column = PlanState._fields.index("slewing")
+        actions[:, 1] = run.states[1:, column] / fixed.task.authority
     return replace(run, actions=actions)
 
 
@@ -263,14 +305,18 @@ def compute_clairvoyant(
     Args:
         env: Single env.
         seed: Seed of the episode.
-        starts: Actions, shape (K, width), by method; without any the plan starts from zeros.
+        starts: Actions after the lead-in, shape (K, width), by method; without any the plan starts
+            from zeros.
 
     Returns:
         Actions of the least cost, and the costs of all candidates.
     """
-    start_time, base = time.process_time(), _get_base(env)
+    start_time, base, env = time.process_time(), _get_base(env), _ManoeuvreEnv(env)
     env.reset(seed=seed)
     shape = (_count_periods(base), *(base.action_space.shape or ()))
+    if env.lost:  # before an action has acted
+        costs, seconds = {"none": env.lost}, time.process_time() - start_time
+        return ClairvoyantResult(np.zeros(shape, np.float32), env.lost, "none", costs, {}, seconds)
     candidates: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
     candidates |= {name: np.asarray(run, np.float32) for name, run in (starts or {}).items()}
     costs = {name: _simulate_run(env, seed, run).cost for name, run in candidates.items()}
@@ -293,12 +339,15 @@ def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Act
         seed: Seed of the episode.
 
     Returns:
-        Actions in fractions of full scale, shape (K, width), zeros after a failure.
+        Actions after the lead-in in fractions of full scale, shape (K, width), zeros after a
+        failure.
     """
     base = _get_base(env)
     _, *steps = iterate_steps(env, agent, seed)
+    steps = steps[_count_lead_steps(base) :]
     actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
-    actions[: len(steps)] = [step.action for step in steps]
+    for k, step in enumerate(steps):
+        actions[k] = step.action
     return actions
 
 
@@ -307,5 +356,11 @@ def _get_base(env: gym.Env[Actions, Actions]) -> "StabilityEnv":
 
 
 def _count_periods(base: "StabilityEnv") -> int:
-    """Count the control periods of the episode that was last reset."""
-    return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
+    """Count the control periods of the episode that was last reset, after the lead-in."""
+    duration = base.get_state()["params"][P.task.duration]
+    return -int(-duration // base.control_period) - _count_lead_steps(base)
+
+
+def _count_lead_steps(base: "StabilityEnv") -> int:
+    """Count the control periods of the lead-in of the episode that was last reset."""
+    return int(base.get_state()["params"][P.task.lead_in]) // base.control_period

@@ -1,4 +1,4 @@
-"""The preview of an episode at its start: driver, wind and disturbances, step by step."""
+"""The preview of an episode after its lead-in: driver, wind and disturbances, step by step."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.engine.layout import ActuatorState, EpisodeArrays, P, StepVariant, TaskParams, Z
+from ...envs.engine.layout import EpisodeArrays, P, StepVariant, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
 from ...envs.engine.window import compute_profile_angle, make_window
 from ...envs.numerics.jit import as_python
@@ -16,10 +16,8 @@ from ...envs.record import Array
 from ...envs.scenarios.driver import (
     SpeedProfile,
     compute_acceleration_command,
-    compute_speed_reference,
     compute_wind,
 )
-from ...envs.scenarios.road import NOMINAL_PATH, NominalMotion, step_nominal_car
 from ...envs.task import REPORT, ReferenceParams
 from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
@@ -44,8 +42,9 @@ class PreviewStep(NamedTuple):
     acceleration: Scalar  # m/s2, the driver's acceleration, fed forward
     turn: Scalar  # rad/s, mean turning rate of a road that the nominal car lays, else 0
     weight: Scalar  # s, quadrature weight of the cost rate at the step's start
-    beta_ref: Scalar  # rad, at the step's start; read for a lagged reference alone
+    beta_ref: Scalar  # rad, at the step's start; read if it is lagged or of sensors with errors
     gamma_ref: Scalar  # rad/s
+    effort: Scalar  # 1, and 0 at the episode's end, after which no effort counts
 
 
 class PlanState(NamedTuple):
@@ -69,6 +68,8 @@ class PlanState(NamedTuple):
     integral: Scalar
     slewing: Scalar  # added steering that is commanded (rad)
     added: Scalar  # added steering that is applied (rad)
+    command_l: Scalar  # command of the left motor (N m)
+    command_r: Scalar
 
 
 class PlanParams(NamedTuple):
@@ -95,39 +96,40 @@ class Forecast:
 
     fixed: PlanParams
     known: Array  # columns of `PreviewStep` (its fields, periods + 1); the last: the episode's end
-    start: PlanState  # at tick 0
+    start: PlanState  # where the lead-in ends
     driver: Array  # the driver's steering command at every tick (rad), shape (periods, n)
 
 
 def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
-    """Make the forecast of an episode that was just reset.
+    """Make the forecast of an episode whose lead-in, if it has one, just ended.
 
     Args:
-        base: Unwrapped env at tick 0.
-        actions: Actions of a run, shape (K, width), to which a driver reacts; None: zeros.
+        base: Unwrapped env at the manoeuvre's start.
+        actions: Actions of a run, shape (K, width), to which driver, measured reference and place
+            on the road react; None: zeros.
 
     Returns:
-        Forecast from tick 0 to the episode's end.
+        Forecast from the manoeuvre's start to the episode's end.
 
     Raises:
-        ValueError: The env is not at the start of an episode.
+        ValueError: The env is elsewhere in its episode.
     """
     n = base.control_period
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
-    if z[Z.clock.tick] != 0.0:
-        raise ValueError("a forecast starts at an episode's start: call reset() first")
+    if z[Z.clock.tick] != p[P.task.lead_in]:
+        raise ValueError("a forecast starts where a manoeuvre does: call reset() first")
     start = read_plan_state(z)
     fixed = _make_plan_params(base, p, snapshot["config"].start.switches, n)
-    last = fixed.periods * n
+    ticks = np.arange(fixed.periods * n + 1) + int(z[Z.clock.tick])
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
     # disturbances, and a steering profile's front wheels, do not depend on the actions
-    drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
-    command = driver
+    states = _simulate_actions(base, snapshot, actions, n)
+    command = states[:, Z.driver]
     if not fixed.kind.has_driver and base.scenario.steering != "wander":
-        command = np.array([compute_profile_angle(p, float(k)) for k in range(last + 1)])
-    known = _compute_preview(p, fixed, drive, command, refs)
+        command = np.array([compute_profile_angle(p, float(k)) for k in ticks])
+    known = _compute_preview(p, fixed, ticks, states, command)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 
 
@@ -142,7 +144,7 @@ def read_plan_state(z: Array) -> PlanState:
     """
     motion, drive = read(z, Z.motion), read(z, Z.drive)
     actuators = drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added
-    return PlanState(*motion, *actuators)
+    return PlanState(*motion, *actuators, drive.command_l, drive.command_r)
 
 
 def _make_plan_params(base: Any, p: Array, switches: Array, n: int) -> PlanParams:
@@ -164,14 +166,12 @@ def _make_plan_params(base: Any, p: Array, switches: Array, n: int) -> PlanParam
         as_python(make_step_variant)(p, switches),
         base.action_space.shape[0],
         n,
-        -int(-task.duration // n),
+        -int((task.lead_in - task.duration) // n),
     )
 
 
-def _simulate_actions(
-    base: Any, snapshot: dict[str, Any], actions: Array, n: int
-) -> tuple[Array, Array, Array]:
-    """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
+def _simulate_actions(base: Any, snapshot: dict[str, Any], actions: Array, n: int) -> Array:
+    """Simulate the packed states at every tick by the env, shape (K n + 1, STATE_WIDTH)."""
     z = snapshot["state"]
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
     p, switches = snapshot["params"], snapshot["switches"]
@@ -179,49 +179,52 @@ def _simulate_actions(
     record = snapshot["rows"], snapshot["packets"]
     row = EpisodeArrays(p, z, switches, obs, *record, report, bounds, make_window(1))
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
-    last = n * len(actions)
-    drive, driver = np.empty((last + 1, len(ActuatorState._fields))), np.empty(last + 1)
-    refs = np.empty((last + 1, 2))
-    for tick in range(last + 1):
-        drive[tick] = read(z, Z.drive)
-        driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
-        step_vehicle(row, held_actions[tick], 1)
-    # an unstable simulation may give NaN or inf
-    return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
+    states = np.empty((n * len(actions) + 1, len(z)))
+    for state, action in zip(states, held_actions, strict=False):
+        state[:] = z
+        step_vehicle(row, action, 1)
+    return np.nan_to_num(states)  # an unstable simulation may give NaN or inf
 
 
 def _compute_preview(
-    p: Array, fixed: PlanParams, drive: Array, command: Array, refs: Array
+    p: Array,
+    fixed: PlanParams,
+    ticks: npt.NDArray[np.int64],
+    states: Array,
+    command: Array,
 ) -> Array:
     """Compute the columns of `PreviewStep`, shape (len(PreviewStep), periods + 1)."""
     n, last = fixed.ticks, len(command) - 1
     nodes = np.arange(0, last, n)
-    names = ActuatorState._fields
-    angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
+    angle = states[:, Z.drive.delta_f] - states[:, Z.drive.added]
 
-    def compute_wheel_angle(ticks: npt.NDArray[np.int64], rest: float) -> Array:
+    def compute_wheel_angle(places: npt.NDArray[np.int64], rest: float) -> Array:
         """Compute the front wheels' angle without the added one, after a tick's lag."""
-        return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
+        return np.asarray(as_python(apply_lag)(command[places], angle[places], rest))
 
     lag, middle = fixed.steering_tick, nodes + n // 2
     wind = read(p, P.wind)
-    wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
-    F_d, N_d = (drive[:last, names.index(name)] for name in ("F_d", "N_d"))
-    forces = np.column_stack([F_d, N_d, np.zeros(last)])
+    wind_forces = np.array([compute_wind(float(tick), wind) for tick in ticks[:-1]])
+    forces = np.column_stack([states[:-1, [Z.drive.F_d, Z.drive.N_d]], np.zeros(last)])
     mean_forces = (forces + wind_forces).reshape(-1, n, 3).mean(axis=1)
     profile = read(p, P.speed_profile)
-    set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])
+    set_points = np.array([_compute_set_point(float(tick), profile) for tick in ticks[nodes]])
     car, change = read(p, P.car), read(p, P.tyre_change)
-    is_changed = nodes >= change.tick
+    is_changed, wave = ticks[nodes] >= change.tick, read(p, P.friction_wave)
+    patch = 1.0 + wave.share * np.sin(wave.rate * states[middle, Z.motion.s] + wave.phase)
+    numbers = car.C_f, car.C_r, car.mu * patch, car.mu_r * patch
     factors = (change.front, change.rear, change.friction, change.friction)
     tyres = [
         np.where(is_changed, factor * number, number)
-        for factor, number in zip(factors, (car.C_f, car.C_r, car.mu, car.mu_r), strict=True)
+        for factor, number in zip(factors, numbers, strict=True)
     ]
+    # the direction of a nominal car's path, gamma + beta'; another road's does not turn so
+    beta, gamma = states[:, Z.nominal_motion.beta], states[:, Z.nominal_motion.gamma]
+    turns = gamma[:-1] + np.diff(beta) / TICK
     # Weights (s) of the cost rates at every n-th tick, by the trapezoid rule: n / 2 ticks at either
     # end. J sums ticks 1 to the last: the start, which does not count, has half a tick less, and
     # the last one, which counts whole, half a tick more. This is exact for n = 1.
-    weights = np.where(nodes < fixed.task.duration, n * TICK, 0.0)
+    weights = np.full(len(nodes), n * TICK)
     weights[0] = 0.5 * (n - 1) * TICK
     table = (
         compute_wheel_angle(nodes, lag.start),
@@ -231,30 +234,18 @@ def _compute_preview(
         *mean_forces.T,
         *tyres,
         *set_points.T,
-        _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, n).mean(axis=1),
+        turns.reshape(-1, n).mean(axis=1),
         weights,
-        *refs[nodes].T,
+        *states[np.ix_(nodes, Z.refs)].T,
+        np.ones(len(nodes)),
     )
     known = np.array(PreviewStep._make(table))
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
     end[PreviewStep._fields.index("command")] = command[last]
-    end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
-    is_complete = last == fixed.task.duration
+    end[PreviewStep._fields.index("beta_ref") :, 0] = *states[last, list(Z.refs)], 0.0
+    is_complete = ticks[-1] == fixed.task.duration
     end[PreviewStep._fields.index("weight")] = 0.5 * (n + 1) * TICK if is_complete else 0.0
     return np.hstack([known, end])
-
-
-def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
-    """Compute by how much a nominal car's path turns in each tick (rad/s), shape (ticks,)."""
-    turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
-    if kind.road == NOMINAL_PATH:
-        speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
-        compute_motion = as_python(compute_speed_reference)
-        follow_path = as_python(step_nominal_car)
-        for tick, steer in enumerate(command):
-            speed = compute_motion(float(tick), speed_profile)[0]
-            turns[tick], path = follow_path(path, steer, speed, nominal_car)
-    return turns
 
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:

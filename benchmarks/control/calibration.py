@@ -1,8 +1,8 @@
-"""The clairvoyant's costs of each task, on seeds of their own that only the version salts.
+"""The clairvoyant's costs of each task, on seeds of their own that only the world's version salts.
 
 An episode takes ten seconds to solve, so `sideslip calibrate` solves all once, into a file. The
 baselines drive the same seeds when a table is made. An entry is refused that no longer fits: by
-its version, its task, or what the uncontrolled car costs on its seeds.
+its world, its task, or what the uncontrolled car costs on its seeds.
 """
 
 import hashlib
@@ -18,11 +18,11 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents.env_info import CarEnv
 from ...envs.io import from_json
 from ...envs.numerics import require_extra
 from ...envs.record import Array
+from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import is_finite
 from ..harness.parallel import run_cases
 from ..harness.results import read_objects, write_text
@@ -53,7 +53,7 @@ class ClairvoyantEpisode:
 class CalibrationRecord(TaskRecord):
     """A contest's episodes, and the command that made them."""
 
-    env_version: str
+    world_version: int
     command: str
     episodes: tuple[ClairvoyantEpisode, ...]
 
@@ -78,7 +78,7 @@ def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     Returns:
         Seeds.
     """
-    texts = [f"clairvoyant {__version__} {task.seed_text} {i}" for i in range(count)]
+    texts = [f"clairvoyant {WORLD_VERSION} {task.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
@@ -95,7 +95,7 @@ class _CalibrationCase:
     def path(self) -> Path:
         """The file of the finished case; other sources or another question give another name."""
         oracle = find_oracle(self.task)  # with which the search begins
-        key = [self.task.record, oracle, self.seed, hash_sources(), __version__]
+        key = [self.task.record, oracle, self.seed, hash_sources(), WORLD_VERSION]
         digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()
         return self.folder / f"{digest[:24]}.json"
 
@@ -178,10 +178,12 @@ class Calibration:
             import osqp  # noqa: F401
         self.folder.mkdir(parents=True, exist_ok=True)
         episodes = run_cases(_solve, self.cases, "calibration", jobs, console)
-        common = {"env_version": __version__, "command": command}
+        rows = zip(*[iter(episodes)] * self.seeds, strict=True)
         return [
-            CalibrationRecord(**task.record, **common, episodes=tuple(episodes[i : i + self.seeds]))
-            for task, i in zip(self.tasks, range(0, len(episodes), self.seeds), strict=True)
+            CalibrationRecord(
+                **task.record, world_version=WORLD_VERSION, command=command, episodes=row
+            )
+            for task, row in zip(self.tasks, rows, strict=True)
         ]
 
     def remove_cases(self) -> None:
@@ -206,7 +208,7 @@ def read_calibration(
 
     Raises:
         FileNotFoundError: There is no file.
-        ValueError: An entry is cut short or lacks something, is of another version or of other
+        ValueError: An entry is cut short or lacks something, is of another world or of other
             seeds.
     """
     records = {}
@@ -221,8 +223,8 @@ def read_calibration(
         )
         record = from_json(CalibrationRecord, item | {"episodes": tuple(parsed)}, where)
         seeds, why = record.seeds, ""
-        if record.env_version != __version__:
-            why = f"of version {record.env_version}, not {__version__}"
+        if record.world_version != WORLD_VERSION:
+            why = f"of world {record.world_version}, not {WORLD_VERSION}"
         elif seeds != derive_seeds(record.task, len(seeds)):
             why = "its seeds are not this contest's"
         if why and not stale:
@@ -288,7 +290,8 @@ def measure_regrets(
     Returns:
         log(J / J_clairvoyant) on the seeds that an entry survives, shape (n,), by case; episodes.
     """
-    selected = [case for task in records for case in cases if case.task == task]
+    # as they were calibrated: tasks are equal whatever their changes are, a short lead-in too
+    selected = [case._replace(task=task) for task in records for case in cases if case.task == task]
     title = "control, the clairvoyant's seeds"
     results = measure(selected, lambda task: records[task].seeds, title=title, **options)
     regrets = {}

@@ -1,6 +1,8 @@
 """`vision="image"`: packets from pictures of the true road, where and when they are taken."""
 
 import copy
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +13,8 @@ pytest.importorskip("cv2")
 import sideslip
 from sideslip.envs.record import PACKET, Record, concatenate
 from sideslip.envs.sensors.camera.analytic import Detector, load_detector
+from sideslip.envs.sensors.camera.images import RoadRenderer
+from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.estimators import EstimateObservation
 
 assert sideslip.__version__
@@ -39,6 +43,26 @@ def drive(env: Any, steps: int = 25, seed: int = 4) -> tuple[Record, list[Any]]:
 def fitted() -> Record:
     """A drive of 0.4 s with delays from the file."""
     return drive(made(vision="image"), 40)[0]
+
+
+def test_a_picture_is_taken_from_the_height_that_the_world_drew() -> None:
+    """It is that of a camera mounted there, of which the lane finder is not told."""
+    env = made(vision="image", delay="link", world={"camera_height": 0.05})
+    camera = env.unwrapped.camera
+    renderer, pictures = camera.renderer, []
+
+    def render(scene: Any, seed: Any) -> Any:
+        pictures.append((scene, seed))
+        return renderer.render_picture(scene, seed)
+
+    camera.renderer = SimpleNamespace(render_picture=render)
+    drive(env, 4)
+    low = replace(Pinhole(), height=Pinhole().height * (1.0 / 1.05))
+    assert pictures and camera.finder.camera == Pinhole()
+    scene, seed = pictures[-1]
+    expected = RoadRenderer(low, renderer.appearance, camera.finder.rows)
+    picture = expected.render_picture(scene._replace(height=1.0), seed)
+    np.testing.assert_array_equal(camera.picture, picture)
 
 
 @pytest.mark.parametrize("env_id", [ID, "sideslip/YawVisionUneven-v0", FUSION])

@@ -57,6 +57,7 @@ class RoadScene(NamedTuple):
     s: float = 0.0  # m, along the road
     roll: float = 0.0  # rad, left side up positive, about the road below the car
     pitch: float = 0.0  # rad, nose down positive
+    height: float = 1.0  # of the camera, over that of its mounting
     road: RoadParams = RoadParams(0.0, 0.0, 1.0)
 
 
@@ -107,7 +108,7 @@ class RoadRenderer:
         """Brightness of the painted rows, without blur and noise, shape (rows, width)."""
         camera, style = self.camera, self.appearance
         rotation = _make_rotation(scene.roll, scene.pitch)
-        lens = rotation @ [camera.ahead, 0.0, camera.height]
+        lens = rotation @ [camera.ahead, 0.0, scene.height * camera.height]
         forward, left, up = np.tensordot(rotation.astype(np.float32), self._rays, 1)
         reach = np.float32(lens[2]) / np.maximum(-up, 1e-4)
         X, Y = np.float32(lens[0]) + reach * forward, np.float32(lens[1]) + reach * left

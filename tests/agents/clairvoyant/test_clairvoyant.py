@@ -1,5 +1,6 @@
 """The clairvoyant knows the plant exactly, and no other run of an episode is better."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -61,6 +62,7 @@ ACTING: dict[str, dict[str, Any]] = {
     "motor power, load transfer": {
         **{"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4}
     },
+    "a world that errs": {"base": "coms-slalom", "onset": 0.0, "amplitude": 0.1, "world": "v1"},
     "a road that winds and leans": {
         **{"base": "coms-slalom", "onset": 0.02, "amplitude": 0.1, "bank": 0.03, "grade": 0.02}
     },
@@ -71,16 +73,19 @@ ACTING: dict[str, dict[str, Any]] = {
 def test_a_symbolic_tick_is_the_envs(case: str) -> None:
     """From each state of a hard run in the env, one step of the plan's plant, by a rule of one
     order more, is the env's tick. A driver steers as in the run of the actions."""
-    changes = HARD | ACTING
-    env = gymnasium.make(ID, scenario=changes[case] | {"duration": 0.2}, control_period=1)
+    scenario = (HARD | ACTING)[case] | {"duration": 0.2}
+    world = scenario.pop("world", "ideal")
+    # the rate of the motors' commands is drawn: a fiftieth of their torque a tick at least
+    actions = ACTIONS if world == "ideal" else 0.005 * ACTIONS
+    env = gymnasium.make(ID, scenario=scenario, control_period=1, world=world)
     env.reset(seed=2)
-    forecast = make_forecast(env.unwrapped, ACTIONS if case in ACTING else None)
+    forecast = make_forecast(env.unwrapped, actions if case in ACTING else None)
     w = ca.SX.sym("w", len(PlanState._fields))
     u, known = ca.SX.sym("u"), ca.SX.sym("known", len(PreviewStep._fields))
     inputs = [u], PreviewStep(*ca.vertsplit(known))
     state, _ = _advance(forecast.fixed, PlanState(*ca.vertsplit(w)), *inputs)
     tick = ca.Function("tick", [w, u, known], [ca.vertcat(*state)])
-    run = _simulate_run(env, 2, ACTIONS)
+    run = _simulate_run(env, 2, actions)
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
@@ -117,13 +122,19 @@ def test_a_lagged_reference_is_the_envs() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("scenario", ["random-steering", "lane-change", "gust"])
-def test_no_run_is_better(scenario: str) -> None:
+@pytest.mark.parametrize(
+    ("scenario", "world"),
+    [
+        *(("random-steering", "ideal"), ("lane-change", "ideal"), ("gust", "ideal")),
+        *(("gust", "v1"), ("random-steering", "v1")),
+    ],
+)
+def test_no_run_is_better(scenario: str, world: str) -> None:
     """Neither the uncontrolled car, nor a controller, nor the plan a little changed.
 
     The plan's steps are ten times the env's, hence the thousandth.
     """
-    env = make(scenario, 3.0)
+    env = gymnasium.make(ID, scenario={"base": scenario, "duration": 3.0}, world=world)
     sensed = EstimateObservation(env, "exact-kf")
     agent = make_agent("two-dof", sensed)
     rng = np.random.default_rng(1)
@@ -179,6 +190,22 @@ def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch.setattr(clairvoyant, "STEP_LENGTHS", (0.0,))  # steps that go nowhere
     stuck, status = _solve_ilqr(env, 0)
     assert status == "stuck" and stuck.cost == _simulate_run(env, 0, np.zeros((40, 1))).cost
+
+
+def test_a_plan_begins_where_the_lead_in_ends() -> None:
+    """Its cost is that of the whole episode, in which the lead-in costs nothing but a loss."""
+    scenario = {"base": "coms-slalom", "duration": 0.3, "onset": 0.0, "amplitude": 0.1}
+    env = gymnasium.make(ID, scenario=scenario, world="v1", lead_in=0.5)
+    result = compute_clairvoyant(env, 1)
+    assert result.actions.shape == (30, 1) and result.winner == "from none"
+    whole = _simulate_run(env, 1, np.vstack([np.ones((50, 1)), result.actions]))
+    assert whole.cost == result.cost < 0.9 * result.costs["none"]
+    policy: Any = SimpleNamespace(predict=lambda obs, *_, **__: (np.full(1, obs[0]), None))
+    assert record_actions(env, policy, 1).shape == (30, 1)
+    scenario |= {"half_width": 0.01}
+    narrow = gymnasium.make(ID, scenario=scenario, world="v1", lead_in=2.0)
+    lost = compute_clairvoyant(narrow, 1)
+    assert lost.costs == {"none": lost.cost} and lost.cost > 30.0
 
 
 def test_bad_input() -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import sideslip
 
@@ -66,11 +67,10 @@ def test_the_programmes_cost_is_that_in_the_env(lags: bool) -> None:
     assert found.cost < 0.2 * _simulate_run(env, 3, np.zeros_like(found.actions)).cost
 
 
-def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost() -> None:
-    """J(u) = J_0 + g' u + u' H u / 2, probed by replays; a quarter of full scale is exact in
-    float32. At the plan the slope vanishes, or points out of the limits where one is reached."""
-    env = make(duration=0.1, lags=True, disturbance_moment=600.0, amplitude=(0.04, 0.04))
-    K, step = 10, 0.25
+def probe_cost(env: gymnasium.Env[Any, Any], K: int) -> tuple[float, Array, Array]:
+    """J(u) = J_0 + g' u + u' H u / 2 over K periods, probed by replays; a quarter of full scale is
+    exact in float32."""
+    step = 0.25
     units = step * np.eye(K)[:, :, None]
     none = _simulate_run(env, 1, np.zeros((K, 1))).cost
     ahead = np.array([_simulate_run(env, 1, unit).cost for unit in units])
@@ -81,6 +81,31 @@ def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost
         for j in range(K):
             pair = _simulate_run(env, 1, units[i] + units[j]).cost
             H[i, j] = (pair - ahead[i] - ahead[j] + none) / step**2
+    return none, g, H
+
+
+@pytest.mark.parametrize("ticks", [5, 10, 25])
+def test_a_plan_weighs_the_moments_rate(ticks: int) -> None:
+    """Its cost is the least of the quadratic function that replays tell; the rate matters there.
+
+    The plan takes a rate over a period where that is shorter than 10 ms, the env over 10 ms."""
+    scenario = LINEAR | {"duration": 0.02 * ticks, "lags": True, "amplitude": (0.04, 0.04)}
+    world = {"moment_rate": 0.002, "tyres": "linear"}
+    options: dict[str, Any] = {"world": world, "control_period": ticks, "scenario": scenario}
+    env = gymnasium.make("sideslip/YawVision-v0", reference="zero-slip", **options)
+    none, g, H = probe_cost(env, 20)
+    least = minimize(
+        lambda u: none + g @ u + 0.5 * u @ H @ u, np.zeros(20), jac=lambda u: g + H @ u,
+        method="L-BFGS-B", bounds=[(-1.0, 1.0)] * 20, options={"ftol": 1e-14, "gtol": 1e-12},
+    )  # fmt: skip
+    found, _ = _solve_ilqr(env, 1)
+    assert found.cost < (1.01 if ticks < 10 else 1.0001) * least.fun
+
+
+def test_the_programmes_plan_meets_the_conditions_of_optimality_of_the_envs_cost() -> None:
+    """At the plan the slope vanishes, or points out of the limits where one is reached."""
+    env = make(duration=0.1, lags=True, disturbance_moment=600.0, amplitude=(0.04, 0.04))
+    _, g, H = probe_cost(env, 10)
     found = optimum(env, 1)[0][:, 0]
     slope = (g + H @ found) / np.abs(g).max()
     at_limit = np.abs(found) > 1.0 - 1e-6

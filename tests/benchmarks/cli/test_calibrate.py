@@ -59,8 +59,8 @@ def test_it_writes_beside_the_user(
 def test_the_matrix_refuses_a_stale_file_before_it_drives(run: Run, here: Path) -> None:
     old = CalibrationRecord(*(FIRST.tier, FIRST.env_id, FIRST.vehicle, FIRST.reference,
                               FIRST.scenario),
-                "0.0.1", "by hand", ())  # fmt: skip
+                0, "by hand", ())  # fmt: skip
     (here / "old.json").write_text(json.dumps([vars(old)]))
     status, _, err = run("bench", "control", "--quick", "--clairvoyant", "old.json")
     assert status == 2
-    assert f"{FIRST.name}, is stale: of version 0.0.1" in " ".join(err.split())
+    assert f"{FIRST.name}, is stale: of world 0" in " ".join(err.split())

@@ -55,12 +55,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
-def test_seeds_are_its_own_and_follow_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_are_its_own_and_follow_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
     few, many = derive_seeds(GUST, 4), derive_seeds(GUST)
     assert many[:4] == few and len(set(many)) == 64
     assert min(many) > 10**6
     assert not set(many) & set(derive_seeds(SINE))
-    monkeypatch.setattr(calibration, "__version__", "9.9.9")
+    monkeypatch.setattr(calibration, "WORLD_VERSION", 999)
     assert not set(many) & set(derive_seeds(GUST))
 
 
@@ -93,8 +93,8 @@ SPOILED: dict[str, Callable[[str], str]] = {
     "entry 1: unknown asked": lambda text: text.replace('"command"', '"asked"'),
     "episode 1: missing winner": lambda text: text.replace('"winner": "from none",', ""),
     "entry 1: episodes is no list": lambda text: text.replace('"episodes"', '"others"'),
-    "entry 1, gust, yaw, is stale: of version 0.0.1": lambda text: text.replace(
-        '"env_version": "', '"env_version": "0.0.1", "command": "'
+    "entry 1, gust, yaw, is stale: of world 99": lambda text: text.replace(
+        '"world_version": ', '"world_version": 99'
     ),
     "slalom, yaw, is stale: its seeds are not": lambda text: text.replace("gust", "slalom"),
 }
@@ -143,7 +143,8 @@ def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
 ) -> None:
     (entry,) = Calibration([GUST], tmp_path, 4).run(jobs=1)
     none = ControlCase(GUST, Entry("none"))
-    cases = [none, ControlCase(SINE, Entry("none"))]
+    changed = dataclasses.replace(GUST, changes={"reference": "model"})
+    cases = [ControlCase(changed, Entry("none")), ControlCase(SINE, Entry("none"))]
     regrets, there = measure_regrets({GUST: entry}, cases, jobs=1)
     assert list(there) == [none]
     costs = measure([none], derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
