@@ -23,10 +23,17 @@ from sideslip.estimators.core.record import N_INPUTS
 assert sideslip.__version__
 
 
+SURE = {"force_share": 1e-3, "model_error": 0.0, "robust": 0.0, "noise_time": 2.0}
+SURE |= dict.fromkeys(("accel_bias_sd", "accel_scale_sd", "bias_sd", "bank_sd"), 0.0)
+"""Options of a filter that does not doubt its forces: what it cannot predict is noise."""
+
+
 @functools.cache
-def drive(accel: float = 0.1) -> tuple[Any, Log]:
+def drive(accel: float = 0.1, base: str = "random-steering") -> tuple[Any, Log]:
     """A drive of the COMS whose accelerometer has this noise in m/s2."""
-    scenario = {"base": "random-steering", "noise": {"accel": accel}, "duration": 6.0}
+    scenario: dict[str, Any] = {"base": base, "noise": {"accel": accel}, "duration": 6.0}
+    if base == "straight":  # nothing errs but by its noise
+        scenario |= dict.fromkeys(("disturbance_force", "disturbance_moment", "accel_y_bias"), 0.0)
     env: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario)
     return env.unwrapped, rollout(env, seed=1).log
 
@@ -38,8 +45,8 @@ def built(name: str, log: Log, **options: Any) -> Estimator:
 
 @pytest.mark.parametrize("noise", [0.03, 0.1, 0.8])
 def test_the_accelerometers_noise_is_found_and_never_less_than_configured(noise: float) -> None:
-    _, log = drive(noise)
-    filter_ = built("joint-robust", log, accel_y_noise=0.05)
+    _, log = drive(noise, "straight")
+    filter_ = built("joint-robust", log, accel_y_noise=0.05, **SURE)
     filter_.run(log)
     f = filter_.filters[0]
     assert math.sqrt(f.r_fast[f.accel_row]) == pytest.approx(max(noise, 0.05), rel=0.4)
@@ -50,14 +57,14 @@ def test_the_accelerometers_noise_is_found_and_never_less_than_configured(noise:
 
 def test_noise_that_is_coloured_counts_for_what_its_mean_errs() -> None:
     """AR(1) of correlation time tau: a mean of many rows errs by 2 tau / dt times white noise's."""
-    _, log = drive(0.02)
+    _, log = drive(0.02, "straight")
     sd, tau, rng = 0.5, 0.02, np.random.default_rng(0)
     keep = math.exp(-0.001 / tau)
     steps = rng.normal(0.0, sd * math.sqrt(1.0 - keep * keep), len(log.record.fast))
     fast = log.record.fast.copy()
     fast[:, FAST.accel_y] += lfilter([1.0], [1.0, -keep], steps)
     shaken = dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
-    filter_ = built("joint-robust", log, accel_y_noise=0.02)
+    filter_ = built("joint-robust", log, accel_y_noise=0.02, **SURE)
     filter_.run(shaken)
     f = filter_.filters[0]
     wanted = sd * math.sqrt(2.0 * tau / 0.001)
