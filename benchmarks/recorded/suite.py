@@ -276,8 +276,8 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
     honest = rank_by_score(result.honesty)[0]
-    _, held, _ = np.median(result.honesty[honest], axis=0)
-    believed = f"Best by the log score: {honest}, whose 95 % interval holds {held:.0%}."
+    held = 100.0 * np.median(result.honesty[honest], axis=0)[1]
+    believed = f"Best by the log score: {honest}, whose 95 % interval holds {held:.0f} %."
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: _compute_ratio(result, first, name) for name in rest}
@@ -428,7 +428,9 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         figure = _select_traces(over_time, result)
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
         held = {"truth": SHARES} | result.held
-        curves = draw_curves(SHARES, held, "share an interval should hold", "share it holds")
+        curves = draw_curves(
+            SHARES, held, "fraction that intervals should hold", "fraction they hold"
+        )
         text = f"Below the line of truth an estimator is surer than it may be. {_HIDDEN}"
         shown.insert(3, ("whether intervals hold", _select_traces(curves, result), text))
         groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}
