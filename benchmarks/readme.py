@@ -180,7 +180,7 @@ def _make_first_table(rows: Sequence[ResultRow]) -> str:
 def _make_headlines(root: Path) -> list[str]:
     """Make README's sentences with numbers from the files in docs.
 
-    `python -m sideslip.benchmarks.studies.next_car --out docs/next_car.json` and `sideslip bench
+    `python -m sideslip.benchmarks.tuning.next_car --out docs/next_car.json` and `sideslip bench
     speed --json docs/speed.json` write the files.
     """
     table = json.loads((root / "docs/next_car.json").read_text(encoding="utf-8"))

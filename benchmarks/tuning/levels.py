@@ -259,26 +259,30 @@ def search(
     Returns:
         The best levels, their mean negative log score (rad) and that of the start.
     """
-    import optuna  # slow to load
-    from optuna.samplers import CmaEsSampler
+    from cmaes import CMA  # of the extra `tune`
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    factors = optuna.distributions.FloatDistribution(0.03, 30.0, log=True)
-    space: dict[str, optuna.distributions.BaseDistribution] = dict.fromkeys(start, factors)
-    sampler = CmaEsSampler(x0=dict.fromkeys(start, 1.0), sigma0=0.3, seed=1, popsize=_POPULATION)
-    study = optuna.create_study(sampler=sampler)
-    study.enqueue_trial(dict.fromkeys(start, 1.0))
-    while len(study.trials) < trials:
-        asked = [study.ask(space) for _ in range(_POPULATION)]
-        levels = [{k: start[k] * v for k, v in trial.params.items()} for trial in asked]
+    names, scores = list(start), list[float]()
+    search_state = CMA(np.zeros(len(names)), 0.3, seed=1, population_size=_POPULATION)
+    best, best_score = dict(start), math.inf
+    while len(scores) < trials:
+        asked = [search_state.ask() for _ in range(_POPULATION)]
+        if not scores:
+            asked[0] = np.zeros(len(names))  # the start itself
+        levels = [
+            {k: start[k] * math.exp(v) for k, v in zip(names, point, strict=True)}
+            for point in asked
+        ]
         cases = [(x, range(i, drives, 2)) for x in levels for i in range(2)]
-        title = f"{len(study.trials)} of {trials} trials"
-        scores = run_cases(_score, cases, title, jobs, console)
-        for i, trial in enumerate(asked):
-            study.tell(trial, float(np.mean([*scores[2 * i], *scores[2 * i + 1]])))
-        console.print(f"{title}: {study.best_value:.3f}", highlight=False)
-    best = {k: start[k] * v for k, v in study.best_params.items()}
-    return best, study.best_value, float(study.trials[0].value or 0.0)
+        title = f"{len(scores)} of {trials} trials"
+        halves = run_cases(_score, cases, title, jobs, console)
+        results = [float(np.mean([*halves[2 * i], *halves[2 * i + 1]])) for i in range(len(levels))]
+        search_state.tell(list(zip(asked, results, strict=True)))
+        scores += results
+        lowest = int(np.argmin(results))
+        if results[lowest] < best_score:
+            best, best_score = levels[lowest], results[lowest]
+        console.print(f"{title}: {best_score:.3f}", highlight=False)
+    return best, best_score, scores[0]
 
 
 def get_levels() -> dict[str, float]:

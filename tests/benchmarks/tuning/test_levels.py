@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks.studies.next_car import PARTS, main
 from sideslip.benchmarks.tuning.levels import (
     convert_levels,
     draw_drive,
@@ -12,6 +11,7 @@ from sideslip.benchmarks.tuning.levels import (
     run_filter,
     search,
 )
+from sideslip.benchmarks.tuning.next_car import PARTS, main
 
 
 def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:

@@ -1,7 +1,7 @@
 """What each part of `joint-robust` is worth on cars that its levels were not found on.
 
-`python -m sideslip.benchmarks.studies.next_car --drives 250 --out docs/next_car.json` runs filters
-with one part less over drives of `tuning.levels.draw_drive` with other seeds.
+`python -m sideslip.benchmarks.tuning.next_car --drives 250 --out docs/next_car.json` runs filters
+with one part less over drives of `levels.draw_drive` with other seeds.
 """
 
 import json
@@ -19,7 +19,7 @@ from ..harness.parallel import run_cases
 from ..harness.results import write_text
 from ..harness.stats import average
 from ..recorded.honesty import compute_honesty
-from ..tuning.levels import draw_drive, run_filter
+from .levels import draw_drive, run_filter
 
 FIRST_SEED = 100_000  # no drive of the search
 _NO_TYRES = {"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "inverse_friction_sd": 0.0}
@@ -81,6 +81,6 @@ def main(
 
 
 if __name__ == "__main__":
-    from sideslip.benchmarks.studies import next_car  # by its name: workers import it
+    from sideslip.benchmarks.tuning import next_car  # by its name: workers import it
 
     typer.run(next_car.main)
