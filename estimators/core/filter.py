@@ -21,7 +21,7 @@ from .multiple_model import compute_mixture, replace_least_likely
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
-from .update import FIRST_VARIANCE, correct_fast
+from .update import FIRST_VARIANCE, compute_excess, correct_fast
 
 
 @jit
@@ -157,9 +157,10 @@ def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
         i: Index of the state.
 
     Returns:
-        Standard deviation in the state's unit.
+        Standard deviation in the state's unit; of a filter that is lost, larger by its surprise.
     """
-    return sqrt(maximum(read_covariance(f, gains, i, i), 0.0))
+    growth = maximum(compute_excess(f), 1.0)
+    return sqrt(maximum(read_covariance(f, gains, i, i), 0.0) * growth)
 
 
 @jit

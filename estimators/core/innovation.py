@@ -9,7 +9,7 @@ from math import log
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import Scalar, Vector, sqrt
+from ...envs.numerics.primitives import Scalar, Vector, minimum, sqrt
 from ...envs.record import PACKET
 from .covariance import dot, predict_measurement, project, project_row, update_scalar
 from .model import compute_row_variance
@@ -172,6 +172,23 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
     else:
         f.known_stamps[s, frame % N_STAMPS] = captured
     return target
+
+
+MAX_SURPRISE = 50.0
+"""Squared innovation over its variance, of which more says no more."""
+
+
+@jit
+def note_surprise(f: FilterRecord, kind: int, surprise: Scalar, weight: Scalar) -> None:
+    """Note how large an innovation was.
+
+    Args:
+        f: Memory of the filter.
+        kind: 0 of a fast row, 1 of a slow sample.
+        surprise: Squared innovation over its variance.
+        weight: Weight in the mean.
+    """
+    f.surprise[kind] += weight * (minimum(surprise, MAX_SURPRISE) - f.surprise[kind])
 
 
 _AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agree

@@ -8,7 +8,7 @@ from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minim
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8, vector_width
 from ...envs.record import FAST
 from .covariance import predict_covariance
-from .innovation import BUFFER, LARSEN, PSEUDO
+from .innovation import BUFFER, LARSEN, MAX_SURPRISE, PSEUDO, note_surprise
 from .model import (
     BETA,
     CURVATURE,
@@ -25,6 +25,7 @@ from .model import (
 from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 
 _FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
+_MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
 _MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
 
 
@@ -112,7 +113,7 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
     if f.steer_jump > 0.0:  # a steering angle (the first input) that jumps waits for the next row
         steer = f.u_new[0]
-        if absolute(steer - f.steer_before) > f.steer_jump:
+        if absolute(steer - f.steer_before) > f.steer_jump or absolute(steer) > _MAX_STEER:
             f.u_new[0] = np.nan
         f.steer_before = steer
     for i in range(f.inputs):
@@ -122,6 +123,8 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
             f.u[i] = f.u_new[i]
     else:
         f.counts[COUNTERS.invalid] += 1
+        if f.r_share > 0.0:
+            note_surprise(f, 0, MAX_SURPRISE, f.step)
     for i in range(f.fasts):
         f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
     turning, f.speed_before = f.turning, f.model_speed

@@ -24,10 +24,11 @@ from .innovation import (
     STORED_ONE,
     check_sample,
     compute_packet_variance,
+    note_surprise,
     propagate_larsen_gains,
 )
 from .innovation import NONE as NONE
-from .model import PSI, is_finite
+from .model import MIN_SPEED, PSI, is_finite
 from .predict import compute_residual
 from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables
 
@@ -258,7 +259,7 @@ def update_filter(
     else:
         is_refused = is_gated and not check_sample(f, s, first, packet)
         if is_gated and f.r_share > 0.0 and f.nis == f.nis:
-            _note_surprise(f, 1, f.nis / f.rows[s], _SAMPLE_WEIGHT)
+            note_surprise(f, 1, f.nis / f.rows[s], _SAMPLE_WEIGHT)
         if is_refused:
             f.counts[COUNTERS.gated] += 1
             f.first_fix = previous_fix
@@ -268,14 +269,21 @@ def update_filter(
 
 
 _SAMPLE_WEIGHT = 1.0 / 12.0  # of a slow sample in the mean of the last ones
-_MAX_SURPRISE = 50.0  # of one innovation: more says no more
-MAX_MEAN_SURPRISE = 3.0
-"""Mean squared innovation over its variance beyond which a filter is lost."""
+# mean surprises beyond which a filter is lost; a clean camera on a bend of a wrong map has 10
+_MAX_FAST, _MAX_SLOW = 3.0, 15.0
 
 
 @jit
-def _note_surprise(f: FilterRecord, kind: int, surprise: Scalar, weight: Scalar) -> None:
-    f.surprise[kind] += weight * (minimum(surprise, _MAX_SURPRISE) - f.surprise[kind])
+def compute_excess(f: FilterRecord) -> Scalar:
+    """Compute how far a filter's surprise is beyond what one that knows its place has.
+
+    Args:
+        f: Memory of the filter.
+
+    Returns:
+        Mean surprise over its limit, of fast rows or slow samples, the larger.
+    """
+    return maximum(f.surprise[0] * (1.0 / _MAX_FAST), f.surprise[1] * (1.0 / _MAX_SLOW))
 
 
 @jit
@@ -286,9 +294,11 @@ def is_healthy(f: FilterRecord) -> Scalar:
         f: Memory of the filter.
 
     Returns:
-        False for a filter that is lost; True for one whose noise is fixed, which keeps no account.
+        False for a filter that is lost, or whose car reverses, which the model does not know; True
+        for one whose noise is fixed, which keeps no account.
     """
-    return maximum(f.surprise[0], f.surprise[1]) < MAX_MEAN_SURPRISE
+    is_known = f.speed > 0.0 - MIN_SPEED or f.r_share == 0.0
+    return is_known and compute_excess(f) < 1.0
 
 
 FIRST_VARIANCE = 100.0
@@ -353,7 +363,7 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
             _find_variance(f, i, residual, projected)
         variance = projected + f.r_fast[i]
         if f.r_share > 0.0:
-            _note_surprise(f, 0, residual * residual / variance, f.step / f.fasts)
+            note_surprise(f, 0, residual * residual / variance, f.step / f.fasts)
         update_scalar(f, variance, residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)

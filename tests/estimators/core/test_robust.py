@@ -119,6 +119,30 @@ def test_a_filter_says_when_it_is_lost() -> None:
     assert all(health[:4]) and not any(health[9:])
 
 
+@pytest.mark.parametrize("fault", ["degrees", "backward"])
+def test_a_steering_angle_in_degrees_and_a_car_that_reverses_are_said(fault: str) -> None:
+    """Within a second, and where the steering is wrong the deviation grows."""
+    _, log = drive()
+    fast = log.record.fast.copy()
+    if fault == "degrees":
+        fast[:, FAST.steer] = np.degrees(fast[:, FAST.steer])
+    else:
+        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= -1.0
+    wrong = dataclasses.replace(log.record, fast=fast)
+    until = next(
+        i for i in range(500, 6000) if abs(fast[i, FAST.steer]) > 1.0 or fault != "degrees"
+    )
+    filter_, deviations = built("joint-robust", log), []
+    for record in (wrong, log.record):
+        filter_.reset(log.slow, 0)
+        rows = np.ascontiguousarray(record.fast[: until + 1000])
+        X, S = np.empty((2, len(rows), len(filter_.names)))
+        filter_.take(rows, len(rows), record.packets[:0], 0, X, S, np.empty(0))
+        deviations.append(S[-1, 0])
+        assert filter_.is_healthy == (record is log.record)
+    assert fault != "degrees" or deviations[0] > 2.0 * deviations[1]
+
+
 def test_what_is_far_beyond_its_noise_counts_less_and_the_rest_as_it_is() -> None:
     _, log = drive()
     plain, robust = (built("joint", log, robust=size).run(log) for size in (0.0, 6.0))
