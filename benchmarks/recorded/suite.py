@@ -275,9 +275,10 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
             describe_innovations(result.nis),
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
-    honest = rank_by_score(result.honesty)[0]
-    held = 100.0 * np.median(result.honesty[honest], axis=0)[1]
-    believed = f"Best by the log score: {honest}, whose 95 % interval holds {held:.0f} %."
+    held = "".join(
+        f" By the log score {name} is best; its 95 % interval holds {100.0 * share:.0f} %."
+        for name, share in rank_by_score(result.honesty)[:1]
+    )
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: _compute_ratio(result, first, name) for name in rest}
@@ -286,7 +287,7 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         f"From the recorded angle {describe_leader(first, over, 'stray')}.",
-        f"Its error: {rmse[first]:.2f} deg; brackets: range over noises. {believed}",
+        f"Its error: {rmse[first]:.2f} deg.{held}",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"
         + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
@@ -379,7 +380,7 @@ def _add_rows(
         records[name] = record | {"us_per_tick": cost}
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
-    return [records[name] for name in rank_by_score(result.honesty) or records]
+    return [records[name] for name in dict(rank_by_score(result.honesty)) or records]
 
 
 def _make_table(

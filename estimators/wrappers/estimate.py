@@ -15,8 +15,9 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
-from ..design.models import FOREIGN_STATE, STATES, TYRES
+from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
+from ..filters import FILTERS
 from ..learned.correction import LearnedEstimator
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
@@ -156,6 +157,13 @@ class Arguments:
         """Whether the vehicle is the true one."""
         return isinstance(self.vehicle, str) and self.vehicle == TRUTH
 
+    @property
+    def _finds_noise(self) -> bool:
+        """Whether it is a filter that finds its noise, and so knows when it is lost."""
+        row = FILTERS.get(self.estimator) if isinstance(self.estimator, str) else None
+        options = {} if row is None else dict(row.options) | dict(self.options)
+        return bool(options.get("noise_time", 0.0))
+
     def make_outputs(self, states: tuple[str, ...], inner: tuple[ObservationEntry, ...]) -> Outputs:
         """Make the outputs of an estimator behind the entries of an inner observation.
 
@@ -187,7 +195,7 @@ class Arguments:
         columns = [states.index(s) for s in self.outputs], [s in _WRAPPED for s in self.outputs]
         keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
         keys += [("nees", NEES)] if any(truths) else []
-        keys += [("healthy", HEALTHY)] if TYRES[0] in states else []
+        keys += [("healthy", HEALTHY)] if self._finds_noise else []
         table = OutputTable(
             n_inner,
             np.array([*columns, truths], np.int64).T.copy(),

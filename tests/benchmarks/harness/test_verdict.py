@@ -153,7 +153,12 @@ def test_a_replay_without_truth_has_no_winner() -> None:
     first, *_ = fits(recorded._compose_verdict(Replayed(traces=traces), False))
     assert first.startswith("Nobody wins")
     squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
-    lines = fits(recorded._compose_verdict(Replayed(squares=squares, traces=traces), True))
+    honesty = {name: np.array([[1.0, 0.94, 3.0 + i]]) for i, name in enumerate(squares)}
+    known = Replayed(squares=squares, traces=traces, honesty=honesty)
+    lines = fits(recorded._compose_verdict(known, True))
+    assert "By the log score exact-kf is best; its 95 % interval holds 94 %." in lines[2]
+    lost = Replayed(traces=traces, nis={"joint": (7.0, 90), "exact-kf": (1.0, 90)})
+    assert "do not believe joint (7.0)" in fits(recorded._compose_verdict(lost, False))[1]
     assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]
     assert "0.57 deg" in lines[2] and "1.15 deg" in lines[3] and "drawn noise" in lines[4]
 
