@@ -52,16 +52,16 @@ def compute_held_shares(error: Array, deviation: Array) -> Array:
     return np.asarray(np.searchsorted(ratios, _WIDTHS) / len(ratios))
 
 
-def describe_innovations(nis: Mapping[str, tuple[float, int]]) -> str:
+def describe_innovations(nis: Mapping[str, float]) -> str:
     """Describe whether slow samples surprise each filter as much as it expects.
 
     Args:
-        nis: Mean squared innovation over its variance, and number of samples, by filter.
+        nis: Mean squared innovation over its variance, of a value of a packet, by filter.
 
     Returns:
         A sentence; "" where no filter has innovations.
     """
-    lost = [f"{name} ({mean:.1f})" for name, (mean, _) in nis.items() if mean > _LOST]
+    lost = [f"{name} ({mean:.1f})" for name, mean in nis.items() if mean > _LOST]
     if not nis:
         return ""
     judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"

@@ -14,6 +14,7 @@ from ... import __version__
 from ...envs.record import Array, Log
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
+from ...estimators.design.models import MEASUREMENTS
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
@@ -105,10 +106,8 @@ class ReplayResult:
     squares: dict[str, Array] = field(default_factory=dict)  # by seed (rad2); empty without truth
     # by seed: NEES, fraction of errors in the 95 % interval, mean log score; empty without truth
     honesty: dict[str, Array] = field(default_factory=dict)
-    held: dict[str, Array] = field(default_factory=dict)  # fraction in intervals, by `_LEVELS`
-    nis: dict[str, tuple[float, int]] = field(
-        default_factory=dict
-    )  # mean, packets; of the first seed
+    held: dict[str, Array] = field(default_factory=dict)  # fraction in intervals, by `SHARES`
+    nis: dict[str, float] = field(default_factory=dict)  # mean, a value of a packet; first seed
     cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
     traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
     # states that are no motion at the end: name, value, standard deviation
@@ -181,9 +180,9 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             result.cost[name] = min(spent, result.cost.get(name, math.inf))
             beta = estimates.x[:, estimates.names.index("beta")]
             result.traces.setdefault(name, beta)
-            if np.isfinite(estimates.nis).any():
-                nis = estimates.nis[np.isfinite(estimates.nis)]
-                result.nis.setdefault(name, (float(np.mean(nis)), len(nis)))
+            if slow is not None and np.isfinite(estimates.nis).any():
+                values = len(MEASUREMENTS[slow].rows)  # of a packet, each of which adds 1
+                result.nis.setdefault(name, float(np.nanmean(estimates.nis)) / values)
             ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
             result.outcomes[name] = [
                 (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
@@ -195,10 +194,8 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
                 honesty.append(compute_honesty(wrong, deviation))
                 result.held.setdefault(name, compute_held_shares(wrong, deviation))
         if truth is not None:
-            result.squares[name], result.honesty[name] = (
-                np.array(squares[1:]),
-                np.array(honesty[1:]),
-            )
+            result.squares[name] = np.array(squares[1:])
+            result.honesty[name] = np.array(honesty[1:])
     return result
 
 
@@ -376,7 +373,7 @@ def _add_rows(
             for column, values in zip(HONESTY, result.honesty[name].T, strict=True):
                 record[column.key] = _compute_range(values)
         if name in result.nis:
-            record["nis"] = result.nis[name][0]
+            record["nis"] = result.nis[name]
         records[name] = record | {"us_per_tick": cost}
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
@@ -389,7 +386,7 @@ def _make_table(
     """Make the table of the estimators; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     cost = Column("us_per_tick", "us per tick", form=".3f")
-    surprise = Column("nis", "NIS", form=".2f")
+    surprise = Column("nis", "NIS of a value", form=".2f")
     if not result.squares:
         title = f"{name}, designed from {car.name}: no truth, no score"
         return ResultTable(title, ("estimator", surprise, cost), records, note)

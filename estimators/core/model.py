@@ -129,7 +129,7 @@ def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     f.push[0], f.push[1] = beta, gamma
     if f.rolling > 0:
         f.push[f.rolling + 1] = phi_rate
-    if f.mapped > 0:  # on a bend that the map turns late the lane's law needs its sine
+    if f.mapped > 0:  # y_l' = V sin(course); without the state the papers' law stays, linear
         course = f.x[BETA] + f.x[PSI]
         f.push[Y_L] = V * (sincos(course)[0] - course)
     f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0

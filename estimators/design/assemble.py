@@ -95,7 +95,7 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
 
 
 _EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
-_BLOCK_TIME = 0.2  # s of a block whose mean innovation shows the accelerometer's noise
+_BLOCK_TIME = 0.2  # s of a block whose mean innovations show the fast sensors' noise
 _SMOOTHING_TIME = 0.015  # s, time constant of the low-pass on the measured speed
 _MAX_SPEED = 80.0  # m/s, speed of the last table of gains
 _SPACING = 0.5  # m/s between two tables of gains

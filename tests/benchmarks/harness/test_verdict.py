@@ -157,7 +157,7 @@ def test_a_replay_without_truth_has_no_winner() -> None:
     known = Replayed(squares=squares, traces=traces, honesty=honesty)
     lines = fits(recorded._compose_verdict(known, True))
     assert "By the log score exact-kf is best; its 95 % interval holds 94 %." in lines[2]
-    lost = Replayed(traces=traces, nis={"joint": (7.0, 90), "exact-kf": (1.0, 90)})
+    lost = Replayed(traces=traces, nis={"joint": 7.0, "exact-kf": 1.0})
     assert "do not believe joint (7.0)" in fits(recorded._compose_verdict(lost, False))[1]
     assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]
     assert "0.57 deg" in lines[2] and "1.15 deg" in lines[3] and "drawn noise" in lines[4]

@@ -34,8 +34,8 @@ def test_the_score_is_best_at_the_true_deviation() -> None:
 
 
 def test_without_truth_innovations_say_whom_not_to_believe() -> None:
-    text = describe_innovations({"joint": (7.25, 90), "exact-kf": (1.1, 90)})
+    text = describe_innovations({"joint": 7.25, "exact-kf": 1.1})
     assert "do not believe joint (7.2)" in text and "exact-kf" not in text
-    assert "nobody is lost" in describe_innovations({"exact-kf": (1.1, 90)})
+    assert "nobody is lost" in describe_innovations({"exact-kf": 1.1})
     assert describe_innovations({}) == ""
     assert not math.isnan(compute_honesty(np.zeros(3), np.ones(3))[2])
