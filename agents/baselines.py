@@ -40,12 +40,11 @@ ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
 `STATE_ORACLES` also the state and the disturbances; neither controller is always the better one."""
 
 FILTER = "exact-kf"
-TYRE_FILTER = "joint"
-_TYRE_FILTER_OPTIONS = dict.fromkeys(
+_TYRE_OPTIONS = {"wary": 10} | dict.fromkeys(
     ("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1
 )
-"""Options of the filter for tyres with a limit: it knows them to a tenth, for its tyre law differs
-from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
+"""Options of an oracle's filter for tyres with a limit: it knows them to a tenth, for its tyre law
+differs from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; sqrt(1 - 0.7^2) is left laterally
@@ -236,11 +235,11 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]
     if has_tyre_filter:
-        levels |= _TYRE_FILTER_OPTIONS
+        levels |= _TYRE_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(
         env,
-        TYRE_FILTER if has_tyre_filter else FILTER,
+        FILTER,
         outputs=OUTPUTS,
         std=False,
         vehicle=TRUTH if knows_tyres else None,

@@ -45,8 +45,7 @@ _UNFILTERED = ("raw-car-steering", "raw-car-yaw", "raw-coms-yaw", "raw-coms-stee
 _SHOWN: Mapping[str, tuple[str, str]] = {
     "`oracle-state`: knows state and car": (STATE, ""),
     "`oracle-parameters`: knows car and biases": (PARAMETERS, ""),
-    "`adaptive-nmpc` on `joint` with friction": ("adaptive-nmpc", "joint, friction"),
-    "the same on `learned-joint`": ("adaptive-nmpc", "learned-joint"),
+    "`adaptive-nmpc` on `joint`": ("adaptive-nmpc", "joint"),
     "`adaptive-lqr` on `joint`": ("adaptive-lqr", "joint"),
     "`nmpc` on `exact-kf`": ("nmpc", REFERENCE_FILTER),
     "`nominal`: `lqr` on `exact-kf`": (NOMINAL, ""),
@@ -70,7 +69,7 @@ FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", "joint"), ("ppo-coms-steering", "joint")],
     "policy on the late sensors alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
-    "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", "joint, friction")],
+    "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", "joint")],
     "`adaptive-lqr` on `joint`": [("adaptive-lqr", "joint")],
     "tuned LQG: `lqr` on `exact-kf`": [(NOMINAL, "")],
     "`model-following` (dakf-stability)": [("model-following", REFERENCE_FILTER)],

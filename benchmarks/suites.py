@@ -19,7 +19,6 @@ SUITES = {
     "control": ".control.suite",
     "learned": ".studies.learned",
     "learned-outside": ".studies.learned_outside",
-    "memory": ".studies.recurrent",
     "papers": ".papers.suite",
     "following": ".studies.coordinated_control",
     "highway": ".studies.traffic",

@@ -365,7 +365,7 @@ class Estimator:
 
         Filters whose noise is fixed (`noise_time=0`) keep no account of it and say True.
         """
-        return bool(is_healthy(self.filters[1 if self._f.members > 0 else 0]))
+        return bool(is_healthy(self.filters[0]))
 
     @property
     def nis(self) -> float:

@@ -35,8 +35,7 @@ class FilterDefinition:
 _GPS = ("gps",)
 _CAMERA = ("camera",)
 
-_JOINT = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
-_ROBUST = (
+_JOINT = (
     ("fast", ("gyro", "accel_y")),
     ("wary", 10),
     ("steer_rate", 3.0),
@@ -161,13 +160,6 @@ FILTERS: dict[str, FilterDefinition] = {
         gains="covariance",
         disturbances="forces",
         options=_JOINT,
-        source="docs/estimators.md, beyond the papers",
-    ),
-    "joint-robust": FilterDefinition(
-        slow=SLOW_NAMES,
-        gains="covariance",
-        disturbances="forces",
-        options=_ROBUST,
         source="docs/estimators.md, beyond the papers",
     ),
 }

@@ -86,15 +86,8 @@ make_estimator.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
     parameters=[*_NAMED, *PARAMETERS, _OTHERS]
 )
 
-_LEARNED = f"{__package__}.learned.correction"  # rooms above this one, loaded when asked for
 ESTIMATORS = Registry(
-    "estimator",
-    {
-        **{name: functools.partial(make_estimator, name) for name in FILTERS},
-        "learned": f"{_LEARNED}:learned",
-        "learned-exact-kf": f"{_LEARNED}:learned_exact_kf",
-        "learned-joint": f"{_LEARNED}:learned_joint",
-    },
+    "estimator", {name: functools.partial(make_estimator, name) for name in FILTERS}
 )
 """Every estimator that has a name: the package's own and those that were registered."""
 

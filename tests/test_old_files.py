@@ -4,7 +4,7 @@
 a training's checkpoint and the zips of PPO and of analytic gradients, which name modules and
 classes; specs of environments; a scenario, a vehicle and a camera; a drive; rows; a session.
 `names.json` lists the names in these, on wires and in `info`: a new name for one of them comes
-beside the old one. Cards, corrections, tuned options and calibrations are read where they lie.
+beside the old one. Cards, tuned options and calibrations are read where they lie.
 """
 
 import dataclasses
@@ -21,7 +21,6 @@ from gymnasium.envs.registration import EnvSpec
 import sideslip.agents.learned.policy
 import sideslip.benchmarks.control.calibration
 import sideslip.benchmarks.entrants.baselines
-import sideslip.estimators.learned.correction_file
 from sideslip.agents import make_agent
 from sideslip.agents.baselines import read_tuned
 from sideslip.agents.learned.policy import list_shipped, load_policy
@@ -64,7 +63,6 @@ def names_now() -> dict[str, list[str]]:
     return {
         "policy card": fields_of(sideslip.agents.learned.policy.Card),
         "network": list(load_policy(list_shipped()[0]).network.description),
-        "correction card": fields_of(sideslip.estimators.learned.correction_file.CorrectionCard),
         "scenario": fields_of(Scenario),
         "vehicle": fields_of(Vehicle),
         "wires": [*WIRE_TABLES, *fields_of(SignalCalibration)],

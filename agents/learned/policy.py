@@ -17,18 +17,18 @@ from ... import __version__
 from ...envs.io import check_types, from_json, write_atomic
 from ...envs.record import Array
 from ...envs.validation import describe_unknown
-from ...estimators.learned.network import (
+from ...estimators.registry import is_user_file
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..controllers.base import Controller
+from ..env_info import AnyEnv, get_env_facts, make_env
+from .network import (
     NO_MEMORY,
     Network,
     build_network,
     parse_json_object,
     read_tensors,
 )
-from ...estimators.learned.network import SUFFIX as SUFFIX
-from ...estimators.registry import is_user_file
-from ...estimators.wrappers.estimate import EstimateObservation
-from ..controllers.base import Controller
-from ..env_info import AnyEnv, get_env_facts, make_env
+from .network import SUFFIX as SUFFIX
 
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
 ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads

@@ -33,7 +33,7 @@ PERIOD = 0.01  # s, control period for which the files give `gamma`
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
 WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
 
-# Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
+# Seeds of tests and of the calibration are below 2^63, those of `distill` beyond.
 _SCALING_SEEDS, _TRAINING_SEEDS, _SEEDS_PER_TRAINING = 2**65, 2**66, 2**40
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")  # no arguments of the class
 _SCHEDULED = ("learning_rate", "clip_range")  # may fall to zero, `_make_schedule`

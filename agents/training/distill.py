@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,7 @@ from .student import Demonstrations, DistillConfig, Scaling, Student, compute_sc
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
 
-if TYPE_CHECKING:
-    from .. import Agent
-
-_DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
+_DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`
 _SEEDS_PER_TRAINING = 2**40
 _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
 _WINDOW = 50  # steps through which the gradient goes back in time, but for traces
@@ -65,32 +62,16 @@ class _Batch(NamedTuple):
     begins: bool  # whether the episodes begin with it
 
 
-_AgentT = TypeVar("_AgentT", bound="Agent | Policy")
-
-
-def imitate(
-    model: Any,
+def _imitate(
+    model: Student,
     tasks: Sequence[DistillTask],
     config: DistillConfig,
-    make_agent: Callable[[Scaling, RoundResult], _AgentT],
-    weight: float | None = None,
-) -> _AgentT:
-    """Let a model drive and learn in rounds.
-
-    Args:
-        model: Network like `Student`, with `recurrent`, `fit_scaling` and its outputs.
-        tasks: Cars and teachers.
-        config: Configuration of the training.
-        make_agent: Function that makes the agent of a round; it drives the next one.
-        weight: S, the cost of a squared error. None: the teacher's curvature, over costs that are
-            capped after the first round at their median there.
-
-    Returns:
-        Agent of the last round.
-    """
+    make_policy: Callable[[Scaling, RoundResult], Policy],
+) -> Policy:
+    """Let a model drive and learn in rounds; `make_policy` makes the one that drives the next."""
     layout, needs, num_envs = tasks[0].cars.layout, tasks[0].teacher.needs, tasks[0].cars.num_envs
     seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, num_envs)
-    agent: _AgentT | None = None
+    policy: Policy | None = None
     scaling: Scaling | None = None
     drives, max_costs, steps = list[Demonstrations](), [np.inf] * len(tasks), 0
     for i in range(config.rounds):
@@ -98,15 +79,13 @@ def imitate(
         for task, max_cost in zip(tasks, max_costs, strict=True):
             first = next(seeds)
             numbers = range(first, first + task.cars.num_envs)
-            demo = _collect_demonstrations(task, agent, numbers, config.noise, max_cost)
-            if weight is not None:
-                demo = demo._replace(curvature=np.full((1, 1), weight, np.float32))
-            new_drives.append(demo)
+            new_drives.append(
+                _collect_demonstrations(task, policy, numbers, config.noise, max_cost)
+            )
         steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
         if scaling is None:
             scaling = model.fit_scaling(new_drives, layout, needs)
-            if weight is None:
-                max_costs = [float(np.median(demo.costs)) for demo in new_drives]
+            max_costs = [float(np.median(demo.costs)) for demo in new_drives]
             privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
             standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))
         for demo in new_drives:
@@ -114,14 +93,14 @@ def imitate(
         epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
         loss = _fit_model(model, drives, scaling, config, epochs)
         mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
-        agent = make_agent(scaling, RoundResult(steps, mean_cost, loss))
-    assert agent is not None
-    return agent
+        policy = make_policy(scaling, RoundResult(steps, mean_cost, loss))
+    assert policy is not None
+    return policy
 
 
 def _collect_demonstrations(
     task: DistillTask,
-    policy: "Agent | Policy | None",
+    policy: Policy | None,
     seeds: Sequence[int],
     noise: float,
     max_cost: float = np.inf,
@@ -132,7 +111,7 @@ def _collect_demonstrations(
     cost more than `max_cost` are weighted as if they cost that: failed ones keep their weight.
     """
     cars, twins, teacher = task
-    student = PolicyController(cars, policy) if isinstance(policy, Policy) else policy
+    student = None if policy is None else PolicyController(cars, policy)
     rng = np.random.default_rng(seeds[0])
     spread = noise * rng.random((len(seeds), 1))
     obs, _ = cars.reset(seed=list(seeds))
@@ -217,7 +196,7 @@ def distill(
         report(result)
         return policy
 
-    return imitate(model, tasks, config, save_round)
+    return _imitate(model, tasks, config, save_round)
 
 
 class _EpisodeBatches:

@@ -19,10 +19,10 @@ import numpy as np
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
-from ...estimators.learned.forward import ACTIVATIONS, RecurrentCell
-from ...estimators.learned.network import SUFFIX, Network
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_info import AnyEnv, CarEnv, get_env_facts
+from ..learned.forward import ACTIVATIONS, RecurrentCell
+from ..learned.network import SUFFIX, Network
 from ..learned.policy import Card, Policy, save_policy
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry
-from ...estimators.learned.forward import MemoryLayer, MovingAverages, RecurrentCell
-from ...estimators.learned.network import Network
+from ..learned.forward import MemoryLayer, MovingAverages, RecurrentCell
+from ..learned.network import Network
 
 with require_extra("train", "distillation needs torch"):
     import torch
@@ -111,18 +111,17 @@ def compute_scaling(
     drives: Sequence[Demonstrations],
     layout: Sequence[ObservationEntry],
     needs: Sequence[str],
-    usual_ages: bool = True,
 ) -> Scaling:
     """Compute the scaling of a student's inputs from drives.
 
     A student that has all of `needs` reads nothing else, which would only be noise to it. One that
-    has less reads all that varies, but for `_UNREAD`.
+    has less reads all that varies, but for `_UNREAD`. An age is scaled by its variation while
+    packets come.
 
     Args:
         drives: Demonstrations.
         layout: Entries of the observation.
         needs: Entries that the teacher reads.
-        usual_ages: Whether an age is scaled by its variation while packets come, not by all of it.
 
     Returns:
         Mean and factor, shape (k,), and mixing, shape (k, k).
@@ -132,7 +131,7 @@ def compute_scaling(
     is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, _UNREAD)
     mean, spread = x.mean(0, np.float64), x.std(0, dtype=np.float64)
     for i, name in enumerate(names):
-        if usual_ages and name.endswith("_age"):
+        if name.endswith("_age"):
             early, median = np.percentile(x[:, i], (_EARLY, _MEDIAN))
             if median > early:
                 mean[i], spread[i] = median, median - early
@@ -276,19 +275,18 @@ def _compute_weights(
     return torch.from_numpy(new), torch.from_numpy(old)
 
 
-def make_dense_layers(*sizes: int, activation: type[nn.Module] = nn.SiLU) -> nn.Sequential:
-    """Make dense layers with an activation between them.
+def make_dense_layers(*sizes: int) -> nn.Sequential:
+    """Make dense layers with SiLU units between them.
 
     Args:
         sizes: Sizes of the inputs and of each layer.
-        activation: Class of the activations.
 
     Returns:
         Layers, the last of which is linear.
     """
     layers: list[nn.Module] = []
     for a, b in itertools.pairwise(sizes):
-        layers += [nn.Linear(a, b), activation()]
+        layers += [nn.Linear(a, b), nn.SiLU()]
     return nn.Sequential(*layers[:-1])
 
 

@@ -17,9 +17,9 @@ from gymnasium.vector.utils import batch_space
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
-from ...estimators.learned.forward import CELL_WEIGHTS, MovingAverages
-from ...estimators.learned.network import Network
 from ..env_info import CarVectorEnv, get_layout
+from ..learned.forward import CELL_WEIGHTS, MovingAverages
+from ..learned.network import Network
 from ..learned.policy import Policy
 from ..rollout import iterate_steps
 from ..vec_env import Observations

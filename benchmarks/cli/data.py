@@ -47,7 +47,7 @@ def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "Signa
 
 
 def _parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
-    """Parse options by estimator, such as {"joint": {"members": 4}} from "joint.members=4"."""
+    """Parse options by estimator, such as {"joint": {"robust": 0.0}} from "joint.robust=0"."""
     options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
         ((key, value),) = parse_options([text]).items()

@@ -1,4 +1,4 @@
-"""Commands of learned policies and corrections: distill, enjoy, export, train-estimator."""
+"""Commands of learned policies: distill, enjoy, export."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,16 +13,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ... import __version__
 from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
 from .common import announce_torch, get_command_line, print_written, show_episode, write_output
-from .names import complete
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
+    from ...agents.learned.network import Network
     from ...agents.learned.policy import Policy
-    from ...estimators.learned.network import Network
 
 ENV = "sideslip/YawVision-v0"
 EPISODES = 256  # of a policy's test
@@ -224,55 +222,4 @@ class _Distill:
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
             distill(card, lessons.make_tasks(), config, target, show)
         console.print(make_task_table(target, self.kind, self.episodes))
-        print_written(console, target)
-
-
-@register("train-estimator", "Train a network that corrects a filter.")
-class _TrainEstimator:
-    """Train a correction of a filter; `learned` with `file=FILE` estimates with it."""
-
-    name: str = take_argument("Name of the file, NAME.safetensors.", ...)
-    base: str = take("The filter.", "exact-kf", autocompletion=complete("estimators"))
-    scenarios: Texts = take("Repeatable; default: of all scored contests.")
-    option: Texts = take("NAME=VALUE of the filter; repeatable.")
-    episodes: int = take("Episodes of each contest, driver and sensor set.", 32)
-    epochs: int = take("Passes over all samples.", 20)
-    seed: int = take("Of weights and episodes.", 0, min=0)
-    out: File = take("The file; default: NAME here.")
-
-    def run(self) -> None:
-        announce_torch()
-        from ...agents.training.corrections import READ, train_correction
-        from ...envs.sensors.slow import SENSOR_SETS
-        from ...estimators.learned.correction_file import CorrectionCard, save_correction
-        from ...estimators.make import make_estimator
-        from ..control.tasks import YAW, list_scored_tasks
-
-        target, console = self.out or Path(f"{self.name}.safetensors"), Console()
-        check_file(target, ".safetensors")
-        tasks = list_scored_tasks()
-        known = [item.scenario for item in tasks]
-        wanted = dict.fromkeys(self.scenarios or known)
-        drives = [(task.env_id, task.env_options) for task in tasks if task.scenario in wanted]
-        drives += [(YAW, {"scenario": item}) for item in wanted if item not in known]
-        both, options = SENSOR_SETS["fusion"], parse_options(self.option)
-        states = make_estimator(self.base, sensors=both, slow=list(both), **options).names
-        card = CorrectionCard(
-            base=self.base,
-            base_options=options,
-            states=tuple(item for item in READ if item in states),
-            scenarios=tuple(wanted),
-            seed=self.seed,
-            command=get_command_line(),
-            sideslip=__version__,
-        )
-        with use_shared_bar(console, f"train-estimator {self.name}") as bar:
-
-            def show(text: str) -> None:
-                bar.update(bar.task_ids[0], description=text)
-
-            correction = train_correction(card, drives, self.episodes, self.epochs, show)
-        save_correction(target, correction)
-        for what, number in correction.card.evaluation.items():
-            console.print(f"{what} on held-out seeds: {number:.4g}", highlight=False)
         print_written(console, target)

@@ -15,7 +15,6 @@ from ...agents.baselines import (
     FILTER,
     GRIP,
     STEER_WEIGHT,
-    TYRE_FILTER,
     Options,
     get_tuned_options,
     make_noise_options,
@@ -30,7 +29,6 @@ from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import short_repr
 from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
-from ...estimators.learned.correction_file import load_correction
 from ...estimators.vector import estimate, truth
 from ...estimators.wrappers.estimate import EstimateObservation
 from ...estimators.wrappers.truth import TruthObservation
@@ -48,7 +46,7 @@ from .tasks import (
 )
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
-REFERENCE_FILTER = "exact-kf, all sensors"
+REFERENCE_FILTER, JOINT = "exact-kf, all sensors", "joint"
 _BOTH = {"slow": ["camera", "gps"]}
 SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE_FILTER: ("exact-kf", _BOTH),
@@ -57,17 +55,12 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
     "multirate-kf, camera and gps": ("multirate-kf", _BOTH),
-    "joint": ("joint", _BOTH),
-    "joint, friction": ("joint", _BOTH | {"inverse_friction_sd": 0.3}),
-    "learned-joint": ("learned-joint", _BOTH),
+    JOINT: (JOINT, _BOTH),
 }
 """Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
-ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
-"""Adaptive controllers by the filter whose tyres they follow."""
-ESTIMATORS = (
-    *(name for name in SETUPS if name != "learned-joint"),
-    *("single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH),
-)
+ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")
+"""Controllers that follow the tyres of `JOINT`."""
+ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
@@ -127,7 +120,7 @@ class Entry:
     @property
     def is_default(self) -> bool:
         """Whether agents are compared on its estimator: none, the reference or the agent's own."""
-        follows = ADAPTIVE.get(self.estimator) == self.agent
+        follows = self.estimator == JOINT and self.agent in ADAPTIVE
         return self.estimator in ("", REFERENCE_FILTER) or follows or self in _POLICIES
 
     @property
@@ -138,11 +131,8 @@ class Entry:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Estimates that agents read: beta, gamma, and disturbances and tyres if there are any."""
-        base = self.filter_name.removeprefix("learned-")
-        row = FILTERS.get(base)  # a user's own has none
-        options = SETUPS.get(self.estimator, ("", {}))[1] | dict(row.options if row else ())
-        if row and base != self.filter_name:
-            options |= load_correction(base).card.base_options
+        row = FILTERS.get(self.filter_name)  # a user's own has none
+        options = dict(row.options if row else ())
         tyres = tuple(name for name in TYRES if f"{name}_sd" in options)
         return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()), *tyres)
 
@@ -220,7 +210,7 @@ class ControlCase(NamedTuple):
         default weight of added steering.
         """
         tuned = get_tuned_options(self.task.kind, name)
-        if self.task.tier and name not in ADAPTIVE.values():
+        if self.task.tier and name not in ADAPTIVE:
             tuned["filter"] = {}
             if name == NOMINAL:
                 tuned["controller"].pop("steer_weight", None)
@@ -256,14 +246,13 @@ class ControlCase(NamedTuple):
             if estimator == REFERENCE_FILTER:
                 sensors = gym.spec(self.task.env_id).kwargs["sensors"]
                 options = options | {"slow": list(SENSOR_SETS[sensors])}
-            if name in (FILTER, TYRE_FILTER):
+            if name == FILTER:
                 world = make_world(self.env_options.get("world", "ideal"))
                 scenario = make_scenario(self.env_options["scenario"])
-                levels = make_noise_options(scenario, world, name == TYRE_FILTER)
+                levels = make_noise_options(scenario, world)
                 # where nothing pushes, the filter's own level
                 levels = {key: x for key, x in levels.items() if key not in _PUSHES or x > 0.0}
-                is_tuned = name == FILTER or agent == ADAPTIVE.get(estimator)
-                options = levels | (self.options["filter"] if is_tuned else {}) | options
+                options = levels | self.options["filter"] | options
                 unused = set() if "gps" in options["slow"] else {"hdop_table"}
                 unused |= set() if "camera" in options["slow"] else {"camera_yaw_sd"}
                 if "accel_y" not in options.get("fast", ()):
@@ -323,7 +312,6 @@ def check_agent(agent: Agent, rows: int, width: int) -> Agent:
     return _CheckedAgent(agent, (rows, width))
 
 
-_CORRECTED = Entry("adaptive-nmpc", "learned-joint")  # on a filter with a network behind it
 LEARNED: dict[str, tuple[Entry, ...]] = {
     "car-steering": (Entry("distill-car-steering", "joint"), Entry("raw-car-steering")),
     "car-yaw": (Entry("distill-car-yaw", "joint"), Entry("raw-car-yaw")),
@@ -380,8 +368,8 @@ def make_cases(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[Co
         filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
         entries += [Entry(REFERENCE_CONTROLLER, name) for name in filters]
         entries += [Entry(name, REFERENCE_FILTER) for name in CONTROLLERS[task.env_id]]
-        entries += [Entry(name, reads) for reads, name in ADAPTIVE.items()]
-        entries += [_CORRECTED, *(LEARNED.get(task.kind, ()) if task.tier else ())]
+        entries += [Entry(name, JOINT) for name in ADAPTIVE]
+        entries += LEARNED.get(task.kind, ()) if task.tier else ()
         for case in (ControlCase(task, entry) for entry in entries):
             if not (quick and case.is_slow and not case.entry.is_oracle):
                 yield case

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from ...envs.scenarios.world import GROUPS, World, make_world
 from ..harness.stats import Estimate, average
-from .entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
+from .entries import JOINT, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .run import Results, measure
 from .score import rank_entries
 from .tasks import (
@@ -32,8 +32,8 @@ _FILTERS = ("exact-kf, gps", "exact-kf, camera", "bicycle-kf", "dakf")
 ENTRIES = (
     *map(Entry, (NOMINAL, PARAMETERS, STATE, "none")),
     *(Entry(name, REFERENCE_FILTER) for name in ("esc", "two-dof")),
-    Entry("adaptive-lqr", "joint"),
-    Entry("adaptive-nmpc", "joint, friction"),
+    Entry("adaptive-lqr", JOINT),
+    Entry("adaptive-nmpc", JOINT),
     *(Entry(REFERENCE_CONTROLLER, name) for name in _FILTERS),
 )
 """The entries whose order is checked."""

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from ...agents import baselines
+from ...agents.learned.network import SUFFIX
 from ...envs.io import from_json
 from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.ticks import TICK
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import VEHICLES
-from ...estimators.learned.network import SUFFIX
 from ..harness.results import read_objects
 
 YAW = "sideslip/YawFusion-v0"

@@ -150,11 +150,8 @@ class ProcedureEntry:
         return run_drive
 
 
-_TYRES = {"outputs": ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres"]}
-_FRICTION = {
-    "outputs": [*_TYRES["outputs"], "inverse_friction"],
-    "options": {"inverse_friction_sd": 0.3},
-}
+_OUTPUTS = ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres", "inverse_friction"]
+_TYRES = {"outputs": _OUTPUTS}
 _DISTILLED = {"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
 ENTRIES = (
     ProcedureEntry("none"),
@@ -163,7 +160,7 @@ ENTRIES = (
     ProcedureEntry("lqr", "exact-kf"),
     ProcedureEntry("esc"),
     ProcedureEntry("adaptive-lqr", "joint", _TYRES),
-    ProcedureEntry("adaptive-nmpc", "joint", _FRICTION, slow=True),
+    ProcedureEntry("adaptive-nmpc", "joint", _TYRES, slow=True),
     ProcedureEntry("distilled", policies=_DISTILLED),
 )
 

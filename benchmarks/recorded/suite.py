@@ -40,11 +40,10 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
     "dakf": ("gps",),
     "exact-kf": ("gps", "camera"),
     "joint": ("gps", "camera"),
-    "joint-robust": ("gps", "camera"),
 }
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
-_OWN_NOISE = "joint-robust"  # brings its levels along and finds the accelerometer's as it drives
+_OWN_NOISE = "joint"  # brings its levels along and finds the accelerometer's as it drives
 _MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
 _MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
 _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N_d")

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from ...envs.record import Array
 from ...estimators.filters import FILTERS
-from ...estimators.learned.correction_file import list_shipped
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
@@ -152,7 +151,7 @@ def add_filters(suite: Suite, effort: Effort) -> None:
     }
     header = ("", "one", "range", f"of {FEWER}", "range")
     fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
-    for name in (*FILTERS, *(f"learned-{base}" for base in list_shipped())):
+    for name in FILTERS:
         taken = measure_interleaved(envs | _make_filtered(name), fewer)
         bare, bare_many, one, many = (np.array(values) for values in taken.values())
         cells.append([name])

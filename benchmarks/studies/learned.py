@@ -14,7 +14,7 @@ import numpy as np
 
 from ...agents.rollout import compute_cost_ratios
 from ...envs.record import Array
-from ..control.entries import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Entry
+from ..control.entries import ADAPTIVE, CONTROLLERS, JOINT, LEARNED, REFERENCE_FILTER, Entry
 from ..control.run import DriveResult, Results, measure
 from ..control.score import FAILURE_RATIO, compute_log_ratios
 from ..control.tasks import (
@@ -42,7 +42,7 @@ from ..report.study import Request, Study
 TRAINED = "as trained"
 EPISODES = 32, 4  # of a usual and of a quick run
 _PAPERS = ("two-dof", "model-following")
-RIVALS = tuple(ADAPTIVE.values())
+RIVALS = ADAPTIVE
 """Against whom episodes are counted, beside nominal and the papers'."""
 _MIN_SCORED_GAP = 0.1  # mean log ratio from nominal to oracle-parameters, of which there are shares
 _LEVELS = np.geomspace(0.1, 10.0, 41)
@@ -83,7 +83,7 @@ def list_entries(kind: str) -> list[Entry]:
     """
     available = CONTROLLERS[_select_tasks(kind)[0].env_id]
     classics = [Entry(name, REFERENCE_FILTER) for name in _PAPERS if name in available]
-    adaptive = [Entry(name, reads) for reads, name in ADAPTIVE.items()]
+    adaptive = [Entry(name, JOINT) for name in ADAPTIVE]
     return [Entry(NOMINAL), Entry(PARAMETERS), *classics, *adaptive, *LEARNED[kind]]
 
 

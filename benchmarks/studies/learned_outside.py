@@ -18,7 +18,7 @@ from ...agents.rollout import iterate_steps
 from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...estimators.registry import describe_error
-from ..control.entries import ADAPTIVE, LEARNED
+from ..control.entries import LEARNED
 from ..control.run import NUMBERS, Chunk, DriveResult, measure
 from ..control.tasks import (
     NOMINAL,
@@ -47,7 +47,7 @@ KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
 """Classes whose car is about as large and as fast as the BMW."""
 MANOEUVRE = "any-friction-sine-with-dwell"
 """The scenario of every class that ends with the initial heading, as a straight road needs."""
-_RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
+_RIVALS = (NOMINAL, "adaptive-nmpc")
 """Controllers by whose costs all costs are divided: no gap between oracles scales scores here."""
 
 

@@ -19,7 +19,7 @@ from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
 from ...estimators.vector.estimate import EstimateObservation
-from ..control.entries import ADAPTIVE, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
+from ..control.entries import ADAPTIVE, JOINT, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import (
@@ -199,16 +199,17 @@ def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation
     return result
 
 
-_JOINT, _RIVAL = "joint, friction", "adaptive-nmpc"
+_RIVAL = "adaptive-nmpc"
 _OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
            "inverse_friction")  # fmt: skip
+_ESTIMATE_OPTIONS: JsonMap = {"outputs": list(_OUTPUTS), "std": True}
 """States that a student on `joint` reads, with standard deviations."""
 VARIED = {"tyres": (0.4, 2.0), "wind": (-500.0, 500.0), "mass": (0.8, 1.3)}
 VARIED |= {"camera": (0.01, 0.12), "out": (2.0, 6.0)}
 """Drawn in each episode: factors on each axle's tyres, side wind (N); once a lesson: a factor on
 the true car's mass, how late its camera is (s), how long its GPS or its camera is out (s)."""
 _WITHOUT_FILTER = (*ORACLE_NAMES, *(name for names in ORACLES.values() for name in names))
-FILTERS = ("", "joint")
+FILTERS = ("", JOINT)
 
 
 def _list_tasks(kind: str) -> list[ControlTask]:
@@ -246,8 +247,7 @@ class Lessons:
     kind: str  # class of tasks
     estimator: str = ""  # that the student reads, one of `FILTERS`
     teacher: str = _RIVAL
-    """Baseline, controller with its filter of the benchmark, or policy with its card's. The student
-    shares a teacher's filter where that is `joint`."""
+    """Baseline, controller with its filter of the benchmark, or policy with its card's."""
     cars: int = 6  # of each task's lesson
     varied: int = 0
     """Further lessons of each task by `VARIED`, which share as many cars, rounded up; no filter and
@@ -270,7 +270,7 @@ class Lessons:
             Card.
         """
         first = _list_tasks(self.kind)[0]
-        options = self._make_estimate_options(first) if self.estimator else {}
+        options = _ESTIMATE_OPTIONS if self.estimator else {}
         env_options = first.env_options | dict(self.observation_options)
         return Card.from_env_id(first.env_id, env_options, self.estimator, options, **rest)
 
@@ -279,8 +279,7 @@ class Lessons:
         from ...agents.training.distill import DistillTask
 
         rng, teacher, lessons = np.random.default_rng(self.seed), self.teacher, []
-        reads = {controller: name for name, controller in ADAPTIVE.items()}
-        reads |= dict.fromkeys(_WITHOUT_FILTER, "")
+        reads = dict.fromkeys(ADAPTIVE, JOINT) | dict.fromkeys(_WITHOUT_FILTER, "")
         if is_policy(teacher):
             reads[teacher] = load_policy(teacher).card.estimator
         for task in _list_tasks(self.kind):
@@ -296,20 +295,9 @@ class Lessons:
                 options = task.env_options | scenario_options | dict(self.observation_options)
                 env: Any = gym.make_vec(task.env_id, num_envs=count, **options)
                 if self.estimator:
-                    estimate_options = self._make_estimate_options(task)
-                    env = EstimateObservation(env, self.estimator, **estimate_options)
+                    env = EstimateObservation(env, self.estimator, **_ESTIMATE_OPTIONS)
                 lessons.append(DistillTask(env, twins, agent))
         return lessons
-
-    def _make_estimate_options(self, task: ControlTask) -> JsonMap:
-        """The filter of a teacher on `joint`, else of the rival's, with more of its states."""
-        filters = {controller: name for name, controller in ADAPTIVE.items()}
-        controller = self.teacher if self.teacher in filters else _RIVAL
-        entry = Entry(controller, filters[controller])
-        options = ControlCase(task, entry).estimate_options["options"]
-        has_friction = "inverse_friction_sd" in options
-        known = [name for name in _OUTPUTS if name != "inverse_friction" or has_friction]
-        return {"outputs": known, "std": True, "options": options}
 
 
 def prepare_start(
@@ -385,7 +373,7 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     entries = {
         "policy": Entry(str(path), policy.card.estimator),
         NOMINAL: Entry(NOMINAL),
-        _RIVAL: Entry(_RIVAL, _JOINT),
+        _RIVAL: Entry(_RIVAL, JOINT),
         PARAMETERS: Entry(PARAMETERS),
     }
     results = {name: run_chunk(Chunk(task, entry, seeds)) for name, entry in entries.items()}

@@ -23,7 +23,7 @@ from ...agents.design.pi import POLE
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import Array
 from ...envs.validation import check_choice
-from ..control.entries import ADAPTIVE, REFERENCE_FILTER, Entry
+from ..control.entries import ADAPTIVE, JOINT, REFERENCE_FILTER, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import ControlTask, list_candidates, list_scored_tasks
@@ -65,7 +65,7 @@ _BOTH_TIMES = _TIME._replace(of=("filter", "controller"))
 _MPC = (*_LEVELS, _BOTH_TIMES, _GRIP)
 _LQG = (*_MPC, _STEER)
 _NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _STEER._replace(start=10.0))  # s
-_ADAPTIVE = (*_LEVELS[:2], _LEVELS[-1], _BOTH_TIMES, _GRIP)
+_ADAPTIVE = (_TIME._replace(of=("controller",)), _GRIP)
 
 SPACES: dict[str, tuple[SearchNumber, ...]] = {
     "two-dof": (
@@ -188,8 +188,7 @@ def _run_contestant(
     contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
     """Run a controller on a task with some options, an episode for each seed."""
-    follows = {controller: estimator for estimator, controller in ADAPTIVE.items()}
-    estimator = "" if name in ORACLES else follows.get(name, REFERENCE_FILTER)
+    estimator = "" if name in ORACLES else JOINT if name in ADAPTIVE else REFERENCE_FILTER
     return run_chunk(Chunk(contest, Entry(name, estimator, options), seeds))
 
 

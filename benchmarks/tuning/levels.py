@@ -1,4 +1,4 @@
-"""Levels of `joint-robust`, found on simulated cars of world v1 by a log score.
+"""Levels of `joint`, found on simulated cars of world v1 by a log score.
 
 `python -m sideslip.benchmarks.tuning.levels --trials 2000 --out levels.json` goes on from the
 levels in use. Every drive has a car, errors of sensors and of the data sheet, a road and an event
@@ -34,7 +34,7 @@ from ..harness.drives import SETTLED, LoggedEpisode, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
 
-NAME = "joint-robust"
+NAME = "joint"
 _SEARCHED = (
     *("q_front_tyres", "front_tyres_sd", "inverse_friction_sd", "q_inverse_friction"),
     *("force_share", "moment_share", "disturbance_time", "moment_time", "model_error"),
@@ -181,7 +181,7 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
 
 
 def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[Array, Array]:
-    """Run `joint-robust` over a drive.
+    """Run `joint` over a drive.
 
     Args:
         episode: A drive of `draw_drive`.
@@ -300,7 +300,7 @@ def main(
     out: Annotated[Path, typer.Option(help="JSON for the levels.")] = Path("levels.json"),
     jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
 ) -> None:
-    """Search the levels of `joint-robust` and write them."""
+    """Search the levels of `joint` and write them."""
     first = get_levels() if start is None else json.loads(start.read_text(encoding="utf-8"))
     best, score, before = search(first, trials, drives, jobs, Console())
     levels = {name: float(f"{value:.3g}") for name, value in best.items()}

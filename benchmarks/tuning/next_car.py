@@ -1,4 +1,4 @@
-"""What each part of `joint-robust` is worth on cars that its levels were not found on.
+"""What each part of `joint` is worth on cars that its levels were not found on.
 
 `python -m sideslip.benchmarks.tuning.next_car --drives 250 --out docs/next_car.json` runs filters
 with one part less over drives of `levels.draw_drive` with other seeds.
@@ -24,7 +24,7 @@ from .levels import draw_drive, run_filter
 FIRST_SEED = 100_000  # no drive of the search
 _NO_TYRES = {"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "inverse_friction_sd": 0.0}
 PARTS: dict[str, Mapping[str, object]] = {
-    "joint-robust": {},
+    "joint": {},
     "without the accelerometer": {"fast": ("gyro",)},
     "without a time of the moment's own": {"moment_time": 0.0},
     "without noise found while driving": {"noise_time": 0.0},
@@ -57,7 +57,7 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON for the table.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
 ) -> None:
-    """Compare `joint-robust` with itself, one part less at a time."""
+    """Compare `joint` with itself, one part less at a time."""
     console, names = Console(), tuple(PARTS)
     seeds = range(FIRST_SEED, FIRST_SEED + drives)
     judged = run_cases(partial(_measure, names=names), seeds, "the next car", jobs, console)

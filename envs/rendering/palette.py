@@ -20,8 +20,7 @@ FILTERS = {
     "dakf": "#994824", "double-layer": "#096C5A", "lob-2": "#7587C6", "roll-kf": "#BD5A24",
     "kinematic-velocity-kf": "#F35190", "dual-rate": "#36B4CF", "lob": "#633FE1",
     "yaw-moment-observer": "#996C6C", "lateral-force-observer": "#EA9048", "exact-kf": "#0075B4",
-    "joint": "#1B9E1B", "joint-robust": "#127F12", "learned": "#7A9E1B",
-    "learned-exact-kf": "#3F9E90", "learned-joint": "#9AA536",
+    "joint": "#1B9E1B",
 }  # fmt: skip
 CONTROLLERS = {
     "none": GREY, "feedforward": "#C6A200", "two-dof": "#CF75AB", "model-following": "#1BBD75",

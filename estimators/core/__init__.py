@@ -5,6 +5,5 @@ sensor and no filter by name: `design` writes the numbers that it runs on.
 
 A tick: `predict` reads the row, predicts and corrects by the fast sensors, with `model` as the
 transition; `packets` judges what arrives and finds the state it belongs to, `update` corrects by
-it. `covariance` and `innovation` have the Kalman filter's equations, `multiple_model` what several
-records do together: double-layer's second one, and a bank.
+it. `covariance` and `innovation` have the Kalman filter's equations.
 """

@@ -6,8 +6,6 @@ a gain is a division. One filter's memory is a record of numbers; that of severa
 (`vector.lanes`) has fields of the same names, whose columns come one by one.
 """
 
-from math import log
-
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.packed import load_element
 from ...envs.numerics.primitives import Scalar, Vector, absolute, any_lane, select, sqrt
@@ -221,19 +219,3 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
     for j in range(f.total):
         f.PC[j] = f.P[first + i, j]
     return f.PC[first + i]
-
-
-@jit
-def update_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
-    """Correct as `correct_scalar` does, and update the log-likelihood of a bank's member.
-
-    The logarithm changes by -(residual^2 / s + log s) / 2.
-
-    Args:
-        f: Memory of the filter with P C^T of the measurement.
-        variance: Variance s of the residual.
-        residual: Measurement minus its prediction.
-    """
-    if f.members > 0:
-        f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
-    correct_scalar(f, variance, residual)

@@ -1,7 +1,6 @@
 """The filter itself, compiled: fast rows and packets in, states out.
 
-Layers are the records of an estimator: one filter, the two of double-layer-gps, or the mixture and
-the members of a bank.
+Layers are the records of an estimator: one filter, or the two of double-layer-gps.
 
 A tick first holds what was captured at the last tick, and predicts from there with the inputs of
 this row. Then the fast sensors correct the state, and after them the packets that arrive. A
@@ -17,7 +16,6 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import BETA, CURVATURE, LATERAL, build_model, is_finite
-from .multiple_model import compute_mixture, replace_least_likely
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
@@ -63,7 +61,6 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
         f.recent[i, PACKET.captured] = -1  # an empty place
     for i in range(len(f.keep)):
         f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
-    f.weight, f.fresh = f.odds, 0.0
     _fill(f.surprise, 1.0)
     if f.r_share > 0.0:
         f.blocks, f.block_rows = 0, 0
@@ -194,23 +191,10 @@ def _update_second_layer(
 
 
 @jit
-def _first_member(layers: FilterRecords) -> int:
-    """Return the index of the first layer that takes measurements: 1 in a bank, else 0."""
-    return 1 if layers[0].members > 0 else 0
-
-
-@jit
-def _process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """Process a packet by every member behind the first one."""
-    for m in range(2, len(layers)):
-        process_packet(layers[m], gains, packet)
-
-
-@jit
 def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: Matrix) -> None:
-    """Write states and deviations of all layers, or of a bank's mixture, in row j of X and S."""
+    """Write states and deviations of all layers in row j of X and S."""
     column = 0
-    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
+    for layer in range(len(layers)):
         f = layers[layer]
         for i in range(f.n):
             X[j, column] = f.x[i]
@@ -220,7 +204,7 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
 
 @jit
 def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
-    """Write the states of all layers, or of a bank's mixture, and their covariance.
+    """Write the states of all layers and their covariance.
 
     Args:
         layers: Memory of the estimator, shape (layers,).
@@ -234,7 +218,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
     offset, f = 0, layers[0]
     if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
         return False
-    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
+    for layer in range(len(layers)):
         f = layers[layer]
         for i in range(f.n):
             x[offset + i] = f.x[i]
@@ -261,8 +245,7 @@ def advance(
     """Process the fast rows from `start` to `rows` and the first `count` packets.
 
     Args:
-        layers: Memory, shape (1,); (2,), of which the second measures what the first estimates; or
-            a bank, the mixture and its members.
+        layers: Memory, shape (1,); or (2,), of which the second measures what the first estimates.
         gains: Tables of gains of the first layer, shape (cells, rows, columns).
         fast: Fast rows, shape (rows or more, FAST_WIDTH).
         rows: Number of fast rows.
@@ -276,8 +259,7 @@ def advance(
     Returns:
         Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
-    first = _first_member(layers)
-    f = layers[first]
+    f = layers[0]
     position, end_tick = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
         wheel_speed = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
@@ -286,7 +268,7 @@ def advance(
             if gains[cell, 0, 0] == 0.0:
                 f.wanted, f.cursor = cell, position
                 return j
-        for layer in range(first, len(layers)):
+        for layer in range(len(layers)):
             read_fast_row(layers[layer], fast[j], wheel_speed)
             run_tick(layers[layer], gains)
         # a packet waits only if it arrives at a later tick of this call; due, overdue or beyond the
@@ -295,15 +277,9 @@ def advance(
             was_kept = process_packet(f, gains, packets[position])
             if len(nis) > 0:
                 nis[position] = f.nis
-            if first > 0:
-                _process_packet_members(layers, gains, packets[position])
-            elif was_kept and len(layers) > 1:
+            if was_kept and len(layers) > 1:
                 _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
-        if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            replace_least_likely(layers)
-        if first > 0 and (len(X) > 0 or j == rows - 1):
-            compute_mixture(layers)
         if len(X) > 0:
             _write_row(layers, gains, j, X, S)
     f.counts[COUNTERS.future] += count - position  # packets of a call without rows
@@ -353,9 +329,5 @@ def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector)
         gains: Tables of gains, shape (cells, rows, columns).
         packet: Packet, shape (PACKET_WIDTH,).
     """
-    if _first_member(layers) > 0:
-        process_packet(layers[1], gains, packet)
-        _process_packet_members(layers, gains, packet)
-        compute_mixture(layers)
-    elif process_packet(layers[0], gains, packet) and len(layers) > 1:
+    if process_packet(layers[0], gains, packet) and len(layers) > 1:
         _update_second_layer(layers[0], layers[1], gains, packet)

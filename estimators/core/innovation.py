@@ -5,13 +5,11 @@ show that the filter is wrong, or that what is measured has jumped, as a flipped
 then the state that only this sensor measures is forgotten by as much as the residual.
 """
 
-from math import log
-
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Scalar, Vector, minimum, sqrt
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, project, project_row, update_scalar
+from .covariance import correct_scalar, dot, predict_measurement, project, project_row
 from .model import compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 
@@ -64,7 +62,7 @@ def _update_covariance(f: FilterRecord, s: int) -> None:
         row = f.C[s, i]
         f.larsen_expected[s, i] = predict_measurement(f, s, i)
         r = compute_row_variance(f, s, i, f.speed_before)
-        update_scalar(f, project(f, row) + r, 0.0)
+        correct_scalar(f, project(f, row) + r, 0.0)
         for j in range(i):
             _propagate_gain(f, s, j, row)
         for k in range(f.n):
@@ -352,11 +350,6 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
     if f.wary == 0:
         return passed
     if not passed and f.believed[s] >= 0:
-        # a member that refuses would gain: it loses (gate + log det S) / 2, as at the gate
-        if f.members > 0:
-            f.weight -= 0.5 * f.gate[f.rows[s]]
-            for i in range(f.rows[s]):
-                f.weight -= log(f.S[i, i])
         if f.doubts[s] == 0 or not _is_consistent(f, s):
             f.doubts[s], f.doubted[s] = 0, f.tick
         f.doubts[s] += 1

@@ -159,11 +159,10 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
     total_force, moves = 0.0, f.speed > MIN_SPEED
-    for i in range(3 if f.grip > 0 else 2):  # tyres walk while the car moves, a new member's more
+    for i in range(3 if f.grip > 0 else 2):  # tyres walk while the car moves
         index = f.tyres + i if i < 2 else f.grip
         walks = moves and f.P[index, index] < f.prior[index, index]
-        extra = f.fresh if i < 2 else 0.0
-        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
+        f.Q[index, index] = f.q_tyres[i] if walks else 0.0
     if f.mapped > 0:  # a map that is late errs by the road's turn in that time
         error = f.map_lag * V * f.u[CURVATURE]
         share = 1.0 - f.decay[f.mapped] * f.decay[f.mapped]

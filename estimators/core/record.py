@@ -121,16 +121,6 @@ _FIELDS = [
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
     ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
-    # bank: several filters beside each other, of which the first record is the mixture
-    ("members", _INT),  # records behind the mixture; 0: no bank
-    ("weight", _FLOAT),  # logarithm of a member's likelihood
-    ("odds", _FLOAT),  # its weight at the start
-    ("respawn", _INT),  # ticks after which the least likely member begins anew
-    ("hazard", _FLOAT),  # log of the probability that tyres change within `respawn`
-    ("level", _FLOAT, (2,)),  # a member's variances of force, moment over those configured
-    ("spread", _FLOAT),  # variance by which a new member forgets the tyres
-    ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
-    ("alert", _FLOAT),  # value of `fresh` for a new member
     # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
@@ -281,7 +271,7 @@ def _count_numbers(row: Any) -> int:
 
 
 _LEADING = (  # fields of a record that a tick in lanes reads or writes, side by side
-    *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
+    *("n", "total", "periodic", "measured", "speed", "speed_before", "model_speed"),
     *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
     *("y", "u", "counts"),
     *("x", "P"),

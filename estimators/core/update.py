@@ -14,7 +14,7 @@ from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, project, project_row, update_scalar
+from .covariance import correct_scalar, dot, predict_measurement, project, project_row
 from .innovation import (
     BUFFER,
     CONSTANT,
@@ -109,7 +109,7 @@ def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> N
             f.x[j] -= f.share[m + i, j] * f.eps[m + i]
     for i in range(rows):
         r = compute_packet_variance(f, s, i, packet)
-        update_scalar(f, project_row(f, s, i, first) + r, 0.0)
+        correct_scalar(f, project_row(f, s, i, first) + r, 0.0)
         for k in range(i):  # the rows before it correct what it measures
             correction = _apply_row(f, s, i, f.share[m + k])
             for j in range(N):
@@ -212,7 +212,7 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
             sample_scale = (residual * residual - projected) / r * f.scale[s, i]
             scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
             f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
-        update_scalar(f, project_row(f, s, i, first) + r, residual)
+        correct_scalar(f, project_row(f, s, i, first) + r, residual)
         _reduce_residuals(f, s, first, i, f.gain)
         if f.late == LARSEN:
             propagate_larsen_gains(f, f.C[s, i])
@@ -364,7 +364,7 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
         variance = projected + f.r_fast[i]
         if f.r_share > 0.0:
             note_surprise(f, 0, residual * residual / variance, f.step / f.fasts)
-        update_scalar(f, variance, residual)
+        correct_scalar(f, variance, residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
         if f.between == PSEUDO:

@@ -13,7 +13,6 @@ from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import innovation as rule
 from ..core import record as size
 from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
-from ..core.multiple_model import MIN_LOG_WEIGHT
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from . import models
 from .kalman import kalman_gain
@@ -99,11 +98,6 @@ _BLOCK_TIME = 0.2  # s of a block whose mean innovations show the fast sensors' 
 _SMOOTHING_TIME = 0.015  # s, time constant of the low-pass on the measured speed
 _MAX_SPEED = 80.0  # m/s, speed of the last table of gains
 _SPACING = 0.5  # m/s between two tables of gains
-REPLACE_TIME = 0.5  # s between two replacements of a bank's least likely member
-HAZARD = 0.2  # 1/s, rate at which tyres change
-_TYRE_VARIANCE = 0.06  # variance that a change adds to the factors on the stiffness
-# 1/s, variance per second of a new member's factors until the next one: the change may be later
-_TYRE_WALK = 0.02
 
 
 def assemble(
@@ -148,27 +142,7 @@ def assemble(
         _write_rules(f, config, planned)
         _check_window(f, config)
     layers[0].store_predictions |= len(layers) > 1
-    return _build_bank(layers, config, dt), planned
-
-
-def _build_bank(layers: FilterRecords, config: FilterConfig, dt: float) -> FilterRecords:
-    """Build the mixture and the members of a bank of the filter; the filter itself without one."""
-    if config.members < 2:
-        return layers
-    f = layers[0]
-    f.members, f.respawn, f.spread = config.members, round(REPLACE_TIME / dt), _TYRE_VARIANCE
-    f.hazard, f.level[:], f.alert = math.log(HAZARD * REPLACE_TIME), 1.0, _TYRE_WALK * f.step
-    bank = np.repeat(layers, 1 + config.members).view(np.recarray)
-    for m, f in enumerate(bank[1:]):
-        # of two members with equal levels the later one is replaced first
-        f.odds = MIN_LOG_WEIGHT if m >= len(config.levels) else 0.0
-        f.level[:] = np.square(config.levels[m % len(config.levels)])
-        if f.forces:
-            both = range(f.dense, f.dense + 2)
-            f.q_known *= f.level
-            f.Q[both, both] *= f.level
-            f.prior[both, both] *= f.level
-    return bank
+    return layers, planned
 
 
 def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:

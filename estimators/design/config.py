@@ -20,7 +20,6 @@ from .models import BIASES, SCALE, STATES, TYRES, WANDER
 from .options import (
     FAST_CHANNELS,
     FIND,
-    MAX_MEMBERS,
     NOISE,
     NOT_NEGATIVE,
     NUMBER,
@@ -164,7 +163,6 @@ def parse_config(
     Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     chosen |= reader.read(*_NUMBERS) | _parse_gate(chosen["delay"], reader)
-    chosen |= _parse_bank(states, first.forces, chosen["delay"], reader)
     chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
     prior = _parse_prior(states, first.forces, chosen, reader)
     reader.check_unread()
@@ -322,23 +320,6 @@ def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[flo
         expected = f"is 2 to {N_KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
         raise reader.make_error("hdop_table", expected, table)
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
-
-
-def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader) -> _Values:
-    """Parse `members` and `levels`."""
-    value = reader.read_raw("levels", (1.0,))
-    levels = reader.read_array("levels", value)
-    pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
-    fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= MAX_MEMBERS
-    if not (fits and (pairs > 0.0).all() and np.isfinite(pairs).all()):
-        expected = f"are 1 to {MAX_MEMBERS} positive factors or pairs"
-        raise reader.make_error("levels", expected, value)
-    count = reader.read("members", default=len(pairs))["members"]
-    if count > 1 and TYRES[0] not in states:
-        raise reader.make_error("members", "is 1 where tyres are known", count)
-    if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
-        raise reader.make_error("levels", "need disturbances='forces' and a member each", value)
-    return {"members": int(count), "levels": pairs}
 
 
 def _parse_process_noise(

@@ -34,7 +34,6 @@ FAST_CHANNELS: dict[str, tuple[int, ...]] = {
 }
 """The columns of a fast row that are late together."""
 FIND = "find"
-MAX_MEMBERS = 8
 NOISE = {
     "gyro_noise": 0.005,  # rad/s
     "accel_y_noise": 0.1,  # m/s2
@@ -89,9 +88,6 @@ NOT_NEGATIVE = NumberRule("is in {unit} and not negative", lambda v: 0.0 <= v < 
 _PROBABILITY = NumberRule("is a probability between 0 and 1", lambda v: 0.0 < v < 1.0)
 _FRACTION = NumberRule("is a share from 0 to 1", lambda v: 0.0 <= v < 1.0)
 _SAMPLES = NumberRule("is a number of samples", lambda v: v in range(1000))
-_FILTERS = NumberRule(
-    f"is a number of filters from 1 to {MAX_MEMBERS}", lambda v: v in range(1, MAX_MEMBERS + 1)
-)
 _Field = Any  # a field, which stands for its default
 
 
@@ -169,12 +165,6 @@ class FilterOptions:
     moment_sd: float = _make(20.0, "of disturbances that are forces", "N m", POSITIVE)
     disturbance_time: float = _make(0.3, "time constant of both", "s", POSITIVE)
     moment_time: float = _add("time constant of the moment; 0: disturbance_time", "s")
-    members: int = _make(
-        1, "filters of which the least likely forgets the tyres twice a second", limits=_FILTERS
-    )
-    levels: npt.ArrayLike = _make(  # noqa: RUF009
-        (1.0,), "factors on force_sd, moment_sd, or pairs, of members in turn"
-    )
     gate: float | None = _make(
         None, "a sample less likely than 1 - gate is skipped; with wary 1 - 1e-9", "", _PROBABILITY
     )
@@ -186,7 +176,7 @@ class FilterOptions:
     )
     adapt: float = _make(0.0, "fraction of an innovation in R; 0: R as set", limits=_FRACTION)
     latency: Mapping[str, float | str] = _make(
-        None, f"of late channels, {{'gyro': 0.06}}; {FIND!r}: joint finds one of them", "s"
+        None, f"of late channels, {{'gyro': 0.06}}; {FIND!r}: a filter with tyres finds one", "s"
     )
     prior: Mapping[str, float] = _make(None, "standard deviations at the start, by state")
     allow_unstable: bool = _make(False, "build a filter whose error grows")
@@ -221,7 +211,6 @@ class FilterConfig(FilterOptions):
     sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
     models: tuple[FilterModel, ...]  # of each layer
     Q: Array  # (n, n) per second, of the states of all layers
-    levels: Array  # (count, 2), of force_sd and moment_sd
     noise_over_speed: Mapping[str, float]  # of those that grow as 1/V, times V in m/s
 
     @property
@@ -243,6 +232,4 @@ class FilterConfig(FilterOptions):
             for model in self.models
         )
         prior = {name: self.prior[name] for name in self.states if name not in NONLINEAR}
-        return replace(
-            config, models=layers, Q=self.Q[np.ix_(linear, linear)], prior=prior, members=1
-        )
+        return replace(config, models=layers, Q=self.Q[np.ix_(linear, linear)], prior=prior)

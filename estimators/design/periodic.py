@@ -15,7 +15,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
-from ..core.covariance import project_row, update_scalar
+from ..core.covariance import correct_scalar, project_row
 from ..core.filter import reset_filters, run_tick
 from ..core.innovation import CLONE, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
 from ..core.record import FilterRecord, FilterRecords, GainTables
@@ -115,7 +115,7 @@ def _iterate_gains(
                 for i in range(N):
                     _copy_gain(f.P[i], before[i], N)
                 for i in range(f.rows[s]):
-                    update_scalar(f, project_row(f, s, i, first) + f.r[s, i], 0.0)
+                    correct_scalar(f, project_row(f, s, i, first) + f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
                     change = maximum(change, _copy_gain(f.gain, to, N))
             k = N

@@ -18,7 +18,6 @@ from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS
-from ..learned.correction import LearnedEstimator
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
 from ..registry import find_entry_point
@@ -381,9 +380,6 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
                 if done == record.rows:  # 0 after a bad action that failed
                     break  # else a table of gains is missing
                 estimator.design_missing()
-        elif isinstance(inner := getattr(estimator, "inner", None), LearnedEstimator):
-            memory = inner.base.filters, inner.base.gains
-            compile_observe(corrected=True)(*memory, record, inner.memory, inner.net, observed)
         else:
             estimator.step(record.fast[: record.rows], record.packets[: record.count])
             write_outputs(estimator, observed)

@@ -17,7 +17,6 @@ from ..core.filter import advance, compute_deviation, read_covariance
 from ..core.record import FILTER, FilterRecord, GainTables
 from ..core.update import is_healthy
 from ..estimator import compile_call
-from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 from ..protocol import EstimatorLike, compute_std
 
 BETA, STD, NEES, HEALTHY = range(4)  # places in the summary of a step
@@ -168,45 +167,15 @@ def observe(
     f = filters[0]
     summary[0], summary[1] = f.x[0], compute_deviation(f, gains, 0)
     summary[2] = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
-    summary[3] = 1.0 if is_healthy(filters[1 if f.members > 0 else 0]) else 0.0
+    summary[3] = 1.0 if is_healthy(f) else 0.0
     return done
 
 
-@jit
-def observe_corrected(
-    filters: Vector, gains: Matrix, record: StepRecord, m: Vector, net: Any, observed: Observed
-) -> None:
-    """Call `filter_and_correct`, and write the sums as `observe` does.
-
-    Args:
-        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        record: Record to process.
-        m: Memory of the correction, shape (memory_size,).
-        net: Network, as `learned.correction` packs it.
-        observed: Observation and outputs.
-    """
-    fast, rows, packets, count = record
-    filter_and_correct(filters, gains, fast, rows, packets, count, m, net)
-    apply_correction(filters[0], m, net)
-    observe(filters, gains, StepRecord(fast, 0, packets, 0), 0, observed)
-    remove_correction(filters[0], m, net)
-
-
 @cache
-def compile_observe(corrected: bool = False) -> Any:
-    """Return `observe`, or `observe_corrected`, as a plain call.
-
-    Args:
-        corrected: Whether it is `observe_corrected`.
-
-    Returns:
-        A callable with the same positional arguments.
-    """
+def compile_observe() -> Any:
+    """Return `observe` as a plain call with the same positional arguments."""
     small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
     memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), StepRecord(matrix, 0, matrix, 0)
     table = OutputTable(0, np.zeros((1, 3), np.int64), wide)
     observed = Observed(small, table, 0.0, 0.0, small, wide)
-    if corrected:
-        return compile_call(observe_corrected, *memory, record, wide, EXAMPLE, observed)
     return compile_call(observe, *memory, record, 0, observed)

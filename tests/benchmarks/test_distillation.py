@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Policy, save_policy
 from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.control.entries import ADAPTIVE, ControlCase, Entry
@@ -22,7 +23,6 @@ from sideslip.benchmarks.studies.policies import (
     prepare_start,
 )
 from sideslip.envs.vehicle.parameters import VEHICLES
-from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
 
@@ -57,7 +57,7 @@ def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contes
     assert not set(seen) & ControlCase(contest, Entry("distill-coms-yaw")).env_options.keys()
 
 
-@pytest.mark.parametrize("teacher", ADAPTIVE.values())
+@pytest.mark.parametrize("teacher", ADAPTIVE)
 def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
     """To the bit, or it would learn to guess what its teacher's filter says."""
     cars, twins, agent = Lessons("coms-zero-slip", "joint", teacher, 2).make_tasks()[0]

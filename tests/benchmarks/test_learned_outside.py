@@ -12,7 +12,6 @@ pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control.entries import (
-    ADAPTIVE,
     LEARNED,
     ControlCase,
     Entry,
@@ -112,7 +111,7 @@ def driven_at(costs: Any, failed: Any = 0.0) -> DriveResult:
 
 def test_ratios_are_paired_over_each_rival_and_a_failure_counts() -> None:
     policy = LEARNED["car-yaw"][0].agent
-    planner = ADAPTIVE["joint, friction"]
+    planner = "adaptive-nmpc"
     rng, found = np.random.default_rng(0), TransferResult("car-yaw")
     for model in OUTSIDE_PLANTS:
         nominal = rng.uniform(100.0, 200.0, 400)

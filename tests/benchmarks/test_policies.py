@@ -10,6 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
+from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, list_shipped, load_policy, save_policy
 from sideslip.benchmarks.control import tables, tasks
 from sideslip.benchmarks.control.entries import (
@@ -21,7 +22,6 @@ from sideslip.benchmarks.control.run import Chunk, make_storage, run_chunk
 from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
 from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation
-from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
 SHORT = {"base": "random-steering", "duration": 1.5}

@@ -22,6 +22,8 @@ NOISE = {"camera": (3.5e-3, 0.02), "gps": (math.radians(0.14) * 60.0 / 3.6,)}  #
 MEASURED = {"camera": (("psi",), ("y_l",)), "gps": (("beta", "psi"),)}
 GYRO = 0.005
 FAST_SD = {"gyro": GYRO, "accel_y": 0.1, "roll_rate": 0.005}
+WITH_TYRES = {"front_tyres_sd": 0.23, "rear_tyres_sd": 0.23, "wary": 10}
+"""Options with which `exact-kf` has tyres among its states and refuses what contradicts it."""
 ARM = COMS.rear_track / (2.0 * COMS.wheel_radius)
 
 

@@ -27,7 +27,7 @@ def log() -> Log:
             [0, 1],
             marks=pytest.mark.filterwarnings("ignore:double-layer cannot see"),
         ),
-        ("joint", {"members": 3}, [0]),  # of a bank the mixture
+        ("joint", {}, [0]),
     ],
 )
 def test_it_is_that_of_the_records(

@@ -9,6 +9,7 @@ import pytest
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.estimators import make_estimator
 from sideslip.estimators.delayed_channels import _align_rows, _LatencySearch
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 
@@ -18,9 +19,8 @@ FACTS: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": FIG7.speed}
 
 def joint(front: float, rear: float, **options: Any) -> Any:
     """Its nominal car has other tyres than the true one by these factors."""
-    return make_estimator(
-        "joint", vehicle=FIG7.truth.scale_stiffness(front, rear), **FACTS, **options
-    )
+    car = FIG7.truth.scale_stiffness(front, rear)
+    return make_estimator("exact-kf", vehicle=car, **WITH_TYRES, **FACTS, **options)
 
 
 TYRES, LATE = ((1.0, 1.0), (0.7, 1.3), (1.4, 0.7)), (0.0, 0.013, 0.06, 0.1)

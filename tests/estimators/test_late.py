@@ -13,6 +13,7 @@ from sideslip.estimators.analysis.bound import VehicleChange, compute_error_boun
 from sideslip.estimators.delayed_channels import LateEstimator
 from sideslip.estimators.vector.make import make_batch
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 
 LATE = {"gyro": 0.06}
@@ -56,7 +57,7 @@ def drive() -> tuple[Log, dict[str, Any]]:
     packets = log.record.packets.copy()
     packets[5, PACKET.value], packets[9, PACKET.captured] = np.nan, 1e9
     record = Record(log.record.fast[:1990], packets[packets[:, PACKET.arrived] < 1990])
-    facts = {"vehicle": FIG7.truth, "sensors": sensors, "speed": FIG7.speed}
+    facts = {"vehicle": FIG7.truth, "sensors": sensors, "speed": FIG7.speed} | WITH_TYRES
     return later(dataclasses.replace(log, record=record), LATE), facts
 
 
@@ -72,10 +73,10 @@ def stepped(filter_: Any, record: Record, width: int) -> None:
 @pytest.mark.parametrize("latency", [LATE, {"gyro": "find"}])
 def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any) -> None:
     log, facts = drive()
-    filter_: Any = make_estimator("joint", **facts, latency=latency)
+    filter_: Any = make_estimator("exact-kf", **facts, latency=latency)
     end = filter_.run(log)
     assert filter_.latency["gyro"] == pytest.approx(0.06, abs=0.004)
-    batch = make_batch("joint", 2, **facts, latency=latency)
+    batch = make_batch("exact-kf", 2, **facts, latency=latency)
     for width in (10, 37, 1990):
         stepped(filter_, log.record, width)
         assert (filter_.x == end.x[-1]).all() and filter_.tick == 1989
@@ -90,7 +91,7 @@ def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any
 
 def test_a_snapshot_goes_on() -> None:
     log, facts = drive()
-    filter_ = make_estimator("joint", **facts, latency={"gyro": "find"})
+    filter_ = make_estimator("exact-kf", **facts, latency={"gyro": "find"})
     split = log.record.packets[:, PACKET.arrived] < 700
     filter_.step(log.record.fast[:700], log.record.packets[split])
     snapshot = filter_.get_state()
@@ -116,9 +117,9 @@ def test_a_single_packet_counts_at_once() -> None:
 def test_without_a_latency_it_is_the_filter_that_it_was() -> None:
     log, facts = drive()
     for none in ({}, {"gyro": 0.0}):
-        filter_ = make_estimator("joint", **facts, latency=none)
+        filter_ = make_estimator("exact-kf", **facts, latency=none)
         assert type(filter_) is Estimator
-        assert (filter_.run(log).x == make_estimator("joint", **facts).run(log).x).all()
+        assert (filter_.run(log).x == make_estimator("exact-kf", **facts).run(log).x).all()
 
 
 def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
@@ -127,7 +128,7 @@ def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
     punctual = log.record.fast.copy()
     punctual[:-60, FAST.gyro] = log.record.fast[60:, FAST.gyro]
     here = log.record.packets[:, PACKET.arrived] < 1930
-    late, plain = (make_estimator("joint", **facts, latency=each) for each in (LATE, {}))
+    late, plain = (make_estimator("exact-kf", **facts, latency=each) for each in (LATE, {}))
     late.run(log)
     plain.run(Log(Record(punctual[:1930], log.record.packets[here]), log.slow))
     assert isinstance(late, LateEstimator)
@@ -158,8 +159,9 @@ def test_the_bound_that_knows_it_is_a_bound() -> None:
     ],
 )
 def test_what_a_latency_cannot_be(latency: Any, match: str) -> None:
+    sensors = {"camera": CAMERA}
     with pytest.raises(ValueError, match=match):
-        make_estimator("joint", sensors={"camera": CAMERA}, speed=7.0, latency=latency)
+        make_estimator("exact-kf", **WITH_TYRES, sensors=sensors, speed=7.0, latency=latency)
 
 
 def test_filters_that_cannot_have_one() -> None:
@@ -169,4 +171,4 @@ def test_filters_that_cannot_have_one() -> None:
     with pytest.raises(ValueError, match="latency, delay='larsen' and delay='buffer' need"):
         make_estimator("multirate-residual-kf", **common, latency=LATE)
     with pytest.raises(TypeError, match="latency is seconds by channel"):
-        make_estimator("joint", **common, latency=0.06)
+        make_estimator("exact-kf", **common, latency=0.06)

@@ -16,8 +16,8 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import FORMAT, Card, list_shipped, load_policy, save_policy
-from sideslip.estimators.learned.network import Network
 
 pytestmark = pytest.mark.plain
 CARD = Card(
@@ -216,7 +216,7 @@ def test_a_file_of_the_first_format_is_a_network_without_memory(file: Path) -> N
 
 
 def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sideslip.estimators.learned.network.MAX_BYTES", 1000)
+    monkeypatch.setattr("sideslip.agents.learned.network.MAX_BYTES", 1000)
     with pytest.raises(ValueError, match=r"bytes, a policy has at most 1000"):
         load_policy(file)
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController
-from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
-from sideslip.estimators.learned.forward import (
+from sideslip.agents.learned.forward import (
     ACTIVATIONS,
     CELL_WEIGHTS,
     GATES,
     MovingAverages,
     RecurrentCell,
 )
-from sideslip.estimators.learned.network import Network
+from sideslip.agents.learned.network import Network
+from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController, make_agent
+from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, Policy, save_policy
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.learned.network import Network
 
 VISION, FUSION, STEERING = (
     f"sideslip/{name}-v0" for name in ("YawVision", "YawFusion", "AfsYawFusion")

@@ -213,9 +213,8 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     drives = Demonstrations(
         obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
     )
-    usual, deviation = (
-        compute_scaling([drives], layout, ("beta",), each) for each in (True, False)
-    )
+    usual = compute_scaling([drives], layout, ("beta",))
+    deviation = Scaling(obs.mean((0, 1)), 1.0 / obs.std((0, 1)))
     ends = np.percentile(ages, (16, 50))  # the usual age is 0, a soon one a deviation before it
     assert (ends - usual.mean[0]) * usual.scale[0] == pytest.approx([-1.0, 0.0])
     z, plain = (x._replace(mixing=None).mix_inputs(obs)[0, :, 0] for x in (usual, deviation))

@@ -14,19 +14,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.training.callbacks import CHECKPOINT
 from sideslip.agents.training.config import TrainingTask
-from sideslip.agents.training.corrections import train_correction
 from sideslip.agents.training.distill import DistillTask, distill
 from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.recurrent import train_memory
 from sideslip.agents.training.student import DistillConfig
 from sideslip.agents.training.trainer import Trainer, _measure_scaling
 from sideslip.agents.training.warm_start import make_finetune_task
 from sideslip.agents.vec_env import make_vec_env
-from tests.agents.training.test_corrections import CARD, DRIVE
 from tests.agents.training.test_distill import COURSE, ID, OPTIONS
 from tests.agents.training.test_distill import lesson as distilled
 from tests.agents.training.test_gradient import made, tuned_task
-from tests.agents.training.test_memories import lesson
 from tests.agents.training.test_starts import TASK, foreign
 
 VISION = "sideslip/YawVision-v0"
@@ -85,16 +81,6 @@ def seeing() -> DistillTask:
     return DistillTask(twins, twins, teacher)
 
 
-def memory(message: str, name: str, fresh: bool = True) -> Refusal:
-    def train(_: Path) -> None:
-        mine = lesson()
-        layout = mine.cars.layout
-        mine.cars.layout = tuple(e for e in layout if fresh or not e.name.endswith("_fresh"))
-        train_memory(name, mine, COURSE, 3)
-
-    return train, message
-
-
 def normalised_twice(folder: Path) -> None:
     model = Trainer(TINY, 1, folder).build().model
     convert_sb3_policy(model, VecNormalize(make_vec_env(TINY.env_id, 2)))
@@ -115,10 +101,6 @@ REFUSED: dict[str, Refusal] = {
     "cells and traces": config("cells or traces, got 3 and 4", traces=4, cells=3),
     "no lessons": taught("no lessons"),
     "nothing to tell": taught("nothing is left to be told", seeing, auxiliary_weight=0.5),
-    "unknown memory": memory("unknown memory 'lstm'; known: mlp, frames, gru", "lstm"),
-    "no packets": memory("one sensor with packets, got 0", "gru", fresh=False),
-    "no drives": (lambda _: train_correction(CARD, []), "0 drives, 32 episodes, 20 epochs"),
-    "no episodes": (lambda _: train_correction(CARD, [DRIVE], episodes=0), "1 drives, 0 episodes"),
     "unknown algorithm": task("unknown algorithm 'dqn'; known: ppo, sac, tqc", algo="dqn"),
     "task's seed": task("seed is at least 0, got -1", seed=-1),
     "estimator on tensors": task(

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.agents.learned.network import SUFFIX
 from sideslip.benchmarks.control import run
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import Chunk, DriveResult, make_storage
 from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.envs.numerics import kernel_cache
-from sideslip.estimators.learned.network import SUFFIX
 
 SEEDS = (3, 4, 5)
 NUMBERS, SIGNALS = len(run.NUMBERS), 1 + len(run.SIGNALS)

@@ -42,10 +42,9 @@ PAIRS = (
 )
 
 
-def test_a_correction_gives_controllers_what_its_filter_gives() -> None:
-    for name, base in (("exact-kf", "exact-kf"), ("joint", "joint, friction")):
-        assert Entry("lqr", f"learned-{name}").outputs == Entry("lqr", base).outputs
-    assert Entry("lqr", "joint").outputs[-2:] == ("front_tyres", "rear_tyres")
+def test_joint_gives_controllers_its_tyres() -> None:
+    tyres = ("front_tyres", "rear_tyres", "inverse_friction")
+    assert Entry("lqr", "joint").outputs == (*Entry("lqr", REFERENCE_FILTER).outputs, *tyres)
 
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
@@ -90,7 +89,7 @@ def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
 
 @pytest.mark.parametrize("estimator", [REFERENCE_FILTER, "joint"])
 def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
-    """Its levels are the scenario's, which has no accelerometer then."""
+    """Levels of `exact-kf` are the scenario's, which has no accelerometer then."""
     contest = ControlTask(scenario="tie-vision-fig8")
     assert not make_scenario("tie-vision-fig8").roll
     options = ControlCase(contest, Entry("lqr", estimator)).estimate_options["options"]
@@ -100,15 +99,15 @@ def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
 
 
 def test_in_a_world_a_filter_has_the_levels_of_nominals() -> None:
-    """But where it lacks the sensor, or knows the tyres by itself."""
+    """But where it lacks the sensor; `joint` has its own."""
     contest = ControlTask(scenario="coms-slalom", changes={"world": "v1"})
     names = (REFERENCE_FILTER, "exact-kf, gps", "joint")
-    whole, gps, joint = (
+    whole, gps, own = (
         ControlCase(contest, Entry("lqr", name)).estimate_options["options"] for name in names
     )
     assert whole["camera_yaw_sd"] > 0.0 and whole["force_share"] > 0.0
     assert whole.keys() - gps.keys() == {"camera_yaw_sd"}
-    assert "force_share" not in joint and joint["camera_yaw_sd"] == whole["camera_yaw_sd"]
+    assert own.keys() == {"slow"}
     for name in names:
         Entry("lqr", name).make(contest)
 
@@ -129,7 +128,7 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
         "sideslip.benchmarks.control.entries.find_oracle", lambda _, name: f"{name}-{kind}"
     )
     assert ControlCase(contest, Entry(PARAMETERS)).options == found["adaptive-lqr"]
-    adaptive, kind = Entry("adaptive-nmpc", "joint, friction"), "nmpc"
+    adaptive, kind = Entry("adaptive-nmpc", "joint"), "nmpc"
     assert ControlCase(contest, adaptive).options == found["adaptive-nmpc"]
     parameters, state = (ControlCase(contest, Entry(each)).options for each in (PARAMETERS, STATE))
     assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}

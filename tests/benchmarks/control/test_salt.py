@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sideslip
+from sideslip.agents.learned.network import SUFFIX
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import readme
 from sideslip.benchmarks.control import baseline_gaps, calibration, run, tasks
@@ -29,7 +30,6 @@ from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.studies.learned_outside import KINDS, _make_outside_task
 from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suites
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
-from sideslip.estimators.learned.network import SUFFIX
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}

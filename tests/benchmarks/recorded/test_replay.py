@@ -209,7 +209,7 @@ def test_without_gps_and_truth_the_inertial_sensors_serve_more_than_one_filter(
     rows = rows.drop(columns=[name for name in ("course_rad", "sideslip_rad") if name in rows])
     rows.assign(accel_y_mps2=0.0).to_csv(tmp_path / "bare.csv", index=False)
     suite = replay_file(tmp_path / "bare.csv", PASSENGER_CAR, figures=False)
-    assert {row.estimator for row in suite.rows} == {GYRO_ONLY, "joint-robust"}
+    assert {row.estimator for row in suite.rows} == {GYRO_ONLY, "joint"}
 
 
 def test_that_most_rows_were_dropped_is_the_first_line(tmp_path: Path) -> None:

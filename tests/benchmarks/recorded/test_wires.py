@@ -83,7 +83,7 @@ def test_identify_writes_what_replay_reads(tmp_path: Path) -> None:
     assert car.front_stiffness == pytest.approx(true.front_stiffness, rel=0.1)
     assert read_wires(tmp_path / "car.toml").latency["gps"] == pytest.approx(0.2, abs=0.03)
     for vehicle in ([str(tmp_path / "car.toml")], ["identify", "--until", "30"]):
-        more = ["--estimator", "joint", "--estimator-option", "joint.members=2"]
+        more = ["--estimator", "joint", "--estimator-option", "joint.robust=1"]
         run = CliRunner().invoke(app, ["replay", str(path), "--vehicle", *vehicle, *more])
         assert run.exit_code == 0, run.output
         assert "front_tyres" in run.output and "WARNING" not in run.output
@@ -101,7 +101,7 @@ def test_parts_are_replayed_by_themselves(tmp_path: Path) -> None:
 
 
 def test_options_of_estimators() -> None:
-    found = _parse_estimator_options(["joint.members=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
-    assert found == {"joint": {"members": 4, "gate": 0.9}, "dakf": {"q_beta": 1e-4}}
-    with pytest.raises(ValueError, match=r"ESTIMATOR\.NAME=VALUE, got 'members=4'"):
-        _parse_estimator_options(["members=4"])
+    found = _parse_estimator_options(["joint.robust=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
+    assert found == {"joint": {"robust": 4, "gate": 0.9}, "dakf": {"q_beta": 1e-4}}
+    with pytest.raises(ValueError, match=r"ESTIMATOR\.NAME=VALUE, got 'robust=4'"):
+        _parse_estimator_options(["robust=4"])

@@ -56,7 +56,7 @@ def test_every_filter_of_the_catalogue_has_its_line() -> None:
     """All names that make a filter, in one environment and in several."""
     measured = Suite("speed", "", "")
     env_steps.add_filters(measured, SHORT)
-    names = set(ESTIMATORS) - {"learned"}  # which is learned-joint by default
+    names = set(ESTIMATORS)
     assert set(FILTERS) < names
     envs = env_steps.FUSION, f"{env_steps.FUSION} x 2"
     rows = [(row.scenario, row.metric) for row in measured.rows]

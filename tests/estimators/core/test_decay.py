@@ -55,7 +55,7 @@ def case(name: str, clock: SlowSensor | None, **options: Any) -> Any:
 def defaults() -> list[Any]:
     """Every filter with every slow sensor that it prefers."""
     clocks = {"": None, "camera": CAMERA, "gps": GPS}
-    left_out = ("constant-delay-kf", "joint", "joint-robust")  # joint: its tyres are nonlinear
+    left_out = ("constant-delay-kf", "joint")  # joint: its tyres are nonlinear
     return [
         case(name, clocks[sensor])
         for name, row in FILTERS.items()

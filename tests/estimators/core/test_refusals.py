@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, GPS
 
 SEEN: dict[str, Any] = {"camera": CAMERA}
@@ -19,7 +20,7 @@ def call(name: str, sensors: Any = None, **options: Any) -> Any:
 
 
 exact = functools.partial(call, "exact-kf")
-joint = functools.partial(call, "joint", slow=["camera", "gps"])
+joint = functools.partial(call, "exact-kf", slow=["camera", "gps"], **WITH_TYRES)
 NEEDS = ": gate, adapt.* need gains='covariance'"
 BETWEEN_0_AND_1 = "gate is a probability between 0 and 1, got"
 NAN = float("nan")
@@ -50,7 +51,7 @@ REFUSED: dict[str, list[Any]] = {
     "delay='buffer' is for filters that listen at every tick": [
         call("single-rate-kf", SEEN, delay="buffer")
     ],
-    "does not store the noise that noise_time=": [call("joint-robust", SEEN, delay="buffer")],
+    "does not store the noise that noise_time=": [call("joint", SEEN, delay="buffer")],
     f"multirate-kf{NEEDS}": [
         call("multirate-kf", gains="periodic", gate=0.99),
         call("multirate-kf", gains="periodic", adapt=0.02),
@@ -61,17 +62,9 @@ REFUSED: dict[str, list[Any]] = {
     f"lob{NEEDS}": [call("lob", gate=0.5)],
     BETWEEN_0_AND_1: [exact(gate=gate) for gate in (0.0, 1.0, -0.5, 2.0, NAN)],
     "adapt is a share from 0 to 1, got": [exact(adapt=adapt) for adapt in (-0.1, 1.0, NAN)],
-    # tyres as states, and banks
+    # tyres as states
     "another tyre's state": [joint(front_tyres_sd=0.0)],
-    "members is 1 where tyres": [joint(front_tyres_sd=0.0, rear_tyres_sd=0.0, members=2)],
-    "from 1 to 8": [joint(members=0), joint(members=2.5)],
     "not negative": [joint(rear_tyres_sd=-1.0)],
-    "positive factors or pairs": [joint(levels=(0.5, -1.0)), joint(levels=[[0.5, 1.0, 2.0]])],
-    "a member each": [
-        joint(levels=2.0),
-        joint(levels=(0.5, 1.0), disturbances="walk"),
-        joint(levels=(0.5, 1.0, 2.0), members=2),
-    ],
     "accel_scale_sd needs tyres": [exact(fast=["gyro", "accel_y"], accel_scale_sd=0.1)],
     "accel_scale_sd needs accel_y among fast": [joint(accel_scale_sd=0.1)],
 }

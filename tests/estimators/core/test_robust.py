@@ -19,6 +19,7 @@ from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.core.model import build_model
 from sideslip.estimators.core.predict import linearise
 from sideslip.estimators.core.record import N_INPUTS
+from tests.estimators.dense import WITH_TYRES
 
 assert sideslip.__version__
 
@@ -43,14 +44,19 @@ def built(name: str, log: Log, **options: Any) -> Estimator:
     return make_estimator(name, vehicle=drive()[0].nominal, **(slow | options))
 
 
+def filter_with_tyres(log: Log, **options: Any) -> Estimator:
+    """`exact-kf` with states for its tyres."""
+    return built("exact-kf", log, **WITH_TYRES | options)
+
+
 @pytest.mark.parametrize("noise", [0.03, 0.1, 0.8])
 def test_the_accelerometers_noise_is_found_and_never_less_than_configured(noise: float) -> None:
     _, log = drive(noise, "straight")
-    filter_ = built("joint-robust", log, accel_y_noise=0.05, **SURE)
+    filter_ = built("joint", log, accel_y_noise=0.05, **SURE)
     filter_.run(log)
     f = filter_.filters[0]
     assert math.sqrt(f.r_fast[f.accel_row]) == pytest.approx(max(noise, 0.05), rel=0.4)
-    filter_ = built("joint-robust", log, accel_y_noise=0.1, noise_time=0.0)
+    filter_ = built("joint", log, accel_y_noise=0.1, noise_time=0.0)
     filter_.run(log)
     assert filter_.filters[0].r_fast[f.accel_row] == pytest.approx(0.1**2)
 
@@ -64,7 +70,7 @@ def test_noise_that_is_coloured_counts_for_what_its_mean_errs() -> None:
     fast = log.record.fast.copy()
     fast[:, FAST.accel_y] += lfilter([1.0], [1.0, -keep], steps)
     shaken = dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
-    filter_ = built("joint-robust", log, accel_y_noise=0.02, **SURE)
+    filter_ = built("joint", log, accel_y_noise=0.02, **SURE)
     filter_.run(shaken)
     f = filter_.filters[0]
     wanted = sd * math.sqrt(2.0 * tau / 0.001)
@@ -73,7 +79,7 @@ def test_noise_that_is_coloured_counts_for_what_its_mean_errs() -> None:
 
 def test_the_moment_forgets_in_a_time_of_its_own() -> None:
     _, log = drive()
-    f = built("joint", log, disturbance_time=0.5, moment_time=0.1, moment_sd=20.0).filters[0]
+    f = filter_with_tyres(log, disturbance_time=0.5, moment_time=0.1, moment_sd=20.0).filters[0]
     assert f.decay[f.dense] == pytest.approx(math.exp(-0.001 / 0.5))
     assert f.decay[f.dense + 1] == pytest.approx(math.exp(-0.001 / 0.1))
     assert f.q_known[1] == pytest.approx((1.0 - math.exp(-0.002 / 0.1)) * 20.0**2)
@@ -83,7 +89,7 @@ def test_a_late_map_errs_by_the_turn_of_the_road_in_that_time() -> None:
     """The camera's heading has the error, y_l grows with it, and it is as large as the turn."""
     _, log = drive()
     options = {"map_heading_sd": 0.01, "map_heading_time": 2.0, "map_lag_sd": 0.2}
-    filter_ = built("joint", log, **options)
+    filter_ = filter_with_tyres(log, **options)
     f, i = filter_.filters[0], filter_.names.index("map_heading")
     f.u[2], f.model_speed = 0.02, 7.0
     linearise(f, 0.0)
@@ -99,7 +105,7 @@ def test_a_filter_says_when_it_is_lost() -> None:
     _, log = drive()
 
     def list_health(packets: Any) -> list[bool]:
-        filter_, record, told = built("joint-robust", log, slow="gps"), log.record, []
+        filter_, record, told = built("joint", log, slow="gps"), log.record, []
         filter_.reset(log.slow, record.first)
         for start in range(0, 6000, 500):
             arrives = (packets[:, PACKET.arrived] >= start) & (
@@ -132,7 +138,7 @@ def test_a_steering_angle_in_degrees_and_a_car_that_reverses_are_said(fault: str
     until = next(
         i for i in range(500, 6000) if abs(fast[i, FAST.steer]) > 1.0 or fault != "degrees"
     )
-    filter_, deviations = built("joint-robust", log), []
+    filter_, deviations = built("joint", log), []
     for record in (wrong, log.record):
         filter_.reset(log.slow, 0)
         rows = np.ascontiguousarray(record.fast[: until + 1000])
@@ -145,12 +151,12 @@ def test_a_steering_angle_in_degrees_and_a_car_that_reverses_are_said(fault: str
 
 def test_what_is_far_beyond_its_noise_counts_less_and_the_rest_as_it_is() -> None:
     _, log = drive()
-    plain, robust = (built("joint", log, robust=size).run(log) for size in (0.0, 6.0))
+    plain, robust = (filter_with_tyres(log, robust=size).run(log) for size in (0.0, 6.0))
     assert np.array_equal(plain.x, robust.x)
     fast = log.record.fast.copy()
     fast[3000, FAST.gyro] += 3.0
     hit = dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
-    ours, theirs = (built("joint", log, robust=size).run(hit) for size in (6.0, 0.0))
+    ours, theirs = (filter_with_tyres(log, robust=size).run(hit) for size in (6.0, 0.0))
     after = slice(3000, 3300)
     moved = [np.abs(run.x - plain.x)[after, :2].max(axis=0) for run in (ours, theirs)]
     assert (moved[0] < 0.1 * moved[1]).all()
@@ -159,7 +165,7 @@ def test_what_is_far_beyond_its_noise_counts_less_and_the_rest_as_it_is() -> Non
 def test_tyres_that_err_push_by_their_share_of_the_force() -> None:
     """Q of a step holds (share of |F_f| + |F_r|)^2, and the same at half the wheelbase."""
     base, log = drive()
-    filter_ = built("joint", log, model_error=0.1, disturbance_time=0.2)
+    filter_ = filter_with_tyres(log, model_error=0.1, disturbance_time=0.2)
     filter_.run(log)
     f, car = filter_.filters[0], base.nominal
     V, (beta, gamma), delta = f.model_speed, f.x[:2], log.record.fast[-1, FAST.steer]
@@ -175,7 +181,7 @@ def test_tyres_that_err_push_by_their_share_of_the_force() -> None:
 
 def test_forces_come_in_shares_of_the_weight() -> None:
     base, log = drive()
-    filter_ = built("joint", log, force_share=0.05, moment_share=0.01, force_sd=30.0)
+    filter_ = filter_with_tyres(log, force_share=0.05, moment_share=0.01, force_sd=30.0)
     f, car = filter_.filters[0], base.nominal
     weight, arm = car.mass * GRAVITY, 0.5 * (car.front_arm + car.rear_arm)
     share = 1.0 - math.exp(-2.0 * 0.001 / 0.3)
@@ -202,15 +208,17 @@ def test_on_a_strange_car_its_intervals_mean_something() -> None:
     log = rollout(env, seed=2, options={"duration": 7.0}).log
     car, beta = env.unwrapped.nominal.scale_stiffness(0.7, 1.3), log.truth["beta"]
     nees = []
-    for name in ("joint-robust", "joint"):
+    for name, options in (("joint", {}), ("exact-kf", WITH_TYRES)):
         known = {"sensors": log.slow, "slow": ["gps"], "course_noise": math.radians(0.5)}
-        run = make_estimator(name, vehicle=car, **known).run(log)
+        run = make_estimator(name, vehicle=car, **known, **options).run(log)
         nees.append(np.mean(((run.x[:, 0] - beta) / run.std[:, 0])[2000:] ** 2))
     assert nees[0] < 3.0 and nees[1] > 10.0
 
 
-@pytest.mark.parametrize("name", ["joint", "joint-robust"])
-def test_ten_minutes_at_a_standstill_change_nothing_that_is_not_seen(name: str) -> None:
+@pytest.mark.parametrize(("name", "options"), [("joint", {}), ("exact-kf", WITH_TYRES)])
+def test_ten_minutes_at_a_standstill_change_nothing_that_is_not_seen(
+    name: str, options: dict[str, Any]
+) -> None:
     """Gyro and accelerometer are off, the wheels' noise is all that moves; then it drives again."""
     scenario = {
         "base": "random-steering",
@@ -231,7 +239,7 @@ def test_ten_minutes_at_a_standstill_change_nothing_that_is_not_seen(name: str) 
     record = dataclasses.replace(
         log.record, fast=np.vstack([first, still, first]), packets=np.vstack([packets, later])
     )
-    filter_ = built(name, log, bias_sd=0.01)
+    filter_ = built(name, log, bias_sd=0.01, **options)
     run = filter_.run(dataclasses.replace(log, record=record, truth={}))
     tyres = [filter_.names.index(f"{axle}_tyres") for axle in ("front", "rear")]
     stop, go = len(first) + 1200, len(first) + rows - 1

@@ -16,6 +16,7 @@ from sideslip.envs.record import PACKET, Array
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import Estimator, make_estimator
 from tests.estimators.core.test_tyres import LINEAR
+from tests.estimators.dense import WITH_TYRES
 
 assert sideslip.__version__
 FROM, TO = 4000, 7000  # ticks between which a sensor fails
@@ -32,7 +33,7 @@ def drives(sensors: str, count: int = 4) -> tuple[Any, list[Log]]:
 
 def built(base: Any, log: Log, **options: Any) -> Estimator:
     held = {"vehicle": base.nominal, "sensors": log.slow, "speed": base.held_speed}
-    return make_estimator("joint", **held, slow=list(log.slow), **options)
+    return make_estimator("exact-kf", **held, slow=list(log.slow), **WITH_TYRES | options)
 
 
 def with_packets(log: Log, packets: Array) -> Log:
@@ -146,34 +147,17 @@ def test_what_jumped_for_good_is_believed_after_ten_and_another_sensor_can_forbi
     assert (nees < 1.5).all() and counts == {"gated": 9 * len(logs)}  # no GPS measures the lane
 
 
-@pytest.mark.parametrize("members", [1, 3])
 @pytest.mark.parametrize("delay", ["clone", "buffer"])
-def test_a_first_course_that_is_turned_is_found_out(delay: str, members: int) -> None:
+def test_a_first_course_that_is_turned_is_found_out(delay: str) -> None:
     base, (log, *_) = drives("gps")
     packets = log.record.packets.copy()
     packets[:3, VALUE] += np.pi
-    filter_ = built(base, log, delay=delay, members=members)
+    filter_ = built(base, log, delay=delay)
     run = filter_.run(with_packets(log, packets))
     assert filter_.counts["gated"] == 9
     assert abs(run["psi"][-1] - log.truth["psi"][-1]) < 0.05
     errors = (run["beta"] - log.truth["beta"])[4000:] / run.std[4000:, 0]
     assert np.mean(errors**2) < 2.0
-
-
-def test_a_member_that_refuses_a_sample_is_no_likelier_for_it() -> None:
-    """One sample beyond both gates costs either member as much as its gate."""
-    base, (log, *_) = drives("gps")
-    filter_ = built(base, log, members=2)
-    filter_.run(with_packets(log, log.record.packets[:-1]))
-    packet = log.record.packets[-1].copy()
-    assert packet[ARRIVED] <= filter_.tick
-    packet[VALUE] += 2.0
-    before = filter_.filters.weight[1:].copy()
-    filter_.update(packet)
-    f = filter_.filters[1]
-    assert filter_.filters[1].counts[6] == 1
-    lost = before - filter_.filters.weight[1:]
-    assert lost[0] == pytest.approx(0.5 * f.gate[1] + np.log(f.S[0, 0]))
 
 
 @pytest.mark.parametrize(

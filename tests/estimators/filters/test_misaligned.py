@@ -17,6 +17,7 @@ from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.core.test_consistency import within
 from tests.estimators.core.test_wary import CAMERA as CAMERA_PLACE
 from tests.estimators.core.test_wary import FROM, built, change_lane, drives, spoilt
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.drives import Drives, told
 from tests.estimators.simulation import CAMERA, GPS
 
@@ -29,8 +30,8 @@ RUNS = 24
 def test_an_estimated_tyre_s_model_is_the_force_at_the_angle_less_the_offset() -> None:
     """Its value, and its slope by the offset, which is a difference of the law's. The tyre has a
     limit: a force that is linear in the slip would hide where it is expanded."""
-    options = SDS | {"inverse_friction_sd": 0.1}
-    filter_ = make_estimator("joint", sensors={"camera": CAMERA}, speed=7.0, **options)
+    options = SDS | WITH_TYRES | {"inverse_friction_sd": 0.1}
+    filter_ = make_estimator("exact-kf", sensors={"camera": CAMERA}, speed=7.0, **options)
     f, names, steer = filter_.filters[0], filter_.names, 0.08
     f.x[:2], f.x[names.index("steer_offset")] = (0.02, 0.3), 0.01
 

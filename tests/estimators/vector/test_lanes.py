@@ -17,6 +17,7 @@ from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
 from sideslip.estimators.vector.lanes import _MIN_LANES, BLOCK, make_blocks
 from sideslip.estimators.vector.make import make_batch
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
 
@@ -141,7 +142,7 @@ def test_which_filters_are_in_lanes() -> None:
         ("exact-kf", {}, 5),
         ("multirate-kf", {}, 5),
         ("exact-kf", {"delay": "stored"}, 5),
-        ("joint", {}, 0),
+        ("exact-kf", WITH_TYRES, 0),
         ("exact-kf", {"delay": "buffer"}, 0),
     ]
     for name, options, there in cases:

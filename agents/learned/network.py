@@ -1,7 +1,6 @@
 """A policy's network without torch, and its safetensors file: tensors, and a card in the metadata.
 
-Reading runs no code: safetensors are numbers, the card is JSON. Policies (`agents.learned.policy`)
-and corrections of estimators (`correction_file`) are such files, each with a card of its own.
+Reading runs no code: safetensors are numbers, the card is JSON.
 """
 
 import json
