@@ -19,7 +19,7 @@ import gymnasium as gym
 from ..envs.scenarios.draws import get_range
 from ..envs.scenarios.manoeuvres import SCENARIOS
 from ..envs.scenarios.scenario import Scenario
-from ..envs.scenarios.world import IDEAL, World
+from ..envs.scenarios.world import IDEAL, WORLD_VERSION, World
 from ..envs.sensors.inertial import Noise
 from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice
@@ -259,12 +259,17 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file holds something else; the message has the path.
+        ValueError: The file holds something else, or is of another world; the message has the path.
     """
     try:
         classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from None
+    if (version := classes.pop("world_version", 0)) != WORLD_VERSION:
+        raise ValueError(
+            f"{path} was tuned in world {version}, this is {WORLD_VERSION}: tune anew, "
+            "sideslip tune controller NAME --write"
+        )
     for kind, names in classes.items():
         for name, parts in names.items() if isinstance(names, dict) else [("", names)]:
             is_valid = isinstance(parts, dict) and parts.keys() <= set(PARTS)

@@ -17,8 +17,6 @@ SUITES = {
     "estimation": ".studies.estimation",
     "unknown": ".studies.unknown",
     "control": ".control.suite",
-    "learned": ".studies.learned",
-    "learned-outside": ".studies.learned_outside",
     "papers": ".papers.suite",
     "following": ".studies.coordinated_control",
     "highway": ".studies.traffic",
@@ -28,7 +26,7 @@ SUITES = {
 }
 """The module of each suite, whose `STUDY` it is."""
 
-SALTED = ("control", "learned", "learned-outside")
+SALTED = ("control",)
 """The suites whose test seeds follow the contestants' sources."""
 
 

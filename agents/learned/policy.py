@@ -16,6 +16,7 @@ from safetensors.numpy import save
 from ... import __version__
 from ...envs.io import check_types, from_json, write_atomic
 from ...envs.record import Array
+from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import describe_unknown
 from ...estimators.registry import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
@@ -60,6 +61,7 @@ class Card:
     steps: int = 0  # of the environment
     cpu_seconds: float = 0.0  # of the training
     sideslip: str = __version__  # version of the package
+    world_version: int = 0  # of the world it was trained in, 0 where nothing errs
     evaluation: JsonMap = field(default_factory=dict)
     """The salt of the test seeds, their number ("episodes"), and "cost": mean and 95 % interval of
     the policy and of each controller beside it. Of a class of tasks also its costs by scenario."""
@@ -118,6 +120,7 @@ class Card:
         """
         facts = get_env_facts(env)
         rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
+        rest["world_version"] = WORLD_VERSION if facts.moment_rate > 0.0 else 0
         return cls(control_period=int(facts.control_period), reference=facts.reference, **rest)
 
     def _to_json(self, **extra: Any) -> str:
@@ -297,7 +300,7 @@ class PolicyController(Controller):
         policy: Shipped name, file's path, or `Policy`.
 
     Raises:
-        ValueError: The env's entries, units, control period or action are not the policy's.
+        ValueError: The env's entries, units, control period, world or action are not the policy's.
     """
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
@@ -317,6 +320,11 @@ class PolicyController(Controller):
             raise ValueError(
                 f"policy {name} was trained with a control period of {card.control_period} ticks, "
                 f"this env has {facts.control_period}"
+            )
+        if facts.moment_rate > 0.0 and card.world_version != WORLD_VERSION:
+            raise ValueError(
+                f"policy {name} was trained in world {card.world_version}, this env is of world "
+                f"{WORLD_VERSION}, whose sensors err: train it there"
             )
         if facts.width < self.policy.network.width:
             raise ValueError(

@@ -102,8 +102,8 @@ class _TuneController:
     kind: Texts = take(
         "Class of tasks, such as car-yaw; default: all. Repeatable.", None, "--class"
     )
-    trials: int = take("Trials of a class, finished ones included.", 60)
-    seeds: int = take("Tuning seeds of a task.", 16)
+    trials: int = take("Trials of a class, finished ones included.", 120)
+    seeds: int = take("Tuning seeds of a task.", 8)
     seed: int
     storage: Text
     jobs: int | None

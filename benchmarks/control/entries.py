@@ -68,13 +68,6 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
 """Besides the reference controller, on the reference filter."""
 ORACLE_NAMES = (NOMINAL, PARAMETERS, STATE)
 _CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
-_SHARED = {
-    ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
-    ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
-    ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
-}
-"""Untuned controllers: the one, closest in knowledge, from which they take which options; their
-filters' levels are the scenario's."""
 _SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 _PUSHES = ("force_sd", "moment_sd")
@@ -188,33 +181,13 @@ class ControlCase(NamedTuple):
     def options(self) -> Options:
         """Options of filter and agent: its own, or those of `agents.get_tuned_options`.
 
-        The reference controller has nominal's, a user's own nominal's filter, and one that was not
-        tuned what it shares with a baseline.
+        Nominal, the oracles and a user's own are as they were made.
         """
-        entry, kind, name = self.entry, self.task.kind, self.driver
-        if entry.options is not None:
-            return entry.options
-        if entry.trust or entry.is_users:
-            trusted = {"trust": True} if entry.trust else {}
-            return self._get_tuned_options(NOMINAL) | {"controller": trusted}
-        if name in _SHARED and not any(get_tuned_options(kind, name).values()):
-            source, numbers = _SHARED[name]
-            best = get_tuned_options(kind, source)["controller"]
-            return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
-        return self._get_tuned_options(NOMINAL if name == REFERENCE_CONTROLLER else name)
-
-    def _get_tuned_options(self, name: str) -> Options:
-        """Get what was tuned, in version 0, less what does worse in the tiers' world.
-
-        There the world's ranges tell the levels of `exact-kf`, and nominal does better with the
-        default weight of added steering.
-        """
-        tuned = get_tuned_options(self.task.kind, name)
-        if self.task.tier and name not in ADAPTIVE:
-            tuned["filter"] = {}
-            if name == NOMINAL:
-                tuned["controller"].pop("steer_weight", None)
-        return tuned
+        if self.entry.options is not None:
+            return self.entry.options
+        if self.entry.trust or self.entry.is_users:
+            return {"filter": {}, "controller": {"trust": True} if self.entry.trust else {}}
+        return get_tuned_options(self.task.kind, self.driver)
 
     @property
     def env_options(self) -> dict[str, Any]:

@@ -1,15 +1,14 @@
-"""Search of the options that make a controller cheapest over the tasks of a class.
+"""Search of the options that give a controller the best score over the tasks of a class.
 
 Every controller gets the same number of trials on the same tuning seeds. The objective is minus the
-mean of `compute_log_ratios` over tasks and seeds: log(J / J_nominal), J_nominal that of the untuned
-`nominal`, clipped to +-3, where a failure counts log 20.
+mean score r over tasks and seeds. The lead-in is short.
 """
 
 import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,16 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ... import __version__
-from ...agents.baselines import NOMINAL, ORACLES, Options
+from ...agents.baselines import GRIP, STEER_WEIGHT, Options
 from ...agents.controllers.yaw_stability import BANDWIDTH
 from ...agents.design.pi import POLE
 from ...envs.numerics.kernel_cache import hash_experiment
-from ...envs.record import Array
+from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import check_choice
 from ..control.entries import ADAPTIVE, JOINT, REFERENCE_FILTER, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
-from ..control.score import compute_log_ratios
-from ..control.tasks import ControlTask, list_candidates, list_scored_tasks
+from ..control.score import PairedDrives
+from ..control.tasks import NOMINAL, QUICK_LEAD_IN, ControlTask, list_scored_tasks
 from ..harness.parallel import count_cores, run_cases
 from ..harness.results import Suite, write_text
 from .estimator import SearchOptions
@@ -40,70 +39,54 @@ STEERING = ("coms-model", "car-steering")  # the action steers too
 class SearchNumber(NamedTuple):
     """A number that is searched between low and high, on a logarithmic scale, from `start` on."""
 
-    name: str  # of the option, behind a dot the place in a list
+    name: str  # of the controller's option, behind a dot the place in a list
     start: float
     low: float
     high: float
-    of: tuple[str, ...] = ("controller",)  # whose option it is: controller, filter or both
     is_integer: bool = False
     steering: bool = False  # it means something only where the action steers
 
 
-_TIME = SearchNumber("disturbance_time", 0.3, 0.03, 3.0, ("filter",))  # s
-_LEVELS = (
-    SearchNumber("force_sd", 50.0, 10.0, 3e3, ("filter",)),  # N
-    SearchNumber("moment_sd", 20.0, 5.0, 3e3, ("filter",)),  # N m
-    SearchNumber("bias_sd", 0.01, 1e-4, 0.05, ("filter",)),  # rad/s
-    SearchNumber("accel_bias_sd", 0.2, 0.01, 2.0, ("filter",)),  # m/s2
-    SearchNumber("bank_sd", 0.01, 1e-4, 0.1, ("filter",)),  # rad
-    SearchNumber("accel_y_noise", 0.1, 0.02, 2.0, ("filter",)),  # m/s2
-)
-_GRIP = SearchNumber("grip", 0.7, 0.3, 1.0)
-_FILTER = (*_LEVELS, _TIME, _GRIP)
-_STEER = SearchNumber("steer_weight", 100.0, 0.3, 1e3, steering=True)
-_BOTH_TIMES = _TIME._replace(of=("filter", "controller"))
-_MPC = (*_LEVELS, _BOTH_TIMES, _GRIP)
-_LQG = (*_MPC, _STEER)
-_NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _STEER._replace(start=10.0))  # s
-_ADAPTIVE = (_TIME._replace(of=("controller",)), _GRIP)
+_TIME = SearchNumber("disturbance_time", 0.3, 0.03, 3.0)  # s
+_GRIP = SearchNumber("grip", GRIP, 0.3, 1.0)
+_STEER = SearchNumber("steer_weight", STEER_WEIGHT, 0.3, 1e3, steering=True)
+_LQG = (_TIME, _GRIP, _STEER)
+_NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _TIME, _GRIP, _STEER._replace(start=10.0))  # s
 
 SPACES: dict[str, tuple[SearchNumber, ...]] = {
     "two-dof": (
         SearchNumber("gain", 1.0, 0.1, 10.0),
         SearchNumber("pole", POLE, 2.0, 60.0),
-        *_FILTER,
+        _GRIP,
     ),
     "model-following": (
         SearchNumber("bandwidth.0", 5.0, 0.5, 50.0),  # rad/s, of the slip
         SearchNumber("bandwidth.1", 5.0, 0.5, 50.0),  # of the yaw rate
-        *_FILTER,
+        _GRIP,
     ),
     "esc": (
         SearchNumber("bandwidth", BANDWIDTH, 2.0, 60.0),  # rad/s
         SearchNumber("band", 0.02, 1e-3, 0.1),  # rad/s
         SearchNumber("slip", 0.05, 2e-3, 0.3),  # rad
-        *_FILTER,
+        _GRIP,
     ),
     "sliding-mode": (
         SearchNumber("pole", 15.0, 2.0, 60.0),  # rad/s
         SearchNumber("rate", 40.0, 4.0, 400.0),
         SearchNumber("layer", 0.2, 0.02, 2.0),
-        *_FILTER,
+        _GRIP,
     ),
     "lqr": _LQG,
-    "mpc": (SearchNumber("horizon", 30, 10, 60, is_integer=True), *_MPC),
-    "nmpc": (*_NMPC, *_MPC),
-    "adaptive-lqr": (_STEER, *_ADAPTIVE),
-    "adaptive-nmpc": (*_NMPC, *_ADAPTIVE),
-    "nominal": _LQG,
-    # it knows the gyro's bias
-    "oracle-parameters-lqr": tuple(number for number in _LQG if number.name != "bias_sd"),
+    "mpc": (SearchNumber("horizon", 30, 10, 60, is_integer=True), _TIME, _GRIP),
+    "nmpc": _NMPC,
+    "adaptive-lqr": _LQG,
+    "adaptive-nmpc": _NMPC,
 }
-"""Numbers by controller. All but the oracles drive on `exact-kf` with all sensors, adaptive ones on
-the filter whose tyres they follow; `lqr` has what is found for `nominal`, the same design."""
-_SLOW = ("mpc", "nmpc", "adaptive-nmpc", "oracle-parameters-lqr")
+"""Numbers by controller. Filters are not tuned here: the world's ranges tell the levels of
+`exact-kf`, and `joint` takes none. Nominal and the oracles are designed, not tuned: `lqr` is what
+tuning makes of nominal."""
+_SLOW = ("mpc", "nmpc", "adaptive-nmpc")
 _STAGES = (2, 4, 8)  # seeds after which the better half of a slow controller's trials goes on
-_TRIALS = 60
 LOGS = Path(__file__).with_name("logs")
 """Studies whose options the package ships."""
 _UNTUNED: Options = {"filter": {}, "controller": {}}
@@ -144,18 +127,17 @@ class ControllerTuning:
         return {number.name: number.start for number in self.numbers}
 
     def _make_options(self, values: dict[str, float]) -> Options:
-        """Make the options of filter and controller from numbers, rounded to three digits."""
-        options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
+        """Make the controller's options from numbers, rounded to three digits."""
+        options: dict[str, Any] = {}
         for number in self.numbers:
             name, _, index = number.name.partition(".")
             rounded = float(f"{values[number.name]:.3g}")
             value = round(rounded) if number.is_integer else rounded
-            for part in number.of:
-                if index:
-                    options[part].setdefault(name, []).append(value)
-                else:
-                    options[part][name] = value
-        return options
+            if index:
+                options.setdefault(name, []).append(value)
+            else:
+                options[name] = value
+        return {"filter": {}, "controller": options}
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
@@ -172,43 +154,38 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
     Raises:
         ValueError: The name or class is unknown, or there are no tasks or no seeds.
     """
-    numbers, matching = _get_space(name, kind), _list_contests(name, kind)
-    if not matching or not seeds:
-        raise ValueError(f"{kind}: {len(matching)} contests, {len(seeds)} seeds; both are needed")
-    return ControllerTuning(name, kind, tuple(matching), tuple(seeds), numbers)
-
-
-def _list_contests(name: str, kind: str) -> list[ControlTask]:
-    """List the scored tasks of a class; for an oracle all candidates, chosen by its costs."""
-    tasks = list_candidates() if name in ORACLES else list_scored_tasks()
-    return [task for task in tasks if task.kind == kind]
+    numbers, changes = _get_space(name, kind), {"lead_in": QUICK_LEAD_IN}
+    tasks = [replace(t, changes=changes) for t in list_scored_tasks() if t.kind == kind]
+    if not tasks or not seeds:
+        raise ValueError(f"{kind}: {len(tasks)} contests, {len(seeds)} seeds; both are needed")
+    return ControllerTuning(name, kind, tuple(tasks), tuple(seeds), numbers)
 
 
 def _run_contestant(
     contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
     """Run a controller on a task with some options, an episode for each seed."""
-    estimator = "" if name in ORACLES else JOINT if name in ADAPTIVE else REFERENCE_FILTER
+    estimator = "" if name == NOMINAL else JOINT if name in ADAPTIVE else REFERENCE_FILTER
     return run_chunk(Chunk(contest, Entry(name, estimator, options), seeds))
 
 
 @lru_cache(maxsize=64)
-def _compute_nominal_costs(contest: ControlTask, seeds: tuple[int, ...]) -> Array:
-    return _run_contestant(contest, NOMINAL, _UNTUNED, seeds).costs
+def _drive_nominal(contest: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
+    return _run_contestant(contest, NOMINAL, _UNTUNED, seeds)
 
 
 def _compute_objective(
     task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
-    options, log_ratios = task._make_options(values), []
+    options, scores = task._make_options(values), []
     for contest in task.contests:
         result = _run_contestant(contest, task.name, options, seeds)
         if result.error:
             return math.inf
-        log_ratios.append(-compute_log_ratios(_compute_nominal_costs(contest, seeds), result))
-    value = float(np.mean(log_ratios))
-    return value if math.isfinite(value) else math.inf
+        nominal = _drive_nominal(contest, seeds)
+        scores.append(PairedDrives(nominal, result, contest.cost_floor).compute_scores())
+    return -float(np.mean(scores))
 
 
 def _evaluate_trials(
@@ -273,7 +250,7 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
     return {
         "contestant": task.name,
         "class": task.kind,
-        "env_version": __version__,
+        "world_version": WORLD_VERSION,
         "contests": [item.name for item in task.contests],
         "seeds": list(task.seeds),
         "start": rows[0]["objective"],
@@ -305,13 +282,11 @@ def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
     Returns:
         Suite with a table.
     """
-    best = log["best"]
-    start = math.inf if log["start"] is None else math.exp(log["start"])
+    best, start = log["best"], log["start"]
+    before = "it cannot be driven" if start is None else f"{-start:.3f}"
     text = (
         f"{len(log['trials'])} trials over {len(task.contests)} contests of {task.kind} on "
-        f"{len(task.seeds)} tuning seeds each: cost {100.0 * math.exp(best['objective']):.1f} % of "
-        f"the untuned nominal's (geometric mean, a failure counts 20), {100.0 * start:.1f} % at "
-        "the start."
+        f"{len(task.seeds)} tuning seeds: score {-best['objective']:.3f}; at the start {before}."
     )
     table = make_result_table(best["numbers"], task.search)
     return Suite("tune", f"Tuning {task.name} in {task.kind}", text, tables=[table])

@@ -17,6 +17,7 @@ from ...agents.baselines import Options, read_tuned
 from ...agents.rollout import rollout
 from ...envs.io import to_toml
 from ...envs.numerics.kernel_cache import hash_sources
+from ...envs.scenarios.world import WORLD_VERSION
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
@@ -284,11 +285,11 @@ def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> Non
     classes = classes | {kind: classes.get(kind, {}) | {name: options}}
     tables = [
         f"[{class_name}.{contestant}.{part}]\n"
-        + "".join(f"{option} = {json.dumps(value)}\n" for option, value in part_options.items())
+        + "".join(f"{option} = {to_toml(value)}\n" for option, value in part_options.items())
         for class_name, names in sorted(classes.items())
         for contestant, parts in sorted(names.items())
         for part, part_options in parts.items()
         if part_options
     ]
-    write_text(target, _TUNED + "\n" + "\n".join(tables))
+    write_text(target, "\n".join([f"{_TUNED}world_version = {WORLD_VERSION}\n", *tables]))
     read_tuned.cache_clear()

@@ -22,8 +22,6 @@ from sideslip.benchmarks.control.entries import (
 )
 from sideslip.benchmarks.control.run import Chunk, measure
 from sideslip.benchmarks.control.tasks import (
-    PARAMETERS,
-    STATE,
     YAW,
     ControlTask,
     list_scored_tasks,
@@ -110,29 +108,6 @@ def test_in_a_world_a_filter_has_the_levels_of_nominals() -> None:
     assert own.keys() == {"slow"}
     for name in names:
         Entry("lqr", name).make(contest)
-
-
-def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oracles' numbers are those of the adaptive controllers, which know nearly as much."""
-    found = {
-        "adaptive-lqr": {"filter": {}, "controller": {"grip": 0.4, "steer_weight": 3.0}},
-        "adaptive-nmpc": {"filter": {"force_sd": 9.0}, "controller": {"grip": 0.6, "horizon": 0.3}},
-    }
-    nothing: dict[str, Any] = {"filter": {}, "controller": {}}
-    monkeypatch.setattr(
-        "sideslip.benchmarks.control.entries.get_tuned_options",
-        lambda _, name: found.get(name, nothing),
-    )
-    contest, kind = list_scored_tasks()[0], "lqr"
-    monkeypatch.setattr(
-        "sideslip.benchmarks.control.entries.find_oracle", lambda _, name: f"{name}-{kind}"
-    )
-    assert ControlCase(contest, Entry(PARAMETERS)).options == found["adaptive-lqr"]
-    adaptive, kind = Entry("adaptive-nmpc", "joint"), "nmpc"
-    assert ControlCase(contest, adaptive).options == found["adaptive-nmpc"]
-    parameters, state = (ControlCase(contest, Entry(each)).options for each in (PARAMETERS, STATE))
-    assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
-    assert state == {"filter": {}, "controller": {"horizon": 0.3}}
 
 
 def test_truth_is_told_without_error() -> None:

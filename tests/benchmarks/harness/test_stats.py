@@ -11,7 +11,6 @@ from sideslip.benchmarks.harness.stats import (
     ratio_of_roots,
     root_mean,
 )
-from sideslip.benchmarks.studies.learned import _compute_profile
 
 
 def far_away(values: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -69,19 +68,8 @@ def test_no_spread_gives_a_point_and_too_few_seeds_no_interval() -> None:
 
 def test_definitions_are_those_of_rliable() -> None:
     """Agarwal et al., NeurIPS 2021: the probability of improvement is the mean over tasks of
-    Mann and Whitney's U over the number of pairs, the score distribution the share of runs above
-    a level. Our task is a seed, with one run each."""
+    Mann and Whitney's U over the number of pairs. Our task is a seed, with one run each."""
     rng = np.random.default_rng(7)
     costs, others = (rng.integers(0, 6, 80).astype(float) for _ in range(2))
     U = [mannwhitneyu([-a], [-b]).statistic for a, b in zip(costs, others, strict=True)]
     assert compute_win_rate(costs, others).value == pytest.approx(np.mean(U), abs=1e-12)
-    levels = np.array([-1.0, 0.0, 2.5, 5.0])
-    above = [np.mean(-costs >= -level) for level in levels]
-    assert _compute_profile(costs, levels)[0] == pytest.approx(above, abs=1e-12)
-
-
-def test_a_profile_rises_to_all_that_do_not_fail() -> None:
-    values = np.array([0.5, 1.0, 2.0, np.inf, np.nan])
-    value, low, high = _compute_profile(values, np.array([0.1, 0.5, 1.0, 100.0]))
-    assert value == pytest.approx([0.0, 0.2, 0.4, 0.6])
-    assert np.all(low <= value) and np.all(value <= high)

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ pytest.importorskip("optuna")
 from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
 from sideslip.benchmarks.control.entries import ControlCase
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
-from sideslip.benchmarks.control.tasks import ControlTask, make_tuning_seeds
+from sideslip.benchmarks.control.tasks import QUICK_LEAD_IN, ControlTask, make_tuning_seeds
 from sideslip.benchmarks.tuning import controllers
 from sideslip.benchmarks.tuning.controllers import (
     KINDS,
@@ -22,7 +21,6 @@ from sideslip.benchmarks.tuning.controllers import (
     ControllerTuning,
     SearchNumber,
     _compute_objective,
-    _list_contests,
     _run_contestant,
     tune,
 )
@@ -56,34 +54,34 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert _compute_objective(planted, SEEDS, best) == pytest.approx(
         log["best"]["objective"], abs=1e-4
     )
-    assert "cost" in controllers.make_suite(planted, log).text
+    assert "score" in controllers.make_suite(planted, log).text
 
 
-def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
+def test_the_objective_is_minus_the_mean_score() -> None:
     gain = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
     costs = _run_contestant(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
     nominal = _run_contestant(SHORT, "nominal", nothing, SEEDS).costs
-    wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
+    floor = SHORT.cost_floor
+    wanted = np.log((costs + floor) / (nominal + floor)).mean()
     assert _compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
+def test_an_adaptive_contestant_is_tuned_on_the_filter_it_follows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its numbers reach that filter, and nobody else's on the same one."""
+    """Which takes no option, and drives after a short lead-in."""
     asked: list[ControlCase] = []
     monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
-    asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
-    options = asked_of._make_options(asked_of.start | {"force_sd": 77.0})
-    _run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
-    ((contest, entry),) = asked
-    other = replace(entry, agent="lqr")
-    own, others = (ControlCase(contest, x).estimate_options["options"] for x in (entry, other))
-    assert own["force_sd"] == 77.0 != others["force_sd"]
+    tuning = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
+    _run_contestant(tuning.contests[0], tuning.name, tuning._make_options(tuning.start), (1,))
+    (case,) = asked
+    assert case.entry.estimator == "joint" and case.estimate_options["options"].keys() == {"slow"}
+    assert case.agent_options["horizon"] == 0.5
+    assert case.env_options["lead_in"] == QUICK_LEAD_IN
 
 
-def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_is_lost_alone_counts_two(monkeypatch: pytest.MonkeyPatch) -> None:
     def fake(contest: ControlTask, name: str, *_: Any) -> DriveResult:
         numbers = np.zeros((2, len(NUMBERS)))
         numbers[:, NUMBERS.index("cost")] = [0.5, 900.0] if name == "two-dof" else 1.0
@@ -91,10 +89,11 @@ def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -
         return DriveResult(numbers, 0.0)
 
     monkeypatch.setattr(controllers, "_run_contestant", fake)
-    controllers._compute_nominal_costs.cache_clear()
+    controllers._drive_nominal.cache_clear()
     found = _compute_objective(task(SearchNumber("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
-    controllers._compute_nominal_costs.cache_clear()
-    assert found == pytest.approx(0.5 * (math.log(0.501 / 1.001) + math.log(20.0)))
+    controllers._drive_nominal.cache_clear()
+    floor = SHORT.cost_floor
+    assert found == pytest.approx(0.5 * (math.log((0.5 + floor) / (1.0 + floor)) + 2.0))
 
 
 def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,26 +152,25 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
     for name in SPACES:
-        assert len(_list_contests(name, kind)) >= 3
-        numbers = controllers._get_space(name, kind)
+        tuning = controllers.make_controller_tuning(name, kind, (1,))
+        assert len(tuning.contests) >= 3
+        numbers = tuning.numbers
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)
         assert not (steers and kind not in controllers.STEERING)
 
 
 def test_numbers_become_options() -> None:
-    both = SearchNumber("disturbance_time", 0.3, 0.1, 1.0, ("filter", "controller"))
     numbers = (
         SearchNumber("bandwidth.0", 5.0, 1.0, 9.0),
         SearchNumber("bandwidth.1", 5.0, 1.0, 9.0),
         SearchNumber("horizon", 30, 10, 60, is_integer=True),
-        both,
     )
-    found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
+    found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4}
     task = controllers.ControllerTuning("lqr", "car-yaw", (), (0,), numbers)
     assert task._make_options(found) == {
-        "filter": {"disturbance_time": 0.2},
-        "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
+        "filter": {},
+        "controller": {"bandwidth": [2.0, 3.0], "horizon": 20},
     }
 
 
@@ -188,9 +186,17 @@ def test_options_are_written_beside_others_and_read(tmp_path: Path) -> None:
     }
     for text in ("[", "a = 1", "[a.b]\nc = 1", "[a.b.filters]\nc = 1"):
         bad = tmp_path / f"{len(text)}.toml"
-        bad.write_text(text)
+        bad.write_text(f"world_version = 1\n{text}")
         with pytest.raises(ValueError, match=rf"{len(text)}\.toml"):
             read_tuned(bad)
+
+
+def test_what_was_tuned_in_another_world_is_refused(tmp_path: Path) -> None:
+    for head, world in (("world_version = 7", 7), ("", 0)):
+        path = tmp_path / f"{world}.toml"
+        path.write_text(f"{head}\n[a.lqr.controller]\ngrip = 0.5\n")
+        with pytest.raises(ValueError, match=rf"tuned in world {world}, this is 1: tune anew"):
+            read_tuned(path)
 
 
 def test_defaults_stand_where_nothing_was_tuned() -> None:
@@ -232,10 +238,10 @@ def test_the_command_writes_options_and_log(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(controllers, "_list_contests", lambda *_: [SHORT])
+    monkeypatch.setattr(controllers, "list_scored_tasks", lambda: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
     status, out, _ = run("tune", "controller", "two-dof", *few, "--out", "t.toml", "--log", "logs")
-    assert status == 0 and "untuned nominal" in " ".join(out.split())
+    assert status == 0 and "tuning seeds: score" in " ".join(out.split())
     log = json.loads(Path("logs/coms-model.two-dof.json").read_text())
     assert len(log["trials"]) == 2 and log["seeds"] == make_tuning_seeds(1)
     held = {part: options for part, options in log["options"].items() if options}
