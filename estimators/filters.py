@@ -19,6 +19,7 @@ class FilterDefinition:
     """One row of the table: what a filter is, and the defaults of its options."""
 
     slow: tuple[str, ...] = ()  # slow sensors it can use, the preferred first
+    uses_all: bool = False  # whether it uses all of them that are there, not the first alone
     model: str = "bicycle"  # or a name of `models.MODELS`
     fast: tuple[str, ...] = ("gyro",)  # measured in every row
     intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
@@ -157,6 +158,7 @@ FILTERS: dict[str, FilterDefinition] = {
     ),
     "joint": FilterDefinition(
         slow=SLOW_NAMES,
+        uses_all=True,
         gains="covariance",
         disturbances="forces",
         options=_JOINT,

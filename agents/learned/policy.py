@@ -34,7 +34,6 @@ from .network import SUFFIX as SUFFIX
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
 ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
 FOLDER = Path(__file__).resolve().with_name("policies")
-_DEFAULT = "ppo-yaw-vision"
 
 JsonMap = dict[str, Any]
 
@@ -303,7 +302,7 @@ class PolicyController(Controller):
         ValueError: The env's entries, units, control period, world or action are not the policy's.
     """
 
-    def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
+    def __init__(self, env: AnyEnv, policy: str | Path | Policy) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
         name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
         reads = self.policy.network.reads

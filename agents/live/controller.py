@@ -100,6 +100,11 @@ class OnboardController:
         """Counts of packets that a compiled `Estimator` did not use, by reason; else empty."""
         return self.estimator.counts if self._is_native else {}
 
+    @property
+    def is_healthy(self) -> bool:
+        """Whether a compiled `Estimator` is not lost; True for others, which do not tell."""
+        return not self._is_native or self.estimator.is_healthy
+
     def _begin(self, first: int) -> None:
         """Clear all memory; the next tick has the number `first`."""
         self.estimator.reset(self.sensors, first)

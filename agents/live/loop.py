@@ -312,7 +312,8 @@ class Loop:
         bad = sum(counts[reason] for reason in RejectReason)
         numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
         times = statistics.jitter.newest, statistics.latency.newest, statistics.work.newest
-        return LoopStatus._make(map(float, (*numbers, *times, statistics.deadlines)))
+        health = statistics.deadlines, self.onboard.is_healthy
+        return LoopStatus._make(map(float, (*numbers, *times, *health)))
 
     def numbers(self) -> dict[str, object]:
         """Collect all measurements, in JSON types."""

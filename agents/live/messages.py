@@ -88,6 +88,7 @@ class LoopStatus(NamedTuple):
     latency: float = 0.0  # us, of the last tick with a datagram
     time: float = 0.0  # us, of the last tick's work
     deadlines: float = 0.0  # that were due: one a tick of the loop's clock
+    healthy: float = 1.0  # 0 while the estimator is lost
 
 
 SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}

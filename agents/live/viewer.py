@@ -87,6 +87,7 @@ def _make_table(protocol: _ViewerProtocol, title: str) -> "Table":
         table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", _get_unit(name))
     counts = protocol.status
     time = f"t {newest[0]:.1f} s; " if newest else "no inertial data yet; "
+    time += "" if counts.healthy else "the estimator is lost; "
     table.caption = (
         f"{time}{counts.misses:.0f} of {counts.deadlines:.0f} deadlines missed, "
         f"{counts.held:.0f} ticks held\n{counts.bad:.0f} datagrams bad, {counts.lost:.0f} lost; "

@@ -27,6 +27,8 @@ Single = npt.NDArray[np.float32]
 _CLIP = 8.0  # limit of a normalised input (standard deviations)
 _UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
+_FILTERED = ("gyro", "accel_", "roll_rate", "camera_", "gps_")
+"""Beginnings of entries that a filter has read: behind it they would only shake the action."""
 _MIN_SPREAD = 1e-9  # standard deviation below which an input counts as constant
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
 _MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
@@ -115,8 +117,8 @@ def compute_scaling(
     """Compute the scaling of a student's inputs from drives.
 
     A student that has all of `needs` reads nothing else, which would only be noise to it. One that
-    has less reads all that varies, but for `_UNREAD`. An age is scaled by its variation while
-    packets come.
+    has less reads all that varies, but for `_UNREAD` and, behind a filter, what that has read. An
+    age is scaled by its variation while packets come.
 
     Args:
         drives: Demonstrations.
@@ -129,6 +131,8 @@ def compute_scaling(
     x = np.concatenate([demo.obs[demo.is_valid] for demo in drives])
     names = [entry.name for entry in layout]
     is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, _UNREAD)
+    if "beta_hat" in names:
+        is_read &= [not x.startswith(_FILTERED) or x.endswith(("_hat", "_std")) for x in names]
     mean, spread = x.mean(0, np.float64), x.std(0, dtype=np.float64)
     for i, name in enumerate(names):
         if name.endswith("_age"):

@@ -55,7 +55,7 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
     "multirate-kf, camera and gps": ("multirate-kf", _BOTH),
-    JOINT: (JOINT, _BOTH),
+    JOINT: (JOINT, {}),
 }
 """Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
 ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")
@@ -286,18 +286,10 @@ def check_agent(agent: Agent, rows: int, width: int) -> Agent:
 
 
 LEARNED: dict[str, tuple[Entry, ...]] = {
-    "car-steering": (Entry("distill-car-steering", "joint"), Entry("raw-car-steering")),
-    "car-yaw": (Entry("distill-car-yaw", "joint"), Entry("raw-car-yaw")),
-    "coms-model": (
-        Entry("ppo-coms-steering", "joint"),
-        Entry("raw-coms-steering"),
-        Entry("distill-coms-steering", "joint"),
-    ),
-    "coms-zero-slip": (
-        Entry("ppo-coms-yaw", "joint"),
-        Entry("distill-coms-yaw", "joint"),
-        Entry("raw-coms-yaw"),
-    ),
+    "car-steering": (Entry("distill-car-steering", JOINT), Entry("raw-car-steering")),
+    "car-yaw": (Entry("distill-car-yaw", JOINT),),
+    "coms-model": (Entry("distill-coms-steering", JOINT), Entry("raw-coms-steering")),
+    "coms-zero-slip": (Entry("distill-coms-yaw", JOINT),),
 }
 """Policies by the class of their tasks; verdicts speak of the first."""
 _POLICIES = {entry for entries in LEARNED.values() for entry in entries}

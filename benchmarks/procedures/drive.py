@@ -89,7 +89,7 @@ class TestCar:
     __test__ = False  # pytest would take it for tests
 
 
-ENV_ID, _SEED = "sideslip/YawFusion-v0", 0  # of every drive
+ENV_ID = "sideslip/AfsYawFusion-v1"  # of every drive
 _RATIO = 16.0  # steering wheel to front wheels, a usual rack's
 
 # The standards' 80 km/h is the passenger car's. The COMS oversteers and is unstable above 63 km/h;
@@ -98,6 +98,14 @@ CARS: dict[str, TestCar] = {
     "coms": TestCar(COMS, 40.0 / 3.6, _RATIO, 2.395, 0.5),
     "passenger-car": TestCar(PASSENGER_CAR, 80.0 / 3.6, _RATIO, 4.2, 0.8),
 }
+
+
+def _make_policies(recipe: str) -> dict[str, str]:
+    """Make the names of a recipe's policies that steer, by car."""
+    return {car: f"{recipe}-{name}-steering" for car, name in _SHORT.items()}
+
+
+_SHORT = {"coms": "coms", "passenger-car": "car"}
 
 
 @dataclass(frozen=True)
@@ -125,11 +133,12 @@ class ProcedureEntry:
         card = load_policy(name).card
         return name, card.estimator, card.estimator_options
 
-    def drive(self, car: str) -> DriveFunction:
+    def drive(self, car: str, seed: int = 0) -> DriveFunction:
         """Make the drives of a car; references stay within what friction can hold.
 
         Args:
             car: One of `CARS`.
+            seed: Seed of what errs in car and sensors.
 
         Returns:
             The function that drives.
@@ -141,7 +150,7 @@ class ProcedureEntry:
             env = make_env(ENV_ID, estimator, estimate, scenario=CALM | dict(fields), **options)
             base: Any = env.unwrapped
             rows = []
-            for step in iterate_steps(env, make_agent(agent, env), _SEED):
+            for step in iterate_steps(env, make_agent(agent, env), seed):
                 t, steer, moment = (step.info[name] for name in ("t", "steer", "yaw_moment"))
                 rows.append([t, steer, *base.motion[:POSE], moment])
             env.close()
@@ -150,18 +159,21 @@ class ProcedureEntry:
         return run_drive
 
 
-_OUTPUTS = ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres", "inverse_friction"]
-_TYRES = {"outputs": _OUTPUTS}
-_DISTILLED = {"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
+_FORCES: dict[str, Any] = {
+    "outputs": ["beta", "gamma", "F_d", "N_d"],
+    "options": {"slow": ["camera", "gps"]},
+}
+_TYRES = {"outputs": [*_FORCES["outputs"], "front_tyres", "rear_tyres", "inverse_friction"]}
 ENTRIES = (
     ProcedureEntry("none"),
-    ProcedureEntry("feedforward"),
-    ProcedureEntry("two-dof", "exact-kf"),
-    ProcedureEntry("lqr", "exact-kf"),
+    ProcedureEntry("two-dof", "exact-kf", _FORCES),
+    ProcedureEntry("model-following", "exact-kf", _FORCES),
     ProcedureEntry("esc"),
+    ProcedureEntry("lqr", "exact-kf", _FORCES),
     ProcedureEntry("adaptive-lqr", "joint", _TYRES),
     ProcedureEntry("adaptive-nmpc", "joint", _TYRES, slow=True),
-    ProcedureEntry("distilled", policies=_DISTILLED),
+    ProcedureEntry("policy on joint", policies=_make_policies("distill")),
+    ProcedureEntry("policy on sensors", policies=_make_policies("raw")),
 )
 
 

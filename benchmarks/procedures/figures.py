@@ -45,7 +45,7 @@ def draw_figures(results: Mapping[str, CaseResults]) -> list[tuple[str, go.Figur
 
 def _draw_yaw_rates(done: CaseResults) -> go.Figure:
     """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
-    drives = {case.agent: result.shown for case, result in done.items()}
+    drives = {case.agent: results[0].shown for case, results in done.items()}
     t = max((shown.t for shown in drives.values()), key=len)
     series = {
         agent: _compute_shares(shown, t)

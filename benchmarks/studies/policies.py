@@ -247,7 +247,7 @@ class Lessons:
     kind: str  # class of tasks
     estimator: str = ""  # that the student reads, one of `FILTERS`
     teacher: str = _RIVAL
-    """Baseline, controller with its filter of the benchmark, or policy with its card's."""
+    """Baseline, controller on the student's filter if it has one, or policy with its card's."""
     cars: int = 6  # of each task's lesson
     varied: int = 0
     """Further lessons of each task by `VARIED`, which share as many cars, rounded up; no filter and
@@ -287,7 +287,7 @@ class Lessons:
                 scenario_options: JsonMap = {}
                 if change:
                     scenario_options["scenario"] = vary_scenario(task, change)
-                name = reads.get(teacher, REFERENCE_FILTER)
+                name = reads.get(teacher, self.estimator or REFERENCE_FILTER)
                 count = -(-self.cars // self.varied) if change else self.cars
                 scenario_options["lead_in"] = QUICK_LEAD_IN
                 varied_task = replace(task, changes=scenario_options)

@@ -27,8 +27,8 @@ from ..report.study import Request, Study
 ID = "sideslip/Highway-v0"
 _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = ORACLES[STATE][0]
-_READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
-CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
+_READS = {"none": "", ORACLE: ""}
+CONTROLLERS = ("none", "two-dof", "lqr", "nmpc", ORACLE)
 _SEEDS, _DRIVES, _CHUNK = (64, 16), (4, 1), 8  # of a usual and of a quick run
 FIRST_SEED = 2**29
 _ENDS = ("spin", "collision", "departure")

@@ -191,9 +191,7 @@ def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[A
         Errors of the sideslip angle and their deviations (rad), once settled, every 10 ms.
     """
     log, dt = episode.log, episode.log.record.dt
-    config = parse_config(
-        NAME, FILTERS[NAME], log.slow, {"slow": list(log.slow) or None, **options}
-    )
+    config = parse_config(NAME, FILTERS[NAME], log.slow, options)
     # without the check of stability, which costs ten runs
     filters, schedules = assemble(config, episode.facts["vehicle"], dt, None)
     estimates = Estimator(config, dt, filters, schedules).run(log)

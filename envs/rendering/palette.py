@@ -26,11 +26,10 @@ CONTROLLERS = {
     "none": GREY, "feedforward": "#C6A200", "two-dof": "#CF75AB", "model-following": "#1BBD75",
     "esc": "#755A75", "sliding-mode": "#C61248", "lqr": "#D85A00", "mpc": "#127EE1",
     "nmpc": "#3F3FFC", "adaptive-lqr": "#A84300", "adaptive-nmpc": "#5A36FC",
-    "lane-keeping": "#486C3F", "learned": "#D8636C", "ppo-yaw-vision": "#AB6387",
-    "ppo-exact-kf": "#8A4FBF", "ppo-coms-steering": "#C2571A", "ppo-coms-yaw": "#7A5FD0",
+    "lane-keeping": "#486C3F", "learned": "#D8636C",
     "distill-coms-steering": "#8C6D1F", "distill-coms-yaw": "#2E8B9E",
-    "distill-car-steering": "#B0603A", "distill-car-yaw": "#5E8F2E", "raw-car-steering": "#1F93C6",
-    "raw-car-yaw": "#2A8DBD", "raw-coms-yaw": "#3D84B8", "raw-coms-steering": "#15698F",
+    "distill-car-steering": "#B0603A", "distill-car-yaw": "#5E8F2E",
+    "raw-car-steering": "#1F93C6", "raw-coms-steering": "#15698F",
 }  # fmt: skip
 ORACLES = {
     "nominal": "#CF00B4", "oracle-parameters": "#63905A", "oracle-parameters-lqr": "#48905A",

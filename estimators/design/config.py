@@ -188,7 +188,8 @@ def _select_slow_sensors(
             raise ValueError(f"{reader.name} uses no slow sensor, got slow={slow!r}")
         return ()
     if slow is None:
-        requested = [sensor for sensor in row.slow if sensor in available][:1]
+        requested = [sensor for sensor in row.slow if sensor in available]
+        requested = requested if row.uses_all else requested[:1]
         inertial = "accel_y" in dict(row.options).get("fast", row.fast)
         if not requested and (available or not inertial):
             requested = [" or ".join(row.slow)]

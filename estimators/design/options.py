@@ -112,7 +112,9 @@ class FilterOptions:
     Defaults are the common ones; a row of `FILTERS` has its own.
     """
 
-    slow: tuple[str, ...] = _make(None, "slow sensors; several by covariance; None: the first")
+    slow: tuple[str, ...] = _make(
+        None, "slow sensors; several by covariance; None: one, of joint all"
+    )
     gains: str = _make("", "periodic or covariance; of dual-rate constant, from-29 or placed")
     delay: str = _make("clone", f"rule for late samples: {', '.join(RULES)}; see core.innovation")
     assumed_delay: float = _make(0.033, "delay of all samples, by the rule constant", "s", POSITIVE)

@@ -19,6 +19,7 @@ from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
 from sideslip.estimators.vector.truth import TruthObservation as BatchTruth
 from sideslip.estimators.wrappers.truth import TruthObservation
+from tests.policies import VISION
 
 ID = "sideslip/YawVision-v0"
 SCENARIO = {"base": "slalom", "duration": 0.3, "onset": 0.0}
@@ -157,7 +158,7 @@ def test_another_wrapper_is_refused_by_name(name: str, outside: str) -> None:
                        "inside of it; .* transparent = True"):  # fmt: skip
         make_agent("lqr", env)
     with pytest.raises(ValueError, match=name):
-        make_agent("learned", env, policy="ppo-yaw-vision")
+        make_agent("learned", env, policy=VISION)
 
 
 def test_a_wrapper_itself_may_be_declared_transparent() -> None:
@@ -240,7 +241,7 @@ def _wrapped(name: str) -> Any:
 def test_what_is_no_env_of_ours_is_refused_in_one_line() -> None:
     other = gym.make("CartPole-v1")
     for env in (other, gym.make_vec("CartPole-v1", 2), SyncVectorEnv([lambda: other]), ID, 5):
-        for name in ("lqr", "learned", "none"):
+        for name in ("lqr", VISION, "none"):
             with pytest.raises(TypeError, match=r"gym\.make\('sideslip/YawVision-v0'\)") as caught:
                 make_agent(name, env)  # type: ignore[arg-type]
             assert "\n" not in str(caught.value)

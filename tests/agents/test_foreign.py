@@ -105,7 +105,7 @@ def test_the_command_line_takes_entry_points_and_lists_names() -> None:
     ("agent", "error", "message"),
     [
         ("yaw-dumper", ValueError, "unknown agent 'yaw-dumper'; did you mean 'yaw-damper'"),
-        ("ppo-yaw-visoin", ValueError, "did you mean 'ppo-yaw-vision'"),
+        ("distill-car-yav", ValueError, "did you mean 'distill-car-yaw'"),
         ("nowhere:Thing", ValueError, "there is no module 'nowhere'"),
         (3, TypeError, "3 is no agent: int has no predict"),
         (lambda env: None, TypeError, "is no agent: NoneType has no predict"),

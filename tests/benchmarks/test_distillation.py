@@ -24,6 +24,7 @@ from sideslip.benchmarks.studies.policies import (
 )
 from sideslip.envs.vehicle.parameters import VEHICLES
 from tests.benchmarks.conftest import Run
+from tests.policies import GRU, TRACES
 
 
 def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
@@ -172,7 +173,7 @@ def test_a_distillation_that_cannot_be_is_one_line(
 
 def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None:
     """All of its class, but on tensors those of one kind of plant."""
-    policy, task = prepare_start(Path("raw-car-yaw"))
+    policy, task = prepare_start(Path(GRU))
     assert isinstance(policy, Policy)
     names = [each.scenario for each in _list_tasks("car-yaw")]
     driven = task(algo="gradient").scenarios
@@ -186,7 +187,7 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
 
 def test_where_it_is_said_contests_are_varied_too() -> None:
     """Each so often, by the training's seed, and not as a distillation's lessons are."""
-    _, task = prepare_start(Path("raw-coms-yaw"), 2)
+    _, task = prepare_start(Path(TRACES), 2)
     names = [each.scenario for each in _list_tasks("coms-zero-slip")]
     found = task().scenarios
     varied = [each for each in found if not isinstance(each, str)]
@@ -205,8 +206,8 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     for agent, fields, said in (
         (None, {}, "for a policy of a class of contests, got None"),
         (Path("here/best_model.zip"), {}, "got here/best_model.zip"),
-        (Path("raw-coms-yaw"), {"scenarios": ["coms-step"]}, "without other scenarios"),
-        (Path("raw-coms-yaw"), {"env_options": {"scenario": "coms-step"}}, "without other"),
+        (Path(TRACES), {"scenarios": ["coms-step"]}, "without other scenarios"),
+        (Path(TRACES), {"env_options": {"scenario": "coms-step"}}, "without other"),
     ):
         with pytest.raises(ValueError, match=said):
             prepare_start(agent, 2)[1](**fields)

@@ -23,6 +23,7 @@ from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salte
 from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation
 from tests.benchmarks.conftest import Run
+from tests.policies import VISION
 
 SHORT = {"base": "random-steering", "duration": 1.5}
 HERE = "sideslip/YawVision-v0"
@@ -162,17 +163,17 @@ def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -
         assert word in out
     status, out, _ = run("run", HERE, "--agent", path, "--scenario", "lane-change")
     assert status == 0 and "lane-change" in out
-    assert "ppo-yaw-vision" in run("list")[1]
+    assert "distill-car-yaw" in run("list")[1]
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("nobody",), "unknown policy 'nobody'; known: distill-car-"),
-        (("ppo-yaw-vision", "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
-        (("ppo-yaw-vision", "--scenario", "moon"), "unknown scenario 'moon'"),
-        (("ppo-yaw-vision", "--html", "nowhere/report.html"), "no such folder"),
-        (("ppo-yaw-vision", "--episodes", 0), "greater than or equal to 1"),
+        ((VISION, "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
+        ((VISION, "--scenario", "moon"), "unknown scenario 'moon'"),
+        ((VISION, "--html", "nowhere/report.html"), "no such folder"),
+        ((VISION, "--episodes", 0), "greater than or equal to 1"),
     ],
 )
 def test_a_mistake_is_told(run: Run, arguments: tuple[object, ...], said: str) -> None:

@@ -8,57 +8,58 @@ import pytest
 
 from sideslip.benchmarks import readme
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
-from sideslip.benchmarks.control.tasks import (
-    NOMINAL,
-    STATE,
-    TITLES,
-)
+from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]
+ROWS, TRANSFER = (read_json(ROOT / path) for path in (readme.ROWS, readme.TRANSFER))
 
 
-def test_the_page_of_the_benchmark_is_made_from_its_file() -> None:
-    text, rows = (ROOT / readme.PAGE).read_text(), readme._read_tier_rows(ROOT / readme.ROWS)
-    assert readme._replace_table(text, readme.make_table(rows)) == text
-    other = [replace(row, value=1.5 * row.value) for row in rows]
-    assert readme._replace_table(text, readme.make_table(other)) != text
-    kept = {row.scenario: row.n for row in rows if row.controller == STATE}
-    assert all(f" {n}" in text for n in kept.values()), kept  # what its prose says of the episodes
+def test_the_tables_are_made_from_their_files() -> None:
+    pages = {readme.README: readme.make_table(ROWS, TRANSFER)}
+    pages[readme.PAGE] = readme.make_task_table(ROWS)
+    for path, made in pages.items():
+        text = (ROOT / path).read_text()
+        assert readme.replace_table(text, made) == text
+        assert f"{readme.EPISODES} drives" in text
 
 
 def test_the_readme_is_a_door() -> None:
-    """At most 900 words; its table is its file's, of nine rows at most."""
-    text, rows = (ROOT / readme.README).read_text(), read_json(ROOT / readme.FIRST_ROWS)
+    """At most 900 words; its table has nine rows at most."""
+    text = (ROOT / readme.README).read_text()
     assert len(text.split()) <= 900
-    made = readme._make_first_table(rows)
-    assert readme._replace_table(text, made) == text and len(made.splitlines()) <= 2 + 9
-    episodes = {row.n for row in rows if row.controller == NOMINAL}
-    assert f"{readme.EPISODES} drives of each of 21 manoeuvres" in text and len(episodes) > 1
+    assert len(readme.make_table(ROWS, TRANSFER).splitlines()) <= 2 + 9
 
 
 def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
     text = " ".join((ROOT / readme.README).read_text().split())
-    assert readme._make_headlines(ROOT) and all(
-        line in text for line in readme._make_headlines(ROOT)
-    )
+    lines = readme._make_headlines(ROOT)
+    assert lines and all(line in text for line in lines)
 
 
-def test_a_line_has_every_driven_tier_with_cost_interval_and_failures() -> None:
-    assert set(readme.HEADS) > set(TITLES)
+def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -> None:
     cost = ResultRow("control", "tier road", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12)
     rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
     rows += [replace(row, scenario="tier limit", controller="esc") for row in rows]
-    lines = readme.make_table(rows).splitlines()
-    assert lines[0] == "| | road: 60-90 km/h | limit: 70-110 km/h |"
+    far = replace(cost, scenario="fmvss-126 passenger-car", metric="amplitude", value=3.5)
+    lines = readme.make_table(rows, [far]).splitlines()
+    assert lines[0].startswith("| | small car, 18-28 km/h | road, ") and len(TITLES) == 3
     (line,) = (line for line in lines if line.startswith("| no control"))
-    assert line == "| no control | 50 [40, 60] (7) |  |"
-    with pytest.raises(ValueError, match="no table that begins with the tiers"):
-        readme._replace_table("# a README", line)
+    assert line == "| no control |  | 50 (7) |  | 3.5 |  |"
+    with pytest.raises(ValueError, match="no table that begins with"):
+        readme.replace_table("# a README", line)
+
+
+def test_a_task_has_a_line_with_intervals() -> None:
+    task = next(task for task in list_scored_tasks() if task.env_id == STEERING)
+    cost = ResultRow("control", task.name, "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12)
+    rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
+    (line,) = (x for x in readme.make_task_table(rows).splitlines() if "50 [" in x)
+    assert line.startswith(f"| {task.scenario} |") and line.endswith("| 50 [40, 60] (7) |")
 
 
 def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = DriveResult(np.zeros((0, len(NUMBERS))), 0.0, error="no action")
     monkeypatch.setattr(readme, "measure", lambda x, *_, **__: dict.fromkeys(x, wrong))
     with pytest.raises(ValueError, match=r"in .*: no action"):
-        readme._measure_first()
+        readme._measure_entries()

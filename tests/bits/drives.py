@@ -25,6 +25,7 @@ from sideslip.envs import SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import TIERS
 from sideslip.estimators import FILTERS, EstimateObservation, make_estimator
 from sideslip.estimators.vector import EstimateObservation as VectorEstimate
+from tests.policies import VISION
 
 KEPT = Path(__file__).with_name("digests.json")
 STEPS = 1000
@@ -35,7 +36,7 @@ IDS = (
     "sideslip/YawVision-v0",
     "sideslip/YawVisionUneven-v0",
 )
-AGENTS = ("two-dof", "model-following", "esc", "sliding-mode", "lqr", "ppo-yaw-vision")
+AGENTS = ("two-dof", "model-following", "esc", "sliding-mode", "lqr", VISION)
 
 
 class Digest:

@@ -52,7 +52,7 @@ def test_ours_are_in_it_and_cannot_be_taken() -> None:
         register_estimator("dakf", Constant)
     with pytest.raises(ValueError, match="agent 'lqr' is registered already"):
         register_agent("lqr", CONSTANT)
-    for policy in ("ppo-yaw-vision", "here/mine.safetensors"):
+    for policy in ("distill-car-yaw", "here/mine.safetensors"):
         with pytest.raises(ValueError, match="is the name of a policy"):
             register_agent(policy, CONSTANT)
 

@@ -121,6 +121,11 @@ def test_the_table_has_estimates_and_counts() -> None:
     text = console.export_text()
     assert "+5.730" in text and "deg/s" in text and "t 2.5 s" in text
     assert "3 of 998 deadlines missed" in text and "5 datagrams bad, 1 lost" in text
+    assert "is lost" not in text
+    lost = STATUS._replace(healthy=0.0)
+    seen.datagram_received(encode(DatagramKind.STATUS, 0, 0, lost), None)
+    console.print(_make_table(seen, "mine"))
+    assert "the estimator is lost" in console.export_text()
 
 
 def test_nothing_of_a_name_ends_the_pages_script() -> None:

@@ -21,6 +21,7 @@ from sideslip.agents.training.normalise import RewardScale
 from sideslip.agents.training.trainer import Trainer
 from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import make_device_env
+from tests.policies import GRU
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
 SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.016}, "control_period": 2}
@@ -132,13 +133,13 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
 
 
 def begun(task: TrainingTask, folder: Path) -> Any:
-    return Trainer(task, 1, folder, trained_agent=load_policy("raw-car-yaw")).build().model
+    return Trainer(task, 1, folder, trained_agent=load_policy(GRU)).build().model
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:
     task = tuned_task()
     model, env = begun(task, tmp_path), task.vector_env(4)
-    ours = PolicyController(env, "raw-car-yaw")
+    ours = PolicyController(env, GRU)
     obs, _ = env.reset(seed=0)
     mine, theirs, start = None, None, np.ones(4, np.bool_)
     for _ in range(100):

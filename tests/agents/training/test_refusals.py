@@ -24,11 +24,12 @@ from tests.agents.training.test_distill import COURSE, ID, OPTIONS
 from tests.agents.training.test_distill import lesson as distilled
 from tests.agents.training.test_gradient import made, tuned_task
 from tests.agents.training.test_starts import TASK, foreign
+from tests.policies import GRU
 
 VISION = "sideslip/YawVision-v0"
 TINY = TrainingTask(num_envs=8, seed=3, n_eval_envs=4)
 SETTINGS = {algo: TrainingTask(algo=algo).settings for algo in ("ppo", "gradient")}
-POLICY, RAW = load_policy("distill-coms-yaw"), load_policy("raw-car-yaw")
+POLICY, RAW = load_policy("distill-coms-yaw"), load_policy(GRU)
 COMS = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip", "scenario": "coms-slalom"}
 FEW: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS}
 SLALOM = "coms-slalom"

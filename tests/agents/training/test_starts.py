@@ -42,6 +42,7 @@ from sideslip.agents.training.warm_start import (
 )
 from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import make_device_env
+from tests.policies import GRU
 
 POLICY = load_policy("distill-coms-yaw")
 SHORT = {"scenario": {"base": "coms-slalom", "duration": 0.3}}
@@ -61,9 +62,9 @@ def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
     assert task.settings["policy_kwargs"]["activation_fn"] == "silu"
     mixed = make_finetune_task(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
     assert "scenario" not in mixed.env_options and mixed.seed == 3
-    one = make_finetune_task(load_policy("ppo-coms-yaw"), env_options={"scenario": "coms-step"})
+    one = make_finetune_task(POLICY, env_options={"scenario": "coms-step"})
     assert one.env_options == COMS | {"scenario": "coms-step"} and not one.scenarios
-    assert len(make_finetune_task(load_policy("ppo-coms-yaw")).scenarios) == 7
+    assert len(make_finetune_task(POLICY).scenarios) == 7
     for other in ("exact-kf", ""):
         behind = make_finetune_task(POLICY, estimator=other)
         assert (behind.estimator, behind.estimator_options) == (other, {})
@@ -120,7 +121,7 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
     [
         ("ppo", "distill-coms-yaw", 0),
         ("ppo", "distill-coms-yaw", 96),
-        ("gradient", "raw-car-yaw", 96),
+        ("gradient", GRU, 96),
     ],
 )
 @torch.no_grad()

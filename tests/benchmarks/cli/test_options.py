@@ -79,7 +79,7 @@ CASES = [
          ("--map yaw_rate_degps=r", "mapping", ["yaw_rate_degps=r"])),
     *_of("bench control", f"{CLI}.main.write_page", ("--page a.md", "path", Path("a.md"))),
     *_of("calibrate", f"{CLI}.search.use_engine", *CLUSTER),
-    *_of("enjoy ppo-yaw-vision", "benchmarks.studies.policies.evaluate_policy",
+    *_of("enjoy distill-car-yaw", "benchmarks.studies.policies.evaluate_policy",
          ("--seed 7", "seed", 7)),
     *_of("export a.zip", "agents.training.export.export_zip",
          ("--option reference=model", "env_options", {"reference": "model"}),

@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.benchmarks.tuning import estimator as tuning
 from tests.benchmarks.conftest import Run
+from tests.policies import VISION
 
 LQR = ("run", "--agent", "lqr", "--estimator", "exact-kf")
 SCENARIO = "tie-vision-fig8"
@@ -18,7 +19,7 @@ NEEDS = {"train": "stable_baselines3", "train-estimator": "torch", "tune": "optu
 MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
     (("run", "--beside", "none"), "'none' can only drive beside in a film: --video"),
-    (("enjoy", "ppo-yaw-vision", "--video", "film.avi"), "a film ends in .mp4 or .gif"),
+    (("enjoy", VISION, "--video", "film.avi"), "a film ends in .mp4 or .gif"),
     (("run", "--scenario", "moon"), "unknown scenario 'moon'"),
     (("run", "--agent", "pid"), "unknown agent 'pid'"),
     (("run", "sideslip/YawVision-v0", "--estimator", "dakf"), "dakf needs the slow sensor gps"),
@@ -42,7 +43,7 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("run", "--scenario", "gust.txt"), "gust.txt: the file of a scenario ends in .toml or"),
     (("list", "scenario"), "unknown kind of name 'scenario'; did you mean 'scenarios'"),
     (("bench", "weather"), "unknown suite 'weather'; known: estimation"),
-    (("enjoy", "ppo-yaw-vision", "--parquet", "rows.txt"), "a file that ends in .parquet"),
+    (("enjoy", VISION, "--parquet", "rows.txt"), "a file that ends in .parquet"),
     (("replay", "nowhere.csv", "--parquet", "rows.txt"), "a file that ends in .parquet"),
     (("replay", "nowhere.csv"), "nowhere.csv"),
     (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),

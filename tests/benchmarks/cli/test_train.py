@@ -21,6 +21,7 @@ from sideslip.benchmarks.cli.train import _choose_folder, _make_command
 from sideslip.benchmarks.studies import policies as enjoy
 from sideslip.benchmarks.studies.policies import _list_tasks
 from tests.benchmarks.conftest import Run
+from tests.policies import TRACES
 
 NO_COSTS = Mock(**{"summarise.return_value": {"cost": {}}})
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
@@ -139,7 +140,7 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     assert status == 2 and "without --out here" in err
     status, _, err = run("--resume", "-f", "logs")
     assert status == 2 and "logs is for a new training: name the old --out" in err
-    status, _, err = run("-i", "raw-coms-yaw", "-f", "logs")
+    status, _, err = run("-i", TRACES, "-f", "logs")
     assert status == 2 and "drives nothing that remembers as raw-coms-yaw: --out" in err
     for wrong in (("--steps", 0), ("--device", "moon"), ("--eval-freq", 0)):
         status, _, err = run(*TINY, *wrong, "-f", "logs")

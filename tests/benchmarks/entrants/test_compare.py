@@ -36,6 +36,7 @@ from sideslip.benchmarks.entrants.challenge import (
 )
 from sideslip.benchmarks.entrants.score import _make_sentence, compose_verdict, make_table
 from tests.benchmarks.conftest import Run
+from tests.policies import VISION
 
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 PD = """
@@ -244,7 +245,7 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
         *(("esc", "dakf"), ("esc", ""), ("two-dof", "dakf"), ("two-dof", "")),
         ("lqr", "dakf"),
     ]
-    assert make_user_entries(["ppo-yaw-vision"], [])[0].estimator == ""
+    assert make_user_entries([VISION], [])[0].estimator == ""
 
 
 def test_contests_are_those_of_the_id() -> None:
@@ -265,18 +266,11 @@ def test_contests_are_those_of_the_id() -> None:
         assert ComparisonRequest(esc, scenarios=(*gusts, gusts[0] | {"name": "b"})).tasks
 
 
-def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it was tuned, and no tuned options of its own."""
-    tuned = {NOMINAL: {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.6}}}
-    monkeypatch.setattr(
-        "sideslip.benchmarks.control.entries.get_tuned_options",
-        lambda kind, name: tuned.get(name, {}),
-    )
+def test_a_users_agent_has_nominals_filter_and_no_tuned_options() -> None:
     mine = on_default("my.py:Pd")
-    assert ControlCase(ControlTask(), mine).options == {
-        "filter": {"force_sd": 7.0},
-        "controller": {},
-    }
+    case, nominal = ControlCase(ControlTask(), mine), ControlCase(ControlTask(), on_default("lqr"))
+    assert case.options == {"filter": {}, "controller": {}}
+    assert case.estimate_options == nominal.estimate_options
     assert mine.is_users and not on_default("esc").is_users and not on_default(NOMINAL).is_users
 
 

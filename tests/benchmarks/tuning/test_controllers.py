@@ -76,7 +76,7 @@ def test_an_adaptive_contestant_is_tuned_on_the_filter_it_follows(
     tuning = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
     _run_contestant(tuning.contests[0], tuning.name, tuning._make_options(tuning.start), (1,))
     (case,) = asked
-    assert case.entry.estimator == "joint" and case.estimate_options["options"].keys() == {"slow"}
+    assert case.entry.estimator == "joint" and case.estimate_options["options"] == {}
     assert case.agent_options["horizon"] == 0.5
     assert case.env_options["lead_in"] == QUICK_LEAD_IN
 

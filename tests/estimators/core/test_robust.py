@@ -49,6 +49,14 @@ def filter_with_tyres(log: Log, **options: Any) -> Estimator:
     return built("exact-kf", log, **WITH_TYRES | options)
 
 
+def test_without_options_it_uses_every_slow_sensor_that_is_there() -> None:
+    log = drive()[1]
+    for names in (("camera",), ("gps",), ("camera", "gps"), ()):
+        sensors = {name: log.slow[name] for name in names}
+        assert tuple(make_estimator("joint", sensors=sensors).config.sensors) == names
+    assert tuple(make_estimator("exact-kf", sensors=log.slow).config.sensors) == ("camera",)
+
+
 @pytest.mark.parametrize("noise", [0.03, 0.1, 0.8])
 def test_the_accelerometers_noise_is_found_and_never_less_than_configured(noise: float) -> None:
     _, log = drive(noise, "straight")
