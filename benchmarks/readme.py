@@ -19,6 +19,7 @@ from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FIL
 from .control.run import Results, measure
 from .control.score import rank_entries
 from .control.tasks import (
+    LIMIT,
     NOMINAL,
     STATE,
     STEERING,
@@ -46,6 +47,7 @@ ENTRIES: Mapping[str, Sequence[tuple[str, str]]] = {
     "no control": [("none", "")],
 }
 """The lines of the tables, and who stands for each: of a policy the one of the task's car."""
+_BEST = "`adaptive-nmpc` on `joint`"
 _PROCEDURES = {"distill-car-steering": "policy on joint", "raw-car-steering": "policy on sensors"}
 _TRANSFER = {
     "FMVSS 126": ("fmvss-126 passenger-car", "amplitude", 1.0, ".1f"),
@@ -171,16 +173,14 @@ def _make_headlines(root: Path) -> list[str]:
     whole = table["rows"][0]
     key, speeds = ("YawFusion-v0 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
     (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
-    cells = _Cells(read_json(root / ROWS))
-    names = "policy on `joint`", "tuned LQG: `lqr` on `exact-kf`"
-    costs = [
-        [cells.find(f"tier {tier}", ENTRIES[name])[METRICS[0]].value for tier in TITLES]
-        for name in names
-    ]
-    policy, lqg = ([round(100.0 * x) for x in values] for values in costs)
+    cells, limit = _Cells(read_json(root / ROWS)), f"tier {LIMIT}"
+    found = [cells.find(f"tier {tier}", ENTRIES[_BEST]) for tier in TITLES]
+    costs = [round(100.0 * metrics[METRICS[0]].value) for metrics in found]
+    lost = [cells.find(limit, x)[METRICS[1]].value for x in (ENTRIES[_BEST], [(NOMINAL, "")])]
+    first, second = (round(100.0 * share) for share in lost)
     return [
-        f"learned policies cost {min(policy)} to {max(policy)} % of a well-designed LQG's errors,",
-        f"a tuned one {min(lqg)} to {max(lqg)} %.",
+        f"costs {min(costs)} to {max(costs)} % of a well-designed LQG controller, and loses "
+        f"{first} instead of {second} % of the cars at the limit.",
         f"On {table['n']} of them it errs {whole['rms / deg']:.2f} deg (RMS), and its 95 % "
         f"interval holds {whole['in 95 % / %']:.0f} % of the time.",
         f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
