@@ -10,7 +10,7 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from ..envs.numerics import require_extra
-from ..envs.task import make_info
+from ..envs.task import GAMMA_SCALE, STEER_SCALE, ObservationEntry, make_info, make_space
 from ..envs.vector import StabilityVectorEnv
 from ..envs.vehicle.dynamics import Motion
 from ..estimators.vector import estimate as vector_estimate
@@ -18,10 +18,10 @@ from ..estimators.vector import truth as vector_truth
 from ..estimators.vector.estimate import EstimateObservation
 from ..estimators.wrappers import estimate as single_estimate
 from ..estimators.wrappers import truth as single_truth
-from .env_info import CarVectorEnv
+from .env_info import CarVectorEnv, get_layout
 
 with require_extra("train", "training needs torch and stable-baselines3"):
-    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 Observations = npt.NDArray[np.float32]
@@ -37,6 +37,11 @@ _SHARED_ATTRIBUTES = (  # each is the same for all rows
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
 _METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
+_SCALES = {  # by unit, what is much in a drive; other units keep their numbers
+    "rad": STEER_SCALE, "rad/s": GAMMA_SCALE, "m/s": 10.0, "m/s2": 1.0, "m": 1.0, "N": 500.0,
+    "N m": 100.0, "1/m": 0.01,
+}  # fmt: skip
+_WIDE_SCALES = {"gps_X": 100.0, "gps_Y": 100.0}  # m, positions on a map
 _TWINS: dict[type, type] = {
     single_estimate.EstimateObservation: vector_estimate.EstimateObservation,
     single_truth.TruthObservation: vector_truth.TruthObservation,
@@ -239,6 +244,62 @@ class _NativeVecEnv(VecEnv):
         return [self._rows[i] for i in self._get_indices(indices)]
 
 
+def get_scales(layout: Sequence[ObservationEntry]) -> npt.NDArray[np.float32]:
+    """Get the fixed scale of each entry of an observation.
+
+    Args:
+        layout: Entries of the observation.
+
+    Returns:
+        Scales in the entries' units, shape (k,).
+    """
+    scales = [_WIDE_SCALES.get(name, _SCALES.get(unit, 1.0)) for name, unit, *_ in layout]
+    return np.array(scales, np.float32)
+
+
+def scale_layout(layout: Sequence[ObservationEntry]) -> tuple[ObservationEntry, ...]:
+    """Divide the bounds of an observation's entries by their scales.
+
+    Args:
+        layout: Entries in their units.
+
+    Returns:
+        Entries without units.
+    """
+    return tuple(
+        ObservationEntry(name, "-", low / float(scale), high / float(scale))
+        for (name, _, low, high), scale in zip(layout, get_scales(layout), strict=True)
+    )
+
+
+class ScaledVecEnv(VecEnvWrapper):
+    """Observations over fixed scales and rewards per second, outside of the monitor.
+
+    Both are of order one, as stable-baselines3's defaults expect. The monitor and `infos` have the
+    costs as they are.
+
+    Args:
+        venv: Monitor around the bridge.
+        layout: Entries of its observation.
+    """
+
+    def __init__(self, venv: VecEnv, layout: Sequence[ObservationEntry]) -> None:
+        super().__init__(venv, make_space(scale_layout(layout)))
+        ticks, dt = (venv.get_attr(name)[0] for name in ("control_period", "dt"))
+        self._scales, self._period = get_scales(layout), np.float32(ticks * dt)
+
+    def reset(self) -> Observations:
+        """Reset the inner env and scale its observations."""
+        return np.asarray(self.venv.reset(), np.float32) / self._scales
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step the inner env and scale its observations, last ones too, and rewards."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones).tolist():
+            infos[i]["terminal_observation"] = infos[i]["terminal_observation"] / self._scales
+        return np.asarray(obs) / self._scales, rewards / self._period, dones, infos
+
+
 def make_vec_env(
     env_id: str,
     num_envs: int = 1,
@@ -248,11 +309,14 @@ def make_vec_env(
     monitor_file: str | None = None,
     info_keywords: Sequence[str] = (),
     wrapper_class: _Wrapping | None = None,
-) -> VecMonitor:
+    scaled: bool = True,
+) -> VecMonitor | ScaledVecEnv:
     """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
-    It has the bits of a `DummyVecEnv` of single environments with the same seeds. Its `infos` hold
-    one empty dict for all rows but those whose episode ends.
+    Observations are over fixed scales, such as 0.05 rad, and rewards are per second: what learns
+    with stable-baselines3's defaults needs numbers of order one. Episodes of the monitor keep their
+    costs. With `scaled=False` it has the bits of a `DummyVecEnv` of single environments with the
+    same seeds. Its `infos` hold one empty dict for all rows but those whose episode ends.
 
     Args:
         env_id: Id of an env with a native vector env.
@@ -264,6 +328,7 @@ def make_vec_env(
         info_keywords: Keys of the last step's info that go into that file.
         wrapper_class: Wrapper for the vector env, applied outside the estimator's wrapper; its
             result becomes the `VecEnv`.
+        scaled: Whether observations and rewards are scaled; no controller reads such observations.
 
     Returns:
         `VecEnv` that monitors episodes.
@@ -272,7 +337,8 @@ def make_vec_env(
     bridge = _NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
     bridge.action_space.seed(seed)
     bridge.seed(seed)
-    return VecMonitor(bridge, monitor_file, tuple(info_keywords))
+    monitor = VecMonitor(bridge, monitor_file, tuple(info_keywords))
+    return ScaledVecEnv(monitor, get_layout(env)) if scaled else monitor
 
 
 def make_native_env(

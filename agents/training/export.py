@@ -24,6 +24,7 @@ from ..env_info import AnyEnv, CarEnv, get_env_facts
 from ..learned.forward import ACTIVATIONS, RecurrentCell
 from ..learned.network import SUFFIX, Network
 from ..learned.policy import Card, Policy, save_policy
+from ..vec_env import get_scales, scale_layout
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -217,8 +218,10 @@ def policy_from_zip(
     check_trusted(file, trust)
     content, weights = _read(file)
     policy = _build_policy(file, content, weights)
-    frames = _count_frames(file, policy.observation_space, get_env_facts(env).layout)
+    frames, scales = _match_frames(file, policy.observation_space, get_env_facts(env).layout)
     network = convert_sb3_policy(policy, load_normaliser(file, trust, normalise), frames)
+    scales = np.resize(scales, network.mean.shape)  # of all frames, or of one
+    network = replace(network, mean=network.mean * scales, scale=network.scale / scales)
     algorithm = f"stable-baselines3's {type(policy).__name__}"
     described = {"algorithm": algorithm, "steps": int(content.get("num_timesteps", 0))}
     return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
@@ -406,13 +409,32 @@ def load_normaliser(
     return normaliser
 
 
-def _count_frames(file: Path, space: gym.Space[Any], layout: Sequence[ObservationEntry]) -> int:
-    """Count the layout's frames in the policy's observation; ValueError for another observation."""
+def is_scaled(file: Path, layout: Sequence[ObservationEntry]) -> bool:
+    """Return whether a zip was trained on `ScaledVecEnv`, by the text that its space has in JSON.
+
+    Args:
+        file: Zip of stable-baselines3; nothing in it is unpickled.
+        layout: Entries of the observation.
+
+    Returns:
+        True where the bounds are those of scaled entries.
+    """
+    with ZipFile(file) as archive:
+        space = json.loads(archive.read("data")).get("observation_space", {})
+    return bool(space.get("low") == str(make_space(scale_layout(layout)).low))
+
+
+def _match_frames(
+    file: Path, space: gym.Space[Any], layout: Sequence[ObservationEntry]
+) -> tuple[int, Array]:
+    """Count the layout's frames in the policy's observation, and get the scales of its entries."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
     if frames > 0 and rest == 0 and space == make_space(layout, frames):
-        return frames
+        return frames, np.ones(1)
+    if frames > 0 and rest == 0 and space == make_space(scale_layout(layout), frames):
+        return frames, get_scales(layout).astype(np.float64)
     raise ValueError(
         f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
         f"observation here has {len(layout)}: {', '.join(entry.name for entry in layout)}. An "

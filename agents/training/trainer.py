@@ -223,7 +223,7 @@ class Trainer:
         options = dict[str, Any](estimator=task.estimator_kwargs)
         options["env_kwargs"] = task.options(task.num_envs)
         options["wrapper_class"] = start.wrap_env if start else None
-        env = make_vec_env(task.env_id, task.num_envs, **options)
+        env = make_vec_env(task.env_id, task.num_envs, scaled=False, **options)
         first, period = task.first_seed + steps, callback.period
         if start and start.driver:
             n_steps = -(-(self.steps - steps) // env.num_envs)

@@ -22,7 +22,7 @@ from ..learned.forward import CELL_WEIGHTS, MovingAverages
 from ..learned.network import Network
 from ..learned.policy import Policy
 from ..rollout import iterate_steps
-from ..vec_env import Observations
+from ..vec_env import Observations, get_scales
 from .config import (
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
@@ -31,7 +31,7 @@ from .config import (
     get_algorithm,
     read_settings,
 )
-from .export import check_zip, load_normaliser
+from .export import check_zip, is_scaled, load_normaliser
 from .normalise import StandardisedArguments, read_normalisation
 from .student import SAMPLE_STRIDE, compute_whitening
 
@@ -173,6 +173,9 @@ class WarmStart:
             return
         width = (self.env.single_observation_space.shape or (0,))[0]
         mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
+        layout = get_layout(self.env)
+        scales = get_scales(layout) if is_scaled(file, layout) else np.ones(width)
+        mean, scale = mean * scales, scale / scales
         self.scaling = StandardisedArguments(mean.tolist(), scale.tolist(), clip)
 
     def _read_policy(self, policy: Policy, task: TrainingTask) -> None:

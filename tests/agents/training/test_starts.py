@@ -15,6 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sideslip.agents.env_info import get_layout
 from sideslip.agents.learned.policy import Card, Policy, load_policy
 from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
 from sideslip.agents.training.callbacks import (
@@ -40,7 +41,7 @@ from sideslip.agents.training.warm_start import (
     make_finetune_task,
     resolve_settings,
 )
-from sideslip.agents.vec_env import make_vec_env
+from sideslip.agents.vec_env import get_scales, make_vec_env
 from sideslip.envs.device import make_device_env
 from tests.policies import GRU
 
@@ -97,7 +98,8 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
 
     def cars() -> Any:
         options = task.options(4)
-        return make_vec_env(task.env_id, 4, estimator=task.estimator_kwargs, env_kwargs=options)
+        kwargs: Any = {"estimator": task.estimator_kwargs, "env_kwargs": options}
+        return make_vec_env(task.env_id, 4, **kwargs, scaled=False)
 
     table = _measure_reward_scale(driver, cars(), 7, 100)  # an episode has 30
     assert all(len(each) == 4 for each in table) and len({x for row in table for x in row}) == 12
@@ -253,9 +255,10 @@ def begin(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     return training.build().model
 
 
-def foreign(path: Path, normalised: bool, **options: Any) -> Any:
+def foreign(path: Path, normalised: bool, scaled: bool = False, **options: Any) -> Any:
     """A zip as rl-baselines3-zoo leaves it, and what acts in it."""
-    env: Any = make_vec_env(TASK.env_id, 2, env_kwargs=FAST)
+    env: Any = make_vec_env(TASK.env_id, 2, env_kwargs=FAST, scaled=scaled)
+    scales = get_scales(get_layout(TASK.vector_env(2))) if scaled else 1.0
     if normalised:
         env = VecNormalize(env)
     model = PPO("MlpPolicy", env, device="cpu", seed=1, n_steps=32, batch_size=64, **options)
@@ -263,7 +266,12 @@ def foreign(path: Path, normalised: bool, **options: Any) -> Any:
     model.save(path)
     if normalised:
         env.save(path.with_name("vecnormalize.pkl"))
-    return lambda x: model.predict(env.normalize_obs(x) if normalised else x, deterministic=True)[0]
+
+    def act(x: Any) -> Any:
+        x = x / scales
+        return model.predict(env.normalize_obs(x) if normalised else x, deterministic=True)[0]
+
+    return act
 
 
 def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
@@ -283,9 +291,13 @@ def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
     assert torch.equal(again.policy.state_dict()[name], other[name])
 
 
-@pytest.mark.parametrize("normalised", [True, False])
-def test_a_zip_from_elsewhere_acts_as_it_did(normalised: bool, tmp_path: Path) -> None:
-    acts = foreign(tmp_path / "model.zip", normalised)
+@pytest.mark.parametrize(
+    ("normalised", "scaled"), [(True, False), (False, False), (True, True), (False, True)]
+)
+def test_a_zip_from_elsewhere_acts_as_it_did(
+    normalised: bool, scaled: bool, tmp_path: Path
+) -> None:
+    acts = foreign(tmp_path / "model.zip", normalised, scaled)
     model = begin(tmp_path, tmp_path / "model.zip", trust=True)
     x = observations()
     assert np.ptp(acts(x)) > 1e-4

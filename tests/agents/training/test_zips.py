@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import sideslip
+from sideslip.agents.env_info import get_env_facts
 from sideslip.agents.learned.policy import load_policy
 from sideslip.agents.training.export import convert_sb3_policy, export_zip
 
@@ -23,9 +24,13 @@ import torch  # noqa: E402
 from stable_baselines3.common import envs  # noqa: E402
 from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
 from stable_baselines3.common.torch_layers import FlattenExtractor  # noqa: E402
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import (  # noqa: E402
+    VecEnvWrapper,
+    VecFrameStack,
+    VecNormalize,
+)
 
-from sideslip.agents.vec_env import make_vec_env  # noqa: E402
+from sideslip.agents.vec_env import get_scales, make_vec_env  # noqa: E402
 
 torch.set_num_threads(1)
 ID, GUST = "sideslip/YawVision-v0", {"base": "gust", "duration": 0.3}
@@ -54,8 +59,8 @@ MODELS: dict[str, tuple[Any, Any]] = {
 }
 
 
-def bridged(rows: int = 3, env_id: str = ID) -> Any:
-    return make_vec_env(env_id, rows, seed=0, env_kwargs={"scenario": GUST})
+def bridged(rows: int = 3, env_id: str = ID, scaled: bool = False) -> Any:
+    return make_vec_env(env_id, rows, seed=0, env_kwargs={"scenario": GUST}, scaled=scaled)
 
 
 def normalised(env: Any) -> VecNormalize:
@@ -127,6 +132,34 @@ def test_a_stack_of_frames_is_recognised(tmp_path: Path, inside: bool) -> None:
         return obs[:, -22:]
 
     assert difference(model, tmp_path / "mine.zip", env, newest) < 1e-6
+
+
+class Keep(VecEnvWrapper):
+    """Keeps the newest observation."""
+
+    newest: Any
+
+    def reset(self) -> Any:
+        self.newest = self.venv.reset()
+        return self.newest
+
+    def step_wait(self) -> Any:
+        outcome = self.venv.step_wait()
+        self.newest = outcome[0]
+        return outcome
+
+
+@pytest.mark.parametrize("around", [None, "normalised", "stacked"])
+def test_a_zip_of_scaled_observations_reads_plain_ones(around: Any, tmp_path: Path) -> None:
+    """Its scales are found by the bounds of its space, with no file beside it."""
+    keep, scales = Keep(bridged(scaled=True)), get_scales(get_env_facts(bridged()).layout)
+    env: Any = normalised(keep) if around == "normalised" else keep
+    env = VecFrameStack(keep, 3) if around == "stacked" else env
+    model = made(sb3.PPO, "MlpPolicy", env)
+    model.save(tmp_path / "mine.zip")
+    if around == "normalised":
+        env.save(str(tmp_path / "mine.pkl"))
+    assert difference(model, tmp_path / "mine.zip", env, lambda: keep.newest * scales) < 1e-5
 
 
 @pytest.fixture(scope="module")

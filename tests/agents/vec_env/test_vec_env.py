@@ -12,6 +12,7 @@ from gymnasium import wrappers
 from gymnasium.wrappers import vector
 
 from sideslip.agents import make_agent
+from sideslip.agents.env_info import get_env_facts
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
@@ -30,7 +31,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sideslip.agents.training.normalise import RewardScale, RewardScaleWrapper
-from sideslip.agents.vec_env import EMPTY_INFO, _NativeVecEnv, make_vec_env
+from sideslip.agents.vec_env import EMPTY_INFO, _NativeVecEnv, get_scales, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}
@@ -40,7 +41,7 @@ RANDOM: dict[str, Any] = {"phase": None, "loss": 0.2}
 
 
 def native(name: str, count: int, wish: Any = None, **arguments: Any) -> _NativeVecEnv:
-    env = make_vec_env(name, count, estimator=wish, env_kwargs=arguments).venv
+    env = make_vec_env(name, count, estimator=wish, env_kwargs=arguments, scaled=False).venv
     assert isinstance(env, _NativeVecEnv)
     return env
 
@@ -194,7 +195,7 @@ def test_the_empty_info_refuses_to_be_written_into() -> None:
 
 def test_monitor_and_normalisation_work_on_it() -> None:
     """The same sums and statistics as around the single environments."""
-    ours: Any = make_vec_env(VISION, 3, seed=3, env_kwargs={"scenario": SHORT})
+    ours: Any = make_vec_env(VISION, 3, seed=3, env_kwargs={"scenario": SHORT}, scaled=False)
     theirs: Any = DummyVecEnv([lambda: Monitor(gym.make(VISION, scenario=SHORT))] * 3)
     theirs.seed(3)
     one: Any = VecNormalize(VecCheckNan(ours, True))
@@ -223,13 +224,38 @@ def test_the_monitors_file_keeps_words_of_the_last_info(tmp_path: Path) -> None:
     assert lines[2].split(",")[4] == "True"
 
 
+@pytest.mark.parametrize("name", ["sideslip/YawVision-v1", "sideslip/AfsYawFusion-v1"])
+def test_what_learners_see_is_of_order_one_and_the_cost_is_the_envs(name: str) -> None:
+    """Observations in every unit and rewards per second; the monitor has the plain sums."""
+    scenario = {"base": "random-steering", "duration": 2.0}
+    options: Any = {"estimator": "exact-kf", "env_kwargs": {"scenario": scenario}}
+    ours: Any = make_vec_env(name, 32, 3, **options)
+    plain: Any = make_vec_env(name, 32, 3, **options, scaled=False)
+    scales = get_scales(get_env_facts(plain).layout)
+    seen, paid = [ours.reset()], []
+    assert bits(seen[0]) == bits(plain.reset() / scales)
+    for step in range(200):
+        (obs, rewards, dones, infos), other = (env.step(drawn(ours, step)) for env in (ours, plain))
+        assert bits(obs) == bits(other[0] / scales) and obs[0] in ours.observation_space
+        np.testing.assert_allclose(rewards, 100.0 * other[1], rtol=1e-6)
+        seen.append(obs)
+        paid.append(rewards)
+    assert dones.all()
+    for info, wanted in zip(infos, other[3], strict=True):
+        assert info["episode"]["r"] == wanted["episode"]["r"] and info["cost"] == wanted["cost"]
+        assert bits(info["terminal_observation"]) == bits(wanted["terminal_observation"] / scales)
+    settled = np.array(seen[50:-1])  # until then a sensor has said nothing
+    assert np.abs(settled).max() < 40.0 and 0.1 < settled.std(axis=(0, 1)).max() < 10.0
+    assert -5.0 < np.mean(paid) < -0.2
+
+
 @pytest.mark.parametrize("agent", ["none", "lqr"])
 def test_a_controller_is_evaluated_like_a_network(agent: str) -> None:
     """The returns of each row's first episodes are those of the single environments."""
     wish = {"estimator": "exact-kf", "outputs": ["beta", "gamma", "F_d", "N_d"], "std": False}
     rewards = []
     for env in (
-        make_vec_env(VISION, 2, 3, wish, {"scenario": SHORT}),
+        make_vec_env(VISION, 2, 3, wish, {"scenario": SHORT}, scaled=False),
         dummy(VISION, 2, wish, scenario=SHORT),
     ):
         env.seed(3)
@@ -286,13 +312,14 @@ def test_what_cannot_be_bridged_says_why() -> None:
 
 def within(wrapper: Any) -> Any:
     """A bridged vector env with a wrapper of Gymnasium's inside of the bridge."""
-    return make_vec_env(VISION, 2, 0, wrapper_class=wrapper)
+    return make_vec_env(VISION, 2, 0, wrapper_class=wrapper, scaled=False)
 
 
 def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) -> None:
-    env, single = make_vec_env(VISION, 2, 0), DummyVecEnv([lambda: Monitor(gym.make(VISION))])
+    env = make_vec_env(VISION, 2, 0, scaled=False)
+    single = DummyVecEnv([lambda: Monitor(gym.make(VISION))])
     rated = RewardScaleWrapper(env, RewardScale([[1.0, 1.0]]))
-    filmed = make_vec_env(VISION, 2, 0, env_kwargs={"render_mode": "rgb_array"})
+    filmed = make_vec_env(VISION, 2, 0, env_kwargs={"render_mode": "rgb_array"}, scaled=False)
     film = VecVideoRecorder(filmed, str(tmp_path), lambda _: False)
     rewards = VecNormalize(env, norm_obs=False)
     for same in (env, single, rated, film, rewards, VecCheckNan(env), VecMonitor(env)):
@@ -300,7 +327,8 @@ def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) ->
     assert make_agent("none", within(vector.NormalizeReward)).control_period == 10
     changed: Any = VecNormalize(env), VecFrameStack(env, 2), within(vector.ClipAction)
     changed += (DummyVecEnv([lambda: wrappers.NormalizeObservation(gym.make(VISION))]),)
-    names = "VecNormalize", "VecFrameStack", "ClipAction", "NormalizeObservation"
+    changed += (make_vec_env(VISION, 2, 0),)
+    names = "VecNormalize", "VecFrameStack", "ClipAction", "NormalizeObservation", "ScaledVecEnv"
     for name, each in zip(names, changed, strict=True):
         with pytest.raises(ValueError, match=f"^{name} may change observations or actions"):
             make_agent("none", each)
