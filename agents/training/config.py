@@ -161,7 +161,7 @@ class TrainingTask:
         ValueError: A name is unknown, a number out of range, or fields contradict each other.
     """
 
-    env_id: str = "sideslip/YawVision-v0"  # of a native vector env
+    env_id: str = "sideslip/YawVision-v1"  # of a native vector env
     algo: str = "ppo"  # name in `ALGORITHMS`
     estimator: str = ""  # of `EstimateObservation`, "" for none
     env_options: dict[str, Any] = field(default_factory=dict)  # of `gym.make`, in JSON types

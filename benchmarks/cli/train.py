@@ -34,7 +34,7 @@ class _Train:
     """
 
     algo: Text = take("ppo, sac, tqc, recurrent-ppo, gradient (ppo).")
-    env_id: Text = take("An environment's id (sideslip/YawVision-v0).", None, "--env")
+    env_id: Text = take("An environment's id (sideslip/YawVision-v1).", None, "--env")
     estimator: Text = take("An estimator's name (none).")
     estimator_options: Texts = take(
         'NAME=VALUE of EstimateObservation, as outputs=["beta","F_d"].', None, "--estimator-option"

@@ -123,7 +123,7 @@ REFUSED: dict[str, Refusal] = {
     "no scenario": training("unknown scenario 'moon'", env_options={"scenario": "moon"}),
     "other env": training("has no native vector env", "CartPole-v1"),
     "nothing to pay": training(
-        "costs nothing there: there is nothing to learn", env_options={"scenario": QUIET}
+        "costs nothing there: there is nothing to learn", VISION, env_options={"scenario": QUIET}
     ),
     "no window": (lambda _: made(None, n_steps=0), "n_steps is at least 1, got 0"),
     "no source": (lambda _: made(None).learn(1), "needs their source"),

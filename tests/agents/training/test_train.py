@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from sideslip import __version__
+from sideslip.agents import make_agent
+from sideslip.agents.baselines import make_oracle
 from sideslip.agents.learned.policy import PolicyController
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs.vector import StabilityVectorEnv
@@ -271,6 +273,11 @@ def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_ppo_passes_a_quarter_of_none_within_a_minute(tmp_path: Path) -> None:
-    found = trainer.Trainer(TrainingTask(), 250_000, tmp_path).train().best
-    assert found.of_none < 0.25
+def test_ppo_without_options_costs_at_most_a_fifth_more_than_nominal(tmp_path: Path) -> None:
+    task = TrainingTask()
+    trainer.Trainer(task, int(task.settings["n_timesteps"]), tmp_path).train()
+    nominal, agent = make_oracle("nominal", task.env_id, 64, {"autoreset_mode": "SameStep"})
+    env, seeds = task.vector_env(64), range(64)
+    policy = make_agent(str(tmp_path / POLICY), env)
+    found, known = evaluate_costs(env, policy, seeds), evaluate_costs(nominal, agent, seeds)
+    assert found.mean() < 1.2 * known.mean()

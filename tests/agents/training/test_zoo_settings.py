@@ -25,7 +25,7 @@ def run_zoo(script: str, algo: str, folder: Path, *words: str) -> str:
     """What a script of the zoo prints; it drives `YawVision` on one core."""
     command = [
         *(sys.executable, "-m", f"rl_zoo3.{script}", "--algo", ALGORITHMS[algo].zoo),
-        *("--env", "sideslip/YawVision-v0", "--gym-packages", "sideslip", "--device", "cpu"),
+        *("--env", "sideslip/YawVision-v1", "--gym-packages", "sideslip", "--device", "cpu"),
         *("-f", str(folder), "--seed", "0", *words),
     ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -41,7 +41,7 @@ def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) ->
     few = [f"{name}:{value}" for name, value in FEW.items() if name in settings]
     file = ("--conf-file", str(HYPERPARAMS / f"{zoo}.yml"), "--eval-freq", "-1")
     run_zoo("train", algo, tmp_path, *file, "-n", "256", "-params", *few)
-    (zipped,) = (tmp_path / zoo / "sideslip-YawVision-v0_1").glob("sideslip*.zip")
+    (zipped,) = (tmp_path / zoo / "sideslip-YawVision-v1_1").glob("sideslip*.zip")
     task = TrainingTask(algo=algo, num_envs=4, n_eval_envs=4)
     Trainer(task, 64, tmp_path / "on", trained_agent=zipped, trust=True).train()
 

@@ -43,7 +43,7 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert "best" in out and f"here/{POLICY}" in out and "of none's" in out
     card = load_policy(f"here/{POLICY}").card
     assert shlex.split(card.command)[1:] == [
-        "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
+        "train", "--algo", "ppo", "--env", "sideslip/YawVision-v1",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
         "--n-eval-envs", "4", "--eval-freq", "250000",
     ]  # fmt: skip
@@ -56,7 +56,7 @@ def test_it_goes_on_with_what_the_folder_holds(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: NO_COSTS)
-    folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
+    folder = "train-YawVision-v1-ppo-sine-with-dwell-0"
     assert run(*TINY, "--steps", 256, "--eval-freq", 256)[0] == 0
     status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
     assert status == 0, err
@@ -133,8 +133,8 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     for number in (1, 2):
         status, out, err = run(*TINY, "--steps", 64, "-f", "logs")
         assert status == 0, err
-        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{POLICY}" in out
-    params = tmp_path / "logs/ppo/sideslip-YawVision-v0_2/sideslip-YawVision-v0"
+        assert f"logs/ppo/sideslip-YawVision-v1_{number}/{POLICY}" in out
+    params = tmp_path / "logs/ppo/sideslip-YawVision-v1_2/sideslip-YawVision-v1"
     assert "scenario: sine-with-dwell" in (params / "args.yml").read_text()
     status, _, err = run(*TINY, "-f", "logs", "--out", "here")
     assert status == 2 and "without --out here" in err
