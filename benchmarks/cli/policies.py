@@ -191,7 +191,7 @@ class _Distill:
     )
     option: Texts = take("NAME=VALUE of what is observed: with_map, fast; repeatable.")
     seed: int = take("Of weights and episodes.", 0)
-    episodes: int = take("Episodes of each contest's test.", 32, min=2)
+    episodes: int = take("Episodes of each contest's test.", 32, min=5)
     out: File = take("The file; default: NAME here.")
 
     def run(self) -> None:

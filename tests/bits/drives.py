@@ -25,9 +25,9 @@ from sideslip.envs import SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import TIERS
 from sideslip.estimators import FILTERS, EstimateObservation, make_estimator
 from sideslip.estimators.vector import EstimateObservation as VectorEstimate
-from tests.policies import VISION
 
 KEPT = Path(__file__).with_name("digests.json")
+VISION = str(Path(__file__).parents[1] / "files/old/ppo-yaw-vision.safetensors")
 STEPS = 1000
 IDS = (
     "sideslip/AfsYawFusion-v0",
@@ -166,7 +166,7 @@ def cases() -> Iterator[tuple[str, Callable[[], str]]]:
         name, filter = IDS[1], "exact-kf"
         if agent == "model-following":
             name, filter = IDS[0], "dakf"
-        yield f"agent {agent}", partial(_estimated, name, filter, agent, reference="model")
+        yield f"agent {Path(agent).stem}", partial(_estimated, name, filter, agent, reference="model")
     for plant in ("single-track", "drift", "multi-body"):
         yield f"outside {plant}", partial(_bare, "sideslip/Outside-v0", 100, model=plant)
 
