@@ -38,7 +38,6 @@ SPEEDS = dict(zip(TITLES, ("18-28 km/h", "60-90 km/h", "70-110 km/h"), strict=Tr
 ENTRIES: Mapping[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", JOINT), ("distill-coms-steering", JOINT)],
-    "policy on the late sensors alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
     "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", JOINT)],
     "`adaptive-lqr` on `joint`": [("adaptive-lqr", JOINT)],
     "tuned LQG: `lqr` on `exact-kf`": [(REFERENCE_CONTROLLER, REFERENCE_FILTER)],
@@ -48,7 +47,7 @@ ENTRIES: Mapping[str, Sequence[tuple[str, str]]] = {
 }
 """The lines of the tables, and who stands for each: of a policy the one of the task's car."""
 _BEST = "`adaptive-nmpc` on `joint`"
-_PROCEDURES = {"distill-car-steering": "policy on joint", "raw-car-steering": "policy on sensors"}
+_PROCEDURES = {"distill-car-steering": "policy on joint"}
 _TRANSFER = {
     "FMVSS 126": ("fmvss-126 passenger-car", "amplitude", 1.0, ".1f"),
     "another plant": ("outside multi-body", "paired", 100.0, ".0f"),

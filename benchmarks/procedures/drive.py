@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...agents import make_agent
+from ...agents import Agent, make_agent
 from ...agents.learned.policy import load_policy
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.vehicle.parameters import COMS, PASSENGER_CAR, Vehicle
+from ..control.entries import ControlCase, Entry
+from ..control.tasks import STEERING, ControlTask
 from ..harness.drives import make_env
 
 Fields = Mapping[str, Any]
@@ -89,7 +91,7 @@ class TestCar:
     __test__ = False  # pytest would take it for tests
 
 
-ENV_ID = "sideslip/AfsYawFusion-v1"  # of every drive
+ENV_ID = STEERING.replace("-v0", "-v1")  # of every drive
 _RATIO = 16.0  # steering wheel to front wheels, a usual rack's
 
 # The standards' 80 km/h is the passenger car's. The COMS oversteers and is unstable above 63 km/h;
@@ -98,14 +100,6 @@ CARS: dict[str, TestCar] = {
     "coms": TestCar(COMS, 40.0 / 3.6, _RATIO, 2.395, 0.5),
     "passenger-car": TestCar(PASSENGER_CAR, 80.0 / 3.6, _RATIO, 4.2, 0.8),
 }
-
-
-def _make_policies(recipe: str) -> dict[str, str]:
-    """Make the names of a recipe's policies that steer, by car."""
-    return {car: f"{recipe}-{name}-steering" for car, name in _SHORT.items()}
-
-
-_SHORT = {"coms": "coms", "passenger-car": "car"}
 
 
 @dataclass(frozen=True)
@@ -133,6 +127,21 @@ class ProcedureEntry:
         card = load_policy(name).card
         return name, card.estimator, card.estimator_options
 
+    def make_agent(self, car: str, env: Any) -> Agent:
+        """Make the agent with the options that were tuned for the benchmark.
+
+        Args:
+            car: One of `CARS`, or an outside model, which is taken for the passenger car.
+            env: Env of the agent.
+
+        Returns:
+            Agent.
+        """
+        agent, estimator, _ = self.get_configuration(car)
+        vehicle = car if car in CARS else "passenger-car"
+        task = ControlTask(env_id=STEERING, vehicle=vehicle)
+        return make_agent(agent, env, **ControlCase(task, Entry(agent, estimator)).agent_options)
+
     def drive(self, car: str, seed: int = 0) -> DriveFunction:
         """Make the drives of a car; references stay within what friction can hold.
 
@@ -143,14 +152,14 @@ class ProcedureEntry:
         Returns:
             The function that drives.
         """
-        agent, estimator, estimate = self.get_configuration(car)
+        _, estimator, estimate = self.get_configuration(car)
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
 
         def run_drive(fields: Fields) -> Series:
             env = make_env(ENV_ID, estimator, estimate, scenario=CALM | dict(fields), **options)
             base: Any = env.unwrapped
             rows = []
-            for step in iterate_steps(env, make_agent(agent, env), seed):
+            for step in iterate_steps(env, self.make_agent(car, env), seed):
                 t, steer, moment = (step.info[name] for name in ("t", "steer", "yaw_moment"))
                 rows.append([t, steer, *base.motion[:POSE], moment])
             env.close()
@@ -159,6 +168,7 @@ class ProcedureEntry:
         return run_drive
 
 
+_POLICIES = {"coms": "distill-coms-steering", "passenger-car": "distill-car-steering"}
 _FORCES: dict[str, Any] = {
     "outputs": ["beta", "gamma", "F_d", "N_d"],
     "options": {"slow": ["camera", "gps"]},
@@ -172,8 +182,7 @@ ENTRIES = (
     ProcedureEntry("lqr", "exact-kf", _FORCES),
     ProcedureEntry("adaptive-lqr", "joint", _TYRES),
     ProcedureEntry("adaptive-nmpc", "joint", _TYRES, slow=True),
-    ProcedureEntry("policy on joint", policies=_make_policies("distill")),
-    ProcedureEntry("policy on sensors", policies=_make_policies("raw")),
+    ProcedureEntry("policy on joint", policies=_POLICIES),
 )
 
 

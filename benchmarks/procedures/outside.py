@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ...agents import make_agent
 from ...agents.rollout import rollout
 from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
 from ...envs.record import Array
@@ -153,8 +152,8 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> lis
         Episodes in the order of their seeds.
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
-    agent_name, estimator, estimate = entry.get_configuration(model)
+    _, estimator, estimate = entry.get_configuration(model)
     env = make_env(_ENV_ID, estimator, estimate, **options)
-    agent = make_agent(agent_name, env)
+    agent = entry.make_agent(model, env)
     rollouts = [rollout(env, agent, seed) for seed in seeds]
     return [OutsideEpisode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in rollouts]

@@ -166,7 +166,10 @@ def cases() -> Iterator[tuple[str, Callable[[], str]]]:
         name, filter = IDS[1], "exact-kf"
         if agent == "model-following":
             name, filter = IDS[0], "dakf"
-        yield f"agent {Path(agent).stem}", partial(_estimated, name, filter, agent, reference="model")
+        yield (
+            f"agent {Path(agent).stem}",
+            partial(_estimated, name, filter, agent, reference="model"),
+        )
     for plant in ("single-track", "drift", "multi-body"):
         yield f"outside {plant}", partial(_bare, "sideslip/Outside-v0", 100, model=plant)
 
