@@ -53,6 +53,7 @@ _TRANSFER = {
     "another plant": ("outside multi-body", "paired", 100.0, ".0f"),
 }
 """Columns of transfer: scenario, metric, factor and format."""
+_RIVAL = (REFERENCE_CONTROLLER, "paired")  # against whom costs are paired there
 EPISODES = 32  # a contest
 
 
@@ -133,7 +134,8 @@ def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
         line = [name, *(cells.format(f"tier {tier}", pairs, False) for tier in TITLES)]
         for scenario, metric, factor, form in _TRANSFER.values():
             row = found.get((scenario, agent, metric))
-            line.append("" if row is None else f"{factor * row.value:{form}}")
+            value = row.value if row else 1.0 if (agent, metric) == _RIVAL else None
+            line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)
     tiers = (f"{tier}, {SPEEDS[tier]}" for tier in TITLES)
     return _format_table(lines, [*tiers, *_TRANSFER])

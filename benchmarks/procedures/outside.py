@@ -152,6 +152,7 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> lis
         Episodes in the order of their seeds.
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
+    options |= {"steering": True, "sensors": "fusion"}
     _, estimator, estimate = entry.get_configuration(model)
     env = make_env(_ENV_ID, estimator, estimate, **options)
     agent = entry.make_agent(model, env)

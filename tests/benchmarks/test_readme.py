@@ -46,6 +46,7 @@ def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -
     assert lines[0].startswith("| | small car, 18-28 km/h | road, ") and len(TITLES) == 3
     (line,) = (line for line in lines if line.startswith("| no control"))
     assert line == "| no control |  | 50 (7) |  | 3.5 |  |"
+    assert any("`lqr` on" in line and line.endswith("| 100 |") for line in lines)
     with pytest.raises(ValueError, match="no table that begins with"):
         readme.replace_table("# a README", line)
 
