@@ -100,17 +100,18 @@ class _Cells:
     def find(self, scenario: str, pairs: Sequence[tuple[str, str]]) -> dict[str, ResultRow]:
         """The metrics of the first pair that drove the scenario, by name."""
         for pair in pairs:
-            found = {m: self._rows[k] for m in METRICS if (k := (scenario, *pair, m)) in self._rows}
-            if found:
-                return found
+            keys = {metric: (scenario, *pair, metric) for metric in METRICS}
+            metrics = {x: self._rows[key] for x, key in keys.items() if key in self._rows}
+            if metrics:
+                return metrics
         return {}
 
     def format(self, scenario: str, pairs: Sequence[tuple[str, str]], interval: bool) -> str:
         """Cost in % of nominal's, with its interval if asked, and in brackets cars lost in %."""
-        found = self.find(scenario, pairs)
-        if not found:
+        metrics = self.find(scenario, pairs)
+        if not metrics:
             return ""
-        cost, lost = found.get(METRICS[0]), found[METRICS[1]]
+        cost, lost = metrics.get(METRICS[0]), metrics[METRICS[1]]
         low, high = (100.0 * x for x in (cost.low, cost.high)) if cost else (math.nan, math.nan)
         ends = f" [{low:.0f}, {high:.0f}]" if interval and cost else ""
         number = f"{100.0 * cost.value:.0f}" if cost else "-"
@@ -128,12 +129,12 @@ def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
         Markdown.
     """
     cells, lines = _Cells(rows), []
-    found = {(row.scenario, row.controller, row.metric): row for row in transfer}
+    far = {(row.scenario, row.controller, row.metric): row for row in transfer}
     for name, pairs in ENTRIES.items():
         agent = _PROCEDURES.get(pairs[0][0], pairs[0][0])
         line = [name, *(cells.format(f"tier {tier}", pairs, False) for tier in TITLES)]
         for scenario, metric, factor, form in _TRANSFER.values():
-            row = found.get((scenario, agent, metric))
+            row = far.get((scenario, agent, metric))
             value = row.value if row else 1.0 if (agent, metric) == _RIVAL else None
             line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)
@@ -175,8 +176,8 @@ def _make_headlines(root: Path) -> list[str]:
     key, speeds = ("YawFusion-v0 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
     (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
     cells, limit = _Cells(read_json(root / ROWS)), f"tier {LIMIT}"
-    found = [cells.find(f"tier {tier}", ENTRIES[_BEST]) for tier in TITLES]
-    costs = [round(100.0 * metrics[METRICS[0]].value) for metrics in found]
+    by_tier = [cells.find(f"tier {tier}", ENTRIES[_BEST]) for tier in TITLES]
+    costs = [round(100.0 * metrics[METRICS[0]].value) for metrics in by_tier]
     lost = [cells.find(limit, x)[METRICS[1]].value for x in (ENTRIES[_BEST], [(NOMINAL, "")])]
     first, second = (round(100.0 * share) for share in lost)
     return [

@@ -409,21 +409,6 @@ def load_normaliser(
     return normaliser
 
 
-def is_scaled(file: Path, layout: Sequence[ObservationEntry]) -> bool:
-    """Return whether a zip was trained on `ScaledVecEnv`, by the text that its space has in JSON.
-
-    Args:
-        file: Zip of stable-baselines3; nothing in it is unpickled.
-        layout: Entries of the observation.
-
-    Returns:
-        True where the bounds are those of scaled entries.
-    """
-    with ZipFile(file) as archive:
-        space = json.loads(archive.read("data")).get("observation_space", {})
-    return bool(space.get("low") == str(make_space(scale_layout(layout)).low))
-
-
 def _match_frames(
     file: Path, space: gym.Space[Any], layout: Sequence[ObservationEntry]
 ) -> tuple[int, Array]:

@@ -4,10 +4,13 @@ A policy's moving averages become part of the environments, for algorithms witho
 """
 
 import itertools
+import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import ZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +25,7 @@ from ..learned.forward import CELL_WEIGHTS, MovingAverages
 from ..learned.network import Network
 from ..learned.policy import Policy
 from ..rollout import iterate_steps
-from ..vec_env import Observations, get_scales
+from ..vec_env import Observations, get_scales, scale_layout
 from .config import (
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
@@ -31,7 +34,7 @@ from .config import (
     get_algorithm,
     read_settings,
 )
-from .export import check_zip, is_scaled, load_normaliser
+from .export import check_zip, load_normaliser
 from .normalise import StandardisedArguments, read_normalisation
 from .student import SAMPLE_STRIDE, compute_whitening
 
@@ -118,6 +121,13 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     return {"net_arch": list(network.hidden), "activation_fn": network.activation}
 
 
+def _is_scaled(file: Path, layout: Sequence[ObservationEntry]) -> bool:
+    """Return whether a zip was trained on `ScaledVecEnv`, by its space as JSON has it."""
+    with ZipFile(file) as archive:
+        space = json.loads(archive.read("data")).get("observation_space", {})
+    return bool(space.get("low") == str(make_space(scale_layout(layout)).low))
+
+
 class WarmStart:
     """The start of a training from a zip of stable-baselines3 or from a policy.
 
@@ -174,7 +184,7 @@ class WarmStart:
         width = (self.env.single_observation_space.shape or (0,))[0]
         mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
         layout = get_layout(self.env)
-        scales = get_scales(layout) if is_scaled(file, layout) else np.ones(width)
+        scales = get_scales(layout) if _is_scaled(file, layout) else np.ones(width)
         mean, scale = mean * scales, scale / scales
         self.scaling = StandardisedArguments(mean.tolist(), scale.tolist(), clip)
 
