@@ -1,4 +1,4 @@
-"""Envs with an estimator in front, and logged episodes with what their filters are made of."""
+"""Envs with an estimator in front, logged episodes, their filters and their drawn steering."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -6,8 +6,14 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import gymnasium as gym
+import numpy as np
 
-from ...envs.record import Log
+from ...envs.record import Array, Log
+from ...envs.vehicle.parameters import Vehicle
+from ...estimators.design.assemble import assemble
+from ...estimators.design.config import parse_config
+from ...estimators.estimator import Estimator
+from ...estimators.filters import FILTERS
 from ...estimators.protocol import UnobservableWarning
 from ...estimators.wrappers.estimate import EstimateObservation, make_spec
 
@@ -33,6 +39,49 @@ def make_filter_arguments(base: Any) -> dict[str, Any]:
         Arguments by name, dt (s) too.
     """
     return make_spec(base)._asdict() | {"dt": base.dt}
+
+
+def make_unchecked_filter(
+    name: str, log: Log, vehicle: Vehicle, options: Mapping[str, object]
+) -> Estimator:
+    """Make a filter for a log without the check of stability, which costs ten runs.
+
+    Args:
+        name: Name of the filter.
+        log: Log, of which it takes all slow sensors.
+        vehicle: Car that it assumes.
+        options: Options over its defaults.
+
+    Returns:
+        The filter.
+    """
+    slow = {"slow": list(log.slow) or None}
+    config = parse_config(name, FILTERS[name], log.slow, slow | dict(options))
+    return Estimator(config, log.record.dt, *assemble(config, vehicle, log.record.dt, None))
+
+
+def draw_steering(rng: np.random.Generator, amplitude: float, duration: float) -> Array:
+    """Draw a steering angle every 10 ms: sines, and plateaus that begin within 0.25 s.
+
+    Args:
+        rng: Generator.
+        amplitude: Size of the angle (rad).
+        duration: Duration (s).
+
+    Returns:
+        Steering angles (rad), shape (n,).
+    """
+    time = np.arange(round(duration / 0.01)) * 0.01
+    angle = np.zeros(len(time))
+    for share, frequency, phase in rng.uniform((0.1, 0.08, 0.0), (0.5, 0.9, 6.28), (3, 3)):
+        angle += amplitude * share * np.sin(2.0 * np.pi * frequency * time + phase)
+    plateaus, start = np.zeros(len(time)), 0
+    while start < len(time):
+        end = start + int(rng.uniform(80, 300))
+        plateaus[start:end] = amplitude * rng.choice([0.0, 0.0, rng.uniform(-0.8, 0.8)])
+        start = end
+    angle += np.convolve(plateaus, np.full(25, 1.0 / 25.0), "same")
+    return np.asarray(angle * np.minimum(1.0, time / 0.5))
 
 
 def call_quietly(make: Callable[..., T], *args: object, **options: object) -> T:

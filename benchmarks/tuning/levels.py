@@ -25,12 +25,15 @@ from ...envs.record import FAST, PACKET, Array, Log, concatenate
 from ...envs.scenarios.world import GROUPS, make_world
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
-from ...estimators.design.assemble import assemble
-from ...estimators.design.config import parse_config
 from ...estimators.design.models import BIASES, COURSE_SPEED
-from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
-from ..harness.drives import SETTLED, LoggedEpisode, make_filter_arguments
+from ..harness.drives import (
+    SETTLED,
+    LoggedEpisode,
+    draw_steering,
+    make_filter_arguments,
+    make_unchecked_filter,
+)
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
 
@@ -48,21 +51,6 @@ _SEARCHED = (
 _KINDS = ("camera", "gps", "camera and gps", "gps, 100 Hz", "nothing, 100 Hz")
 _WORST = 100.0  # squared error over its variance, of which more counts as much
 _POPULATION = 12
-
-
-def _draw_steering(rng: np.random.Generator, amplitude: float, duration: float) -> Array:
-    """Draw a steering angle (rad) every 10 ms: sines, and plateaus that begin within 0.25 s."""
-    time = np.arange(round(duration / 0.01)) * 0.01
-    angle = np.zeros(len(time))
-    for share, frequency, phase in rng.uniform((0.1, 0.08, 0.0), (0.5, 0.9, 6.28), (3, 3)):
-        angle += amplitude * share * np.sin(2.0 * np.pi * frequency * time + phase)
-    plateaus, start = np.zeros(len(time)), 0
-    while start < len(time):
-        end = start + int(rng.uniform(80, 300))
-        plateaus[start:end] = amplitude * rng.choice([0.0, 0.0, rng.uniform(-0.8, 0.8)])
-        start = end
-    angle += np.convolve(plateaus, np.full(25, 1.0 / 25.0), "same")
-    return np.asarray(angle * np.minimum(1.0, time / 0.5))
 
 
 def _draw_event(rng: np.random.Generator, is_small: bool) -> dict[str, object]:
@@ -143,7 +131,7 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
     amplitude *= min(1.0, (16.0 / speed) ** 1.2)
     scenario: dict[str, object] = {
         "base": "random-steering", "steering": "trace", "trace_step": 0.01, "onset": 0.0,
-        "trace": tuple(_draw_steering(rng, amplitude, duration)), "duration": duration,
+        "trace": tuple(draw_steering(rng, amplitude, duration)), "duration": duration,
         "speed": speed, "front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4),
         "friction": ((0.8, 1.0), (0.4, 1.0), (0.25, 0.6))[rng.integers(3)],
         "hdop_law": "half", "half_width": 1e4, "gyro_bias": (-0.005, 0.005),
@@ -191,10 +179,7 @@ def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[A
         Errors of the sideslip angle and their deviations (rad), once settled, every 10 ms.
     """
     log, dt = episode.log, episode.log.record.dt
-    config = parse_config(NAME, FILTERS[NAME], log.slow, options)
-    # without the check of stability, which costs ten runs
-    filters, schedules = assemble(config, episode.facts["vehicle"], dt, None)
-    estimates = Estimator(config, dt, filters, schedules).run(log)
+    estimates = make_unchecked_filter(NAME, log, episode.facts["vehicle"], options).run(log)
     rows = slice(round(SETTLED / dt), None, max(1, round(0.01 / dt)))
     column = estimates.names.index("beta")
     error = estimates.x[rows, column] - log.truth["beta"][rows]
