@@ -240,7 +240,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a JSON list of objects; NaN becomes null.
+    """Write rows as a JSON list of objects, one a line; NaN becomes null.
 
     Args:
         path: File.
@@ -253,7 +253,7 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
         }
         for row in rows
     ]
-    write_text(path, json.dumps(plain, indent=1) + "\n")
+    write_text(path, "[\n" + ",\n".join(map(json.dumps, plain)) + "\n]\n")
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
