@@ -52,7 +52,7 @@ STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
-_CONSTANTS = (
+CONSTANT_ERRORS = (
     *("camera_yaw", "camera_pitch", "camera_height", "gyro_scale", "gyro_drift", "accel_scale"),
     *("accel_roll", "accel_ahead", "gps_stamp", "map_lag"),
 )
@@ -191,7 +191,7 @@ def make_oracle(
     if name in PARAMETER_ORACLES:
         # no biases: a filter that knows them would subtract them
         scenario: Scenario = single_env.unwrapped.scenario
-        world = dataclasses.replace(world, **{key: getattr(IDEAL, key) for key in _CONSTANTS})
+        world = dataclasses.replace(world, **{key: getattr(IDEAL, key) for key in CONSTANT_ERRORS})
         noise = {key: sd for key, sd in scenario.noise.items() if not key.endswith("_bias")}
         unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
         env_kwargs |= {"scenario": unbiased.to_dict(), "world": world.to_dict()}

@@ -15,7 +15,7 @@ __all__ = ["SALTED", "SUITES", "Request", "check_salt", "run_suites"]
 
 SUITES = {
     "estimation": ".studies.estimation",
-    "unknown": ".studies.unknown",
+    "conditions": ".studies.conditions",
     "control": ".control.suite",
     "papers": ".papers.suite",
     "following": ".studies.coordinated_control",

@@ -121,7 +121,7 @@ _OTHERS = {
     "rad": "rmse static_slip drift course_prediction_error",
     "m": "offset prediction_error",
     "m/s": "speed",
-    "s": "cpu_seconds response_time",
+    "s": "cpu_seconds response_time healthy_after",
     "us": "us_per_tick us_per_step us_per_decision us_added",
     "dB": "decibels",
     "Hz": "hertz",
@@ -129,8 +129,7 @@ _OTHERS = {
     "-": "rmse_over_bound score cost_vs_nominal share_won worst_cost failure_rate spin_rate "
     "departure_rate collision_rate success_rate saved_rate not_finite_rate bad_action_rate "
     "gap ratio difference residual rank share spectral_radius count amplitude overshoot "
-    "log_likelihood nis nees rmse_over_exact_kf rmse_over_own covered_10 covered_20 covered_30 "
-    "covered_40 covered_50 covered_60 covered_70 covered_80 covered_90 covered_95",
+    "log_likelihood nis nees coverage rmse_over_told rmse_over_gyro",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()
