@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import numpy as np
 
-from ...envs.record import Array, Log
+from ...agents.rollout import iterate_steps
+from ...envs.record import Array, Log, concatenate
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.design.assemble import assemble
 from ...estimators.design.config import parse_config
@@ -39,6 +40,27 @@ def make_filter_arguments(base: Any) -> dict[str, Any]:
         Arguments by name, dt (s) too.
     """
     return make_spec(base)._asdict() | {"dt": base.dt}
+
+
+def record_drive(env: gym.Env[Any, Any], seed: int) -> Log:
+    """Record a drive without control, and without the columns of `rollout`, which take longer.
+
+    Args:
+        env: Env of one car.
+        seed: Seed of the reset.
+
+    Returns:
+        Log with the true sideslip angle.
+    """
+    base: Any = env.unwrapped
+    records, times, slips = [], [], []
+    for step in iterate_steps(env, None, seed):
+        records.append(base.record)
+        times.append(step.info["t"])
+        slips.append(step.info["beta"])
+    record = concatenate(records)
+    truth = {"beta": np.interp(record.ticks * record.dt, times, slips)}
+    return Log(record, base.slow_sensors, truth)
 
 
 def make_unchecked_filter(

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from ...agents.baselines import CONSTANT_ERRORS, compute_range_rms
-from ...agents.rollout import rollout
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.scenarios.world import IDEAL
 from ...envs.sensors.slow import SLOW_NAMES
@@ -25,7 +24,7 @@ from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ...estimators.protocol import Estimates
 from ...estimators.wrappers.truth import calibrate
-from ..harness.drives import SETTLED, draw_steering, make_unchecked_filter
+from ..harness.drives import SETTLED, draw_steering, make_unchecked_filter, record_drive
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, mean_share, ratio_of_roots, root_mean
 from ..harness.verdict import format_verdict, summarise_names
@@ -172,7 +171,7 @@ def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tupl
         env = gym.make(condition.env_id, scenario=scenario, **options)
     env.reset(seed=seed)
     truth = env.unwrapped.car_truth
-    return rollout(env, seed=seed).log, env.unwrapped, truth
+    return record_drive(env, seed), env.unwrapped, truth
 
 
 _KNOWN: dict[str, float] = dict.fromkeys(

@@ -20,8 +20,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from ...agents.rollout import iterate_steps
-from ...envs.record import FAST, PACKET, Array, Log, concatenate
+from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.scenarios.world import GROUPS, make_world
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
@@ -33,6 +32,7 @@ from ..harness.drives import (
     draw_steering,
     make_filter_arguments,
     make_unchecked_filter,
+    record_drive,
 )
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
@@ -150,15 +150,7 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
         control_period=10,
     )
     base: Any = env.unwrapped
-    records, times, slips = [], [], []
-    for step in iterate_steps(env, None, seed):
-        records.append(base.record)
-        times.append(step.info["t"])
-        slips.append(step.info["beta"])
-    record = concatenate(records)
-    log = Log(
-        record, base.slow_sensors, {"beta": np.interp(record.ticks * record.dt, times, slips)}
-    )
+    log = record_drive(env, seed)
     facts = make_filter_arguments(base)
     if "100 Hz" in kind:
         log = _reduce_rate(log, 10, ("gps",) if "gps" in kind else ())
