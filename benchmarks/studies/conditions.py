@@ -31,7 +31,7 @@ from ..harness.verdict import format_verdict, summarise_names
 from ..recorded.honesty import HONESTY, compute_honesty
 from ..report.study import Request, Study
 
-NAME, GYRO_ALONE = "joint-robust", "bicycle-kf"
+NAME, GYRO_ALONE = "joint", "bicycle-kf"
 BASE, BAD_INPUT = "base world v1", "steering in degrees"
 _BASE_FACTOR = 4  # seeds of the base world over those of another condition
 _FIRST_SEED = 200_000  # no drive of `tuning`
