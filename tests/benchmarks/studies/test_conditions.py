@@ -1,18 +1,23 @@
 """The suite of conditions: a condition is what its name says, and what errs is caught."""
 
 import dataclasses
+import json
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.drives import make_unchecked_filter
+from sideslip.benchmarks.harness.results import read_json
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import conditions
 from sideslip.benchmarks.studies.conditions import BAD_INPUT, BASE, CONDITIONS, Condition, Edit
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.estimators.filters import FILTERS
 
+DOCS = Path(conditions.__file__ or "").resolve().parents[2] / "docs"
 NAMED = {condition.name: condition for condition in CONDITIONS}
 SHORT = 3.0  # s
 
@@ -147,3 +152,24 @@ def test_a_run_has_rows_verdict_and_picture(monkeypatch: pytest.MonkeyPatch) -> 
     lines = suite.verdict.splitlines()
     assert len(lines) == 5 and max(map(len, lines)) <= 110 and "worst is GPS" in lines[1]
     assert suite.answers[0][2] == lines[1] and len(suite.tables) == 1
+
+
+def test_the_page_says_what_its_file_says() -> None:
+    cells = dict[str, dict[str, float]]()
+    rows = read_json(DOCS / "conditions.json")
+    for row in rows:
+        cells.setdefault(row.scenario, {})[row.metric] = row.value
+    assert list(cells) == list(NAMED) and {row.suite for row in rows} == {"conditions"}
+    text = " ".join((DOCS / "conditions.md").read_text().split())
+    judged = [item for name, item in cells.items() if name not in (BASE, BAD_INPUT)]
+    middle = np.median([item["rmse_over_told"] for item in judged])
+    held = sum(item["coverage"] >= 0.88 for item in judged)
+    for sentence in (
+        f"In world `v1` it errs {cells[BASE]['rmse_over_told']:.2f} times as much.",
+        f"Over {len(judged)} other conditions the median is {middle:.2f}.",
+        f"The 95 % interval holds at least 88 % of the time in {held} of them.",
+    ):
+        assert sentence in text, sentence
+    few, many = sorted({row.n for row in rows})[-2:]
+    assert re.search(rf"has {few} drives of the passenger car, the base world {many}\.", text)
+    assert json.loads((DOCS / "conditions.json").read_text())[0]["scenario"] == BASE
