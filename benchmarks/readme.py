@@ -50,10 +50,10 @@ _BEST = "`adaptive-nmpc` on `joint`"
 _PROCEDURES = {"distill-car-steering": "policy on joint"}
 _TRANSFER = {
     "FMVSS 126": ("fmvss-126 passenger-car", "amplitude", 1.0, ".1f"),
-    "another plant": ("outside multi-body", "paired", 100.0, ".0f"),
+    "another plant": ("outside multi-body", "ratio", 100.0, ".0f"),
 }
 """Columns of transfer: scenario, metric, factor and format."""
-_RIVAL = (REFERENCE_CONTROLLER, "paired")  # against whom costs are paired there
+_RIVAL = (REFERENCE_CONTROLLER, "ratio")  # against whom costs are paired there
 EPISODES = 32  # a contest
 
 

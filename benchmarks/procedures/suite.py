@@ -222,7 +222,7 @@ def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
         numbers = {"cost": interval(costs[case]), "share": np.mean([x.failed for x in episodes])}
         if case.car in rivals and case.agent != RIVAL:
             logs = np.log(compute_cost_ratios(costs[case], rivals[case.car]))
-            numbers["paired"] = geometric_mean(logs)
+            numbers["ratio"] = geometric_mean(logs)
         numbers |= {"n": len(episodes), "peak": np.median([x.peak for x in episodes])}
         records.append(_make_record(case, **numbers, salt="fixed"))
     return records
@@ -281,7 +281,7 @@ _TABLES = {
             "controller",
             Column("car", "model"),
             Column("cost", form=".3g"),
-            Column("paired", f"of {RIVAL}'s / %", 100.0, ".0f"),
+            Column("ratio", f"of {RIVAL}'s / %", 100.0, ".0f"),
             Column("share", "failed / %", 100.0, ".0f"),
             Column("peak", "peak slip / mrad", 1e3, ".0f"),
         ),
