@@ -142,24 +142,25 @@ class ProcedureEntry:
         task = ControlTask(env_id=STEERING, vehicle=vehicle)
         return make_agent(agent, env, **ControlCase(task, Entry(agent, estimator)).agent_options)
 
-    def drive(self, car: str, seed: int = 0) -> DriveFunction:
+    def drive(self, car: str, seed: int | None = None) -> DriveFunction:
         """Make the drives of a car; references stay within what friction can hold.
 
         Args:
             car: One of `CARS`.
-            seed: Seed of what errs in car and sensors.
+            seed: Seed of what errs in car and sensors; None: nothing errs.
 
         Returns:
             The function that drives.
         """
         _, estimator, estimate = self.get_configuration(car)
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
+        options |= {"world": "ideal"} if seed is None else {}
 
         def run_drive(fields: Fields) -> Series:
             env = make_env(ENV_ID, estimator, estimate, scenario=CALM | dict(fields), **options)
             base: Any = env.unwrapped
             rows = []
-            for step in iterate_steps(env, self.make_agent(car, env), seed):
+            for step in iterate_steps(env, self.make_agent(car, env), seed or 0):
                 t, steer, moment = (step.info[name] for name in ("t", "steer", "yaw_moment"))
                 rows.append([t, steer, *base.motion[:POSE], moment])
             env.close()

@@ -52,7 +52,7 @@ def _measure_case(case: ProcedureCase) -> Any:
             A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car, seed), car)
             results.append(fmvss126.run(entry.drive(case.car, seed), car, A, multiples, SHOWN))
         return results
-    drive = entry.drive(case.car)
+    drive = entry.drive(case.car, 0 if case.procedure in iso3888.TRACKS else None)
     if case.procedure in iso3888.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
         return iso3888.run(drive, car, case.procedure, (car.speed * shares).tolist())
@@ -246,7 +246,7 @@ def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
 _KEYS, _PAIR = ("controller", "car"), "{:.3g} ({:.3g})"
 _PER_G = float(np.degrees(GRAVITY))
 _CLAIM = "no control fails at 5 A, a yaw moment of 500 N m passes at 6.5 A"
-_OF = Column("passed", "median car passes up to / A", form="{:.3g} of {:.3g}; {} cars fail")
+_OF = Column("passed", "median car passes up to / A", form="{:.3g} of {:.3g}; {:.0f} cars fail")
 _CIRCLE = {"understeer_gradient": "measured / (deg/g)", "theory": "linear model / (deg/g)"}
 _STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s", "peak_time": "peak after / s"}
 _SHARES = {"ratio": "at 1.00 s / %", "later": "at 1.75 s / %"}

@@ -14,6 +14,7 @@ from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.agents.helpers import observe
 from tests.envs.helpers import bits
+from tests.policies import VISION
 
 PARAMETERS = ["front_stiffness", "rear_stiffness", "friction"]
 STATES = ["beta", "gamma", "d1", "d2"]
@@ -26,6 +27,9 @@ def env() -> gym.Env[Any, Any]:
     )
 
 
+NAMES = [VISION if name == "learned" else name for name in AGENTS]
+
+
 @pytest.fixture
 def steered() -> gym.Env[Any, Any]:
     """An env with all that any agent needs, whose action steers."""
@@ -35,7 +39,7 @@ def steered() -> gym.Env[Any, Any]:
     return TruthObservation(EstimateObservation(tyres, "dakf", outputs=STATES), PARAMETERS)
 
 
-@pytest.mark.parametrize("name", list(AGENTS))
+@pytest.mark.parametrize("name", NAMES)
 def test_single_and_batch_agree_and_memory_is_outside(
     name: str, steered: gym.Env[Any, Any]
 ) -> None:
@@ -58,7 +62,7 @@ def test_single_and_batch_agree_and_memory_is_outside(
             assert np.isnan(action).all() if broken else env.action_space.contains(action)
 
 
-@pytest.mark.parametrize("name", list(AGENTS))
+@pytest.mark.parametrize("name", NAMES)
 def test_a_nan_that_is_read_comes_out_as_nan(name: str, steered: gym.Env[Any, Any]) -> None:
     """Entry by entry; what a controller does not read does not disturb it."""
     agent = make_agent(name, steered)
@@ -80,7 +84,7 @@ def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
     assert action[0] == fresh[0] and action[1] != fresh[1]
 
 
-@pytest.mark.parametrize("name", list(AGENTS))
+@pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines3_evaluates_them(name: str, steered: gym.Env[Any, Any]) -> None:
     agent: Any = make_agent(name, steered)
     reward, _ = evaluate_policy(

@@ -47,7 +47,7 @@ from tests.policies import GRU
 
 POLICY = load_policy("distill-coms-yaw")
 SHORT = {"scenario": {"base": "coms-slalom", "duration": 0.3}}
-COMS = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
+COMS = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip", "lead_in": 0.0}
 FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
 
 
@@ -64,7 +64,7 @@ def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
     mixed = make_finetune_task(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
     assert "scenario" not in mixed.env_options and mixed.seed == 3
     one = make_finetune_task(POLICY, env_options={"scenario": "coms-step"})
-    assert one.env_options == COMS | {"scenario": "coms-step"} and not one.scenarios
+    assert one.env_options == card.env_options | {"scenario": "coms-step"} and not one.scenarios
     for other in ("exact-kf", ""):
         behind = make_finetune_task(POLICY, estimator=other)
         assert (behind.estimator, behind.estimator_options) == (other, {})
@@ -133,7 +133,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     policy, length = load_policy(name), 30 if algo == "ppo" else 6  # tensors cost much more
     car = {name: x for name, x in policy.card.env_options.items() if name != "scenario"}
     base = "coms-slalom" if algo == "ppo" else "car-step"
-    options = car | {"scenario": {"base": base, "duration": 0.01 * length}}
+    options = car | {"scenario": {"base": base, "duration": 0.01 * length}, "lead_in": 0.0}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
     task = make_finetune_task(policy, algo=algo, **more)
     network, training = policy.network, Trainer(task, 400, tmp_path, trained_agent=policy)

@@ -15,7 +15,7 @@ SCENARIO = "tie-vision-fig8"
 TUNE = ("tune", "estimator", "--seeds", 1, "--test-seeds", 2, "--jobs", 1)
 FIG8 = (*TUNE, "bicycle-kf", "--scenario", SCENARIO)
 DRIVES = cache(tuning._simulate_case)  # each is driven once for all tests
-NEEDS = {"train": "stable_baselines3", "train-estimator": "torch", "tune": "optuna"}
+NEEDS = {"train": "stable_baselines3", "tune": "optuna"}
 MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
     (("run", "--beside", "none"), "'none' can only drive beside in a film: --video"),
@@ -76,12 +76,6 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("train", "--num-envs", "0"), "greater than or equal to 1"),
     (("train", "--seed", "-1"), "seed is at least 0, got -1"),
     (("train", "--scenarios", "moon"), "scenario 0 of the mixture: unknown scenario 'moon'"),
-    (("train-estimator", "mine", "--base", "magic"), "unknown estimator 'magic'"),
-    (("train-estimator", "mine", "--base", "multirate-kf"), "a correction's base is course-kf"),
-    (("train-estimator", "mine", "--scenarios", "moon"), "unknown scenario 'moon'"),
-    (("train-estimator", "mine", "--option", "depth=3"), "unknown option"),
-    (("train-estimator", "mine", "--episodes", "0"), " 0 episodes"),
-    (("train-estimator", "mine", "--out", "a.zip"), "a.zip: expected a file that ends in .safe"),
     ((*TUNE, "kalman", "--scenario", SCENARIO), "unknown estimator 'kalman'"),
     ((*TUNE, "dafk", "--scenario", SCENARIO), "did you mean 'dakf'"),
     ((*TUNE, "dakf", "--scenario", "moon"), "unknown scenario 'moon'"),

@@ -3,7 +3,6 @@
 import pytest
 
 pytest.importorskip("vehiclemodels")
-from sideslip.agents import make_agent
 from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
@@ -29,10 +28,10 @@ def test_each_contestant_has_what_it_reads(car: str) -> None:
     names = [each.get_configuration(car)[0] for each in ENTRIES]
     assert names[-1] == f"distill-{'coms' if car == 'coms' else 'car'}-steering"
     for each in ENTRIES:
-        agent, estimator, estimate = each.get_configuration(car)
+        _, estimator, estimate = each.get_configuration(car)
         options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
         env = make_env(ENV_ID, estimator, estimate, **options)
-        make_agent(agent, env)
+        each.make_agent(car, env)
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:

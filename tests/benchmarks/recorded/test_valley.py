@@ -37,7 +37,7 @@ from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, steering_trace,
 from .simulated import as_table
 from .slalom import columns, saved
 
-ESTIMATORS = ("bicycle-kf", "multirate-kf", "exact-kf", "joint")
+ESTIMATORS = ("bicycle-kf", "multirate-kf", "exact-kf")
 NEUTRAL = PASSENGER_CAR.replace(  # steers nearly neutrally: the valley is exact
     mass=1776.0,
     sprung_mass=1500.0,
