@@ -57,31 +57,24 @@ class Edit:
     sensor: str = ""  # slow sensor
     packets: int = 0  # how many packets earlier its values were true
 
-    def apply(self, log: Log, seed: int) -> Log:
-        """Apply the error to a copy of a log.
 
-        Args:
-            log: Log.
-            seed: Seed of the noise.
-
-        Returns:
-            Log with the error.
-        """
-        record, rng = log.record, np.random.default_rng([47, seed])
-        fast, packets, late = record.fast.copy(), record.packets.copy(), self.delay / record.dt
-        pole = np.exp(-2.0 * np.pi * self.corner * record.dt)
-        for column in (getattr(FAST, name) for name in self.columns):
-            white = self.noise * np.sqrt(1.0 - pole**2) * rng.standard_normal(len(fast))
-            x = self.scale * fast[:, column] + self.offset + self.drift * log.time
-            x += self.accel_x * fast[:, FAST.accel_x] + lfilter([1.0], [1.0, -pole], white)
-            rows = np.arange(round(self.start / record.dt), len(fast))
-            fast[rows, column] = x[np.maximum(rows - round(late), 0)]
-        if self.sensor:
-            places = np.flatnonzero(packets[:, PACKET.sensor] == SLOW_NAMES.index(self.sensor))
-            values = record.packets[places[: -self.packets], PACKET.value :]
-            packets[places[self.packets :], PACKET.value :] = values
-        wrong = dataclasses.replace(record, fast=fast, packets=packets)
-        return dataclasses.replace(log, record=wrong)
+def _apply_edit(edit: Edit, log: Log, seed: int) -> Log:
+    """Apply an error to a copy of a log; the seed is that of its noise."""
+    record, rng = log.record, np.random.default_rng([47, seed])
+    fast, packets, late = record.fast.copy(), record.packets.copy(), edit.delay / record.dt
+    pole = np.exp(-2.0 * np.pi * edit.corner * record.dt)
+    for column in (getattr(FAST, name) for name in edit.columns):
+        white = edit.noise * np.sqrt(1.0 - pole**2) * rng.standard_normal(len(fast))
+        x = edit.scale * fast[:, column] + edit.offset + edit.drift * log.time
+        x += edit.accel_x * fast[:, FAST.accel_x] + lfilter([1.0], [1.0, -pole], white)
+        rows = np.arange(round(edit.start / record.dt), len(fast))
+        fast[rows, column] = x[np.maximum(rows - round(late), 0)]
+    if edit.sensor:
+        places = np.flatnonzero(packets[:, PACKET.sensor] == SLOW_NAMES.index(edit.sensor))
+        values = record.packets[places[: -edit.packets], PACKET.value :]
+        packets[places[edit.packets :], PACKET.value :] = values
+    wrong = dataclasses.replace(record, fast=fast, packets=packets)
+    return dataclasses.replace(log, record=wrong)
 
 
 _GPS, _CAMERA, _BOTH = (f"sideslip/Yaw{name}-v0" for name in ("Gps", "Vision", "Fusion"))
@@ -229,7 +222,7 @@ class Outcome(NamedTuple):
 def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     """Run the filters over a drive; None where the car spins before errors count."""
     log, base, _ = _drive_car(condition, seed)
-    beta, dt, wrong = log.truth["beta"], log.record.dt, condition.edit.apply(log, seed)
+    beta, dt, wrong = log.truth["beta"], log.record.dt, _apply_edit(condition.edit, log, seed)
     driven = np.cumsum(np.abs(beta) > _SPIN) == 0
     rows = driven & (log.time >= SETTLED - 1e-9) & (log.record.fast[:, FAST.wheel_left] > _SLOW)
     if rows.sum() * dt < 0.5:
@@ -246,8 +239,8 @@ def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     clean = healthy[time <= condition.fault]
     alarms = float(np.mean(~clean)) if len(clean) else np.nan
     after = float(said[0]) if len(said) else np.inf
-    spins = float(not driven.all())
-    return Outcome(square, informed, by_gyro, nees, coverage, after, alarms, spins)
+    numbers = square, informed, by_gyro, nees, coverage, after, alarms
+    return Outcome(*numbers, spins=float(not driven.all()))
 
 
 def _measure_seeds(case: tuple[Condition, Sequence[int]]) -> list[Outcome | None]:
@@ -348,11 +341,9 @@ STUDY = Study(
     "conditions",
     "How far is a filter without options from one that is told everything?",
     f"RMSE of the sideslip angle from 2 s on, of {NAME} over the same filter that is told: the "
-    "true car, tyres and friction to a tenth, and all constant errors of sensors. In an ideal "
-    "world it is told the levels of noise and disturbances too. No level was found in these "
-    "drives. "
-    "NEES: the mean square of the error over its deviation, 1 where that is honest. Intervals are "
-    f"95 % over seeds. The base world has {_BASE_FACTOR} times as many.",
+    "true car, tyres and friction to a tenth, sensors' errors, and in an ideal world the "
+    "levels of noise and disturbances. No level was found in these drives. NEES: the mean square "
+    "of the error over its deviation, 1 where that is honest. Intervals are 95 % over seeds.",
     (64, 4),
     _measure,
     _add_tables,

@@ -26,7 +26,7 @@ def drive(name: str, seed: int = 0, **changes: Any) -> tuple[Log, Log, Any]:
     """A drive, the same with the condition's error, and the env."""
     condition = dataclasses.replace(NAMED[name], **changes)
     log, base, _ = conditions._drive_car(condition, seed)
-    return log, condition.edit.apply(log, seed), base
+    return log, conditions._apply_edit(condition.edit, log, seed), base
 
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
