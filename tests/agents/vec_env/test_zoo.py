@@ -45,7 +45,7 @@ if __name__ == "__main__":
         env_kwargs={"scenario": SHORT}, wrapper_kwargs={"outputs": ["beta"]},
         vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "spawn"},
     )
-    ours = make_ours(NAME, 2, 5, {"outputs": ["beta"]}, {"scenario": SHORT})
+    ours = make_ours(NAME, 2, 5, {"outputs": ["beta"]}, {"scenario": SHORT}, scaled=False)
     assert drive(theirs) == drive(ours)
     print("the same everywhere")
 """
