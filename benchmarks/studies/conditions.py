@@ -191,7 +191,7 @@ def _run_informed_filter(condition: Condition, seed: int) -> Estimates:
     return make_unchecked_filter(NAME, log, truth.fiala, options).run(calibrated)
 
 
-def _run_watched(estimator: Estimator, log: Log) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _run_with_health(estimator: Estimator, log: Log) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     """Sideslip angle and its deviation (rad), shape (n,); `is_healthy` after each `_WATCH`."""
     record, healthy = estimator.prepare_record(log), list[bool]()
     rows, count = round(_WATCH / record.dt), len(record.fast)
@@ -228,7 +228,7 @@ def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     if rows.sum() * dt < 0.5:
         return None
     filter_ = make_unchecked_filter(NAME, wrong, base.nominal, {})
-    estimate, deviation, healthy = _run_watched(filter_, wrong)
+    estimate, deviation, healthy = _run_with_health(filter_, wrong)
     gyro = make_estimator(GYRO_ALONE, vehicle=base.nominal, dt=dt).run(wrong)["beta"]
     runs = estimate, _run_informed_filter(condition, seed)["beta"], gyro
     square, informed, by_gyro = (float(np.mean((run - beta)[rows] ** 2)) for run in runs)

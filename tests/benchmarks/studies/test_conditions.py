@@ -136,7 +136,7 @@ def test_a_filter_that_is_lost_says_so() -> None:
 def test_looking_at_the_health_changes_no_bit() -> None:
     log, _, base = drive("camera and GPS", duration=SHORT)
     filter_ = make_unchecked_filter(conditions.NAME, log, base.nominal, {})
-    beta, deviation, healthy = conditions._run_watched(filter_, log)
+    beta, deviation, healthy = conditions._run_with_health(filter_, log)
     run = filter_.run(log)
     assert np.array_equal(beta, run["beta"]) and len(healthy) == len(log.time) // 100 + 1
     assert np.array_equal(deviation, run.std[:, run.names.index("beta")])
