@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,10 @@ from ..sensors.link import SlowSensor
 from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
 from ..ticks import TICK
 from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
-from .tables import read_quantities
+from .tables import name_log, read_quantities
+
+if TYPE_CHECKING:
+    from .tables import LogSource
 
 _NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
 _SAMPLED = {  # column of the record: quantity of the log
@@ -27,19 +31,18 @@ _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
-def _make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
+def _make_log(values: dict[str, Array], name: str, dt: float | None = None) -> Log:
     """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
 
     Its first tick is that of the first row, 0 where time starts below 0: ticks are never negative.
     A logged input (steering, torque, command) acts from its row to the next, so it stands one row
-    later in the record. The name is the file's with its folder's.
+    later in the record.
     """
     dt = find_step(values["time"]) if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _make_fast_rows(values)
     packets, slow = _make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
-    name = f"{source.resolve().parent.name}/{source.stem}"
     return Log(record, slow, _compute_truth(values), name)
 
 
@@ -165,12 +168,12 @@ _SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
 
 def read_parts(
-    path: str | Path,
+    source: "LogSource",
     mapping: Mapping[str, str] | None = None,
     start: float = 0.0,
     end: float | None = None,
 ) -> tuple[list[Log], list[str]]:
-    """Read a recorded drive from a table: CSV, Parquet, MATLAB or MDF (needs the extra `report`).
+    """Read a recorded drive from a table (needs the extra `report`).
 
     Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
     between their samples. One is captured and arrives in its row, and the sensor's period is the
@@ -186,7 +189,8 @@ def read_parts(
     sample lacks the sensor.
 
     Args:
-        path: Table with columns named as in `tables.COLUMNS`; unknown ones are ignored.
+        source: Table, or its file (CSV, Parquet, MATLAB, MDF). Columns are named as in
+            `tables.COLUMNS`; unknown ones are ignored.
         mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
             `tables.parse_mapping` makes it.
         start: Time after the first row from which it is read (s).
@@ -199,8 +203,10 @@ def read_parts(
         ValueError: For a file that is no table, a missing column, a value that is no number, and
             where no part is left. Rows in messages count from 1 below the header.
     """
-    source = Path(path)
     values, remarks = read_quantities(source, mapping or {}, _NEEDED, None)
+    label = title = name_log(source)
+    if isinstance(source, str | Path):  # the file's with its folder's
+        title = f"{Path(source).resolve().parent.name}/{Path(source).stem}"
     gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
     known = ~np.any(list(gaps.values()), axis=0)
     elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
@@ -223,9 +229,9 @@ def read_parts(
         if len(pieces) > 1:
             dt = find_step(max((piece["time"] for piece in pieces), key=len))
             pieces = [_resample_evenly(piece, dt, _SAME_STEP) for piece in pieces]
-        logs = [_make_log(piece, source, dt) for piece in pieces]
+        logs = [_make_log(piece, title, dt) for piece in pieces]
     except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+        raise ValueError(f"{label}: {error}") from None
     remarks += [f"{count} {text}." for count, text in [*done, (count, drop_reason)] if count]
     sensors = set[str]().union(*(log.slow for log in logs))
     for i, log in enumerate(logs if len(logs) > 1 else ()):

@@ -19,6 +19,9 @@ from .dialect import KINDS, find_samples, find_unit, read_text
 if TYPE_CHECKING:
     import pandas as pd
 
+    LogSource = str | Path | pd.DataFrame
+    """File of a recorded drive, or its table in memory."""
+
 
 class _LogTable(NamedTuple):
     """A file's columns as they stand there."""
@@ -182,16 +185,19 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 
 def read_quantities(
-    path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
+    source: "LogSource",
+    mapping: Mapping[str, str],
+    needed: Sequence[str],
+    gaps: Collection[str] | None,
 ) -> tuple[dict[str, Array], list[str]]:
-    """Read the file's known quantities in SI units, and describe how they were read.
+    """Read a log's known quantities in SI units, and describe how they were read.
 
     An empty column counts as absent. A file that `_read_table` refuses raises its errors. Rows in
     messages count from 1 below the header.
 
     Args:
-        path: Path of the table.
-        mapping: Our column names, unit included, to the file's; other columns are ignored.
+        source: Path of the table, or the table itself.
+        mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
         gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
             shuffled rows are sorted.
@@ -204,9 +210,13 @@ def read_quantities(
             and fewer than two rows.
     """
     wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
-    table = _read_table(
-        path, lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
-    )
+    if isinstance(source, str | Path):
+        table = _read_table(
+            Path(source), lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
+        )
+    else:
+        names = [str(name).strip() for name in source.columns]
+        table = _LogTable(source.set_axis(names, axis=1), [""] * len(names), names, [])
     remarks = [*table.remarks]
     try:
         columns = _find_columns(table, mapping, remarks)
@@ -231,8 +241,20 @@ def read_quantities(
         if gaps is not None:
             _check_complete(values, [name for name in values if name not in gaps])
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{name_log(source)}: {error}") from None
     return values, remarks
+
+
+def name_log(source: "LogSource") -> str:
+    """Name a log in messages.
+
+    Args:
+        source: Path of the table, or the table itself.
+
+    Returns:
+        The path, or "the frame".
+    """
+    return str(source) if isinstance(source, str | Path) else "the frame"
 
 
 def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:

@@ -37,6 +37,6 @@ def read_log(path: Path, mapping: Mapping[str, str] | None = None) -> Log:
     """The drive of a table that `read_parts` would leave whole."""
     values, _ = read_quantities(path, mapping or {}, _NEEDED, _GAPS)
     try:
-        return _make_log(values, path)
+        return _make_log(values, f"{path.resolve().parent.name}/{path.stem}")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
