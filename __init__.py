@@ -21,7 +21,7 @@ sideslip/YawVision-v1
 sideslip/YawVisionUneven-v0
 sideslip/YawVisionUneven-v1
 
-`estimate`, `rollout`, `score`, `make_agent`, `make_estimator`, `register_agent`,
+`Stream`, `estimate`, `rollout`, `score`, `make_agent`, `make_estimator`, `register_agent`,
 `register_estimator` and the subpackages are loaded when first asked for.
 """
 
@@ -36,9 +36,11 @@ if TYPE_CHECKING:
     from .agents.rollout import rollout
     from .estimators import make_estimator, register_estimator
     from .estimators.frame import estimate
+    from .estimators.stream import Stream
 
 __version__ = "0.2.0"
 __all__ = [
+    "Stream",
     "__version__",
     "estimate",
     "make_agent",
@@ -50,6 +52,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Stream": ".estimators.stream",
     "estimate": ".estimators.frame",
     "make_agent": ".agents",
     "make_estimator": ".estimators",

@@ -18,7 +18,7 @@ from .tables import name_log, read_quantities
 if TYPE_CHECKING:
     from .tables import LogSource
 
-_NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
+NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
 _SAMPLED = {  # column of the record: quantity of the log
     "gyro": "yaw_rate",
     **{name: name for name in ("accel_y", "accel_x", "roll_rate", "wheel_left", "wheel_right")},
@@ -40,8 +40,8 @@ def _make_log(values: dict[str, Array], name: str, dt: float | None = None) -> L
     """
     dt = find_step(values["time"]) if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
-    fast, present = _make_fast_rows(values)
-    packets, slow = _make_packets(values, first, dt)
+    fast, present = make_fast_rows(values)
+    packets, slow = make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
     return Log(record, slow, _compute_truth(values), name)
 
@@ -106,8 +106,15 @@ def find_step(time: Array) -> float:
     return dt
 
 
-def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
-    """Make the record's fast rows and the names of their columns that carry something."""
+def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
+    """Make the record's fast rows and the names of their columns that carry something.
+
+    Args:
+        values: Quantities in SI units, shape (n,) each.
+
+    Returns:
+        Fast rows, shape (n, FAST_WIDTH), and the names.
+    """
     fast = np.zeros((len(values["time"]), FAST_WIDTH))
     if not {"wheel_left", "wheel_right"} <= values.keys():
         values = values | {"wheel_left": values["speed_x"], "wheel_right": values["speed_x"]}
@@ -124,10 +131,19 @@ def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     return fast, tuple(name for name in Fast._fields if name in present)
 
 
-def _make_packets(
+def make_packets(
     values: dict[str, Array], first: int, dt: float
 ) -> tuple[Array, dict[str, SlowSensor]]:
-    """Make the packets of all slow sensors and their clocks."""
+    """Make the packets of all slow sensors and their clocks.
+
+    Args:
+        values: Quantities in SI units, shape (n,) each; NaN where a slow sensor has no sample.
+        first: Tick of the first row.
+        dt: Tick (s).
+
+    Returns:
+        Packets, shape (count, PACKET_WIDTH), and slow sensors by name.
+    """
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     for sensor, names in SENSORS.items():
         if not np.isfinite(values.get(names[0], np.nan)).any():
@@ -162,7 +178,7 @@ def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
 
 
 WARNING_PREFIX = "WARNING: "  # begins a remark that concerns the result
-_MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
+MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
 _MIN_PART = 2.0  # s, of a part
 _SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
@@ -183,7 +199,7 @@ def read_parts(
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
-    irregular places is refused. Holes up to `_MAX_HOLE` s are filled by interpolation on an even
+    irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
     clock; longer ones, and a clock that is set back by more, divide the log, and parts under
     `_MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
     sample lacks the sensor.
@@ -203,7 +219,7 @@ def read_parts(
         ValueError: For a file that is no table, a missing column, a value that is no number, and
             where no part is left. Rows in messages count from 1 below the header.
     """
-    values, remarks = read_quantities(source, mapping or {}, _NEEDED, None)
+    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
     label = title = name_log(source)
     if isinstance(source, str | Path):  # the file's with its folder's
         title = f"{Path(source).resolve().parent.name}/{Path(source).stem}"
@@ -247,8 +263,8 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     if not (steps > 0.0).any():
         raise ValueError(f"time stands still at row 2: {time[1]:.12g} s after {time[0]:.12g} s")
     typical = float(np.median(steps[steps > 0.0]))
-    is_backward = steps < -_MAX_HOLE
-    ends = np.flatnonzero(is_backward | (steps > _MAX_HOLE + typical)) + 1
+    is_backward = steps < -MAX_HOLE
+    ends = np.flatnonzero(is_backward | (steps > MAX_HOLE + typical)) + 1
     for rows in np.split(np.arange(len(time)), ends):
         newest = np.maximum.accumulate(time[rows])
         is_later = np.append(True, time[rows][1:] > newest[:-1] + 1e-3 * typical)
@@ -263,13 +279,13 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
         rows_text = f"{dropped} of {len(time)} rows: have its stamps lost digits?"
         raise ValueError(f"time stands still or steps back in {rows_text}")
     if not pieces:
-        hole = f"a hole of {_MAX_HOLE:g} s"
+        hole = f"a hole of {MAX_HOLE:g} s"
         raise ValueError(f"no part of the log lasts {_MIN_PART:g} s without {hole}")
     n_backward = int(np.count_nonzero(is_backward))
     return pieces, [
         (dropped, "rows whose time steps back or stands still were dropped"),
         (n_backward, "times the clock was set back: the log is divided there"),
-        (holes, f"holes up to {_MAX_HOLE:g} s were filled by interpolation"),
+        (holes, f"holes up to {MAX_HOLE:g} s were filled by interpolation"),
         (len(pieces) if len(pieces) > 1 else 0, "parts, between which rows are missing"),
         (short, f"parts under {_MIN_PART:g} s were left out"),
     ]

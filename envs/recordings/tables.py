@@ -150,8 +150,18 @@ def _make_column_name(quantity: str) -> str:
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
-def _parse_column_name(name: str) -> tuple[str, float]:
-    """Parse a name in lower case to quantity and factor to SI; ValueError if it is none of ours."""
+def parse_column_name(name: str) -> tuple[str, float]:
+    """Parse a column's name.
+
+    Args:
+        name: Name in lower case, unit included.
+
+    Returns:
+        Quantity and factor to SI units.
+
+    Raises:
+        ValueError: The name is none of ours.
+    """
     if name in _NAMES:
         return _NAMES[name]
     known = [_make_column_name(q) for q in COLUMNS]
@@ -179,7 +189,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
         if name in mapping:
             raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
-        _parse_column_name(name)
+        parse_column_name(name)
         mapping[name] = column
     return mapping
 
@@ -283,7 +293,7 @@ def _find_columns(
             raise ValueError(
                 f"no column {column!r} for {name}; the log has {join_names(table.names)}"
             )
-        quantity = _parse_column_name(name)[0]
+        quantity = parse_column_name(name)[0]
         if quantity in quantities:
             raise ValueError(f"{quantity} is mapped twice")
         quantities.add(quantity)
@@ -292,7 +302,7 @@ def _find_columns(
         match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = _parse_column_name(name)[0] if name else ""
+            quantity = parse_column_name(name)[0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -340,7 +350,7 @@ def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str])
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    quantity, factor = _parse_column_name(name)
+    quantity, factor = parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:
         for unit, scale in COLUMNS["time"].items():
             if 3e8 < values[0] * scale < 4e9:
