@@ -13,7 +13,7 @@ import numpy as np
 from ..envs.record import FAST, PACKET, Array
 from ..envs.recordings.dialect import SENSORS, SLOW_QUANTITIES
 from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
-from ..envs.recordings.tables import parse_column_name
+from ..envs.recordings.tables import find_offset, parse_column_name
 from ..envs.sensors.link import SlowSensor
 from ..envs.vehicle.parameters import VehicleSource, make_vehicle
 from .core.record import FilterRecords
@@ -27,13 +27,13 @@ _PATIENCE = 10  # successive samples outside the memory, after which the clock h
 
 
 class SideslipEstimate(NamedTuple):
-    """The estimate at the newest yaw rate's stamp."""
+    """The estimate at the newest sample's stamp."""
 
     time: float  # s
     sideslip: float  # rad
     sideslip_sd: float  # rad
     yaw_rate: float  # rad/s
-    healthy: bool
+    healthy: bool  # False too where a fast channel has been silent for `MAX_HOLE`
 
 
 def _find_wire(quantity: str) -> str:
@@ -61,7 +61,7 @@ class Stream:
         counts: Samples ignored: "outside" the memory.
 
     Raises:
-        ValueError: An unknown or missing channel, or a time that is not positive.
+        ValueError: An unknown or missing channel, one given twice, or a time out of range.
     """
 
     def __init__(
@@ -76,12 +76,14 @@ class Stream:
         quantities = [quantity for quantity, _ in parsed.values()]
         if missing := [name for name in NEEDED[1:] if name not in quantities]:
             raise ValueError(f"no channel of {', '.join(missing)} among {', '.join(channels)}")
+        if twice := [name for name in dict.fromkeys(quantities) if quantities.count(name) > 1]:
+            raise ValueError(f"{', '.join(twice)} comes twice among {', '.join(channels)}")
         if not (0.0 < dt <= MAX_HOLE and dt < memory < math.inf):
             raise ValueError(f"expected 0 < dt <= {MAX_HOLE} s < memory, got {dt}, {memory}")
         wires = read_wires(vehicle)
         self._channels: dict[str, tuple[int, float, float, float]] = {}
         for place, (name, (quantity, factor)) in enumerate(parsed.items()):
-            shift = math.pi / 2.0 if name.casefold().startswith("course_degnorth") else 0.0
+            shift = find_offset(name.casefold())
             if quantity == "steer":
                 factor, shift = factor * wires.gain, wires.offset
             latency = wires.latency.get(_find_wire(quantity), 0.0)
@@ -90,8 +92,10 @@ class Stream:
         self._places = {name: place for place, name in enumerate(quantities)}
         self._is_fast = np.array([name not in SLOW_QUANTITIES for name in quantities])
         self._memory, self._hole = round(memory / dt), round(MAX_HOLE / dt)
-        self._rows = np.empty((_ROOM * self._memory, len(quantities)))  # NaN where nothing came
+        capacity = _ROOM * self._memory + self._hole + 2 * _SNAPSHOT_ROWS
+        self._rows = np.empty((capacity, len(quantities)))  # NaN where nothing came
         self._filled = np.empty_like(self._rows)  # the last value held
+        self._latest = np.empty(len(quantities))  # ticks of the newest samples
         self._x: Array
         self._sd: Array
         self._strange = 0
@@ -113,6 +117,7 @@ class Stream:
         self._snapshots: dict[int, FilterRecords] = {}  # of the filter before a tick's row
         self._rows.fill(np.nan)
         self._filled.fill(np.nan)
+        self._latest.fill(-np.inf)
 
     def push(self, channel: str, stamp: float, value: float) -> None:
         """Take a sample.
@@ -144,9 +149,11 @@ class Stream:
             self._shift()
         self._rows[tick - self._base, place] = factor * value + shift
         self._newest, self._changed = max(tick, self._newest), min(tick, self._changed)
+        self._latest[place] = max(tick, self._latest[place])
 
     def _shift(self) -> None:
         """Move the buffer, so that it begins with what can still change and the row before."""
+        self.estimate()  # whoever asks seldom still has every row filtered
         rows = self._newest - self._base + 1
         drop = rows - self._memory - _SNAPSHOT_ROWS - 2
         for buffer in (self._rows, self._filled):
@@ -168,7 +175,9 @@ class Stream:
             self._run(self._done, end)
         x, sd, names = self._x, self._sd, self._filter.names
         beta, gamma = names.index("beta"), names.index("gamma")
-        time, healthy = self._newest * self.dt, self._filter.is_healthy
+        silence = self._newest - self._latest[self._is_fast].min()
+        healthy = self._filter.is_healthy and bool(silence <= self._hole)
+        time = self._newest * self.dt
         return SideslipEstimate(time, float(x[beta]), float(sd[beta]), float(x[gamma]), healthy)
 
     def _fill(self, start: int, end: int) -> None:

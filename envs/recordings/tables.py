@@ -170,6 +170,18 @@ def parse_column_name(name: str) -> tuple[str, float]:
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
 
+def find_offset(name: str) -> float:
+    """Find what is added to a column's values in SI units.
+
+    Args:
+        name: Name in lower case, unit included.
+
+    Returns:
+        pi / 2 for a course from north (rad), 0 for all others.
+    """
+    return np.pi / 2.0 if name.startswith("course_degnorth") else 0.0
+
+
 def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
     """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
 
@@ -357,8 +369,8 @@ def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str])
                 factor = scale
                 remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
     values *= factor
-    if name.startswith("course_degnorth"):
-        values += np.pi / 2.0  # the course towards north
+    if offset := find_offset(name):
+        values += offset
     is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
     if (bad := is_none | (np.abs(values) > _LARGEST)).any():
         row = int(np.argmax(bad))

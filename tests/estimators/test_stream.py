@@ -71,6 +71,26 @@ def test_any_order_within_the_memory_changes_nothing() -> None:
     assert run(order) == run(punctual)
 
 
+@pytest.mark.parametrize("memory", [0.02, 1.0])
+def test_it_does_not_matter_how_often_one_asks(memory: float) -> None:
+    asked, unasked = make_stream(memory=memory), make_stream(memory=memory)
+    for sample in samples(18.0):
+        asked.push(*sample)
+        unasked.push(*sample)
+        asked.estimate()
+    assert unasked.estimate() == asked.estimate()
+    assert asked.counts == {"outside": 0}
+
+
+def test_a_channel_that_falls_silent_is_said() -> None:
+    stream = make_stream()
+    for name, stamp, value in samples(8.0):
+        if name != "steer_rad" or stamp < 6.0:
+            stream.push(name, stamp, value)
+            now = stream.estimate() if name == "yaw_rate_radps" else None
+            assert now is None or now.healthy == (now.time <= 6.24)
+
+
 def test_none_before_every_fast_channel_has_come() -> None:
     stream = make_stream()
     assert stream.estimate() is None
@@ -117,6 +137,11 @@ def test_refused_samples(sample: Sample, message: str) -> None:
     [
         (("speed_x_kmh", "steer_deg"), {}, "no channel of yaw_rate among speed_x_kmh, steer_deg"),
         (("speed_x_kmh", "steer_deg", "gyro"), {}, "unknown column name 'gyro'"),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "yaw_rate_degps"),
+            {},
+            "yaw_rate comes twice among speed_x_kmh",
+        ),
         (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"dt": 2.0}, "expected 0 < dt <= 0.25"),
         (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"memory": 0.0}, "got 0.01, 0.0"),
     ],
