@@ -36,10 +36,11 @@ def estimate(
     samples. Rows are read as `read_parts` does; across a hole the filter begins anew.
 
     Args:
-        log: Table, or its file (CSV, Parquet, MATLAB, MDF).
+        log: Table, or its file (CSV, Parquet, MATLAB, MDF, CAN trace, ROS bag, MCAP, VBO).
         vehicle: Vehicle as for `make_vehicle`. A file brings along the steering's ratio, sign and
-            offset, and latencies.
+            offset, latencies, and where sensors sit.
         mapping: Our column names, unit included, to the log's: {"yaw_rate_degps": "GyroZ"}.
+            "dbc" names the description of a CAN trace.
         latency: Latency of a channel (s), such as {"gps": 0.2}; overrules the vehicle's file.
 
     Returns:

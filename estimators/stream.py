@@ -19,7 +19,7 @@ from ..envs.vehicle.parameters import VehicleSource, make_vehicle
 from .core.record import FilterRecords
 from .design.options import FAST_CHANNELS
 from .make import make_estimator
-from .wires import read_wires
+from .wires import move_course, read_wires
 
 _SNAPSHOT_ROWS = 16
 _ROOM = 4  # memories that the buffer holds
@@ -51,7 +51,7 @@ class Stream:
 
     Args:
         vehicle: Vehicle as for `make_vehicle`. A file brings along the steering's ratio, sign and
-            offset, and latencies.
+            offset, latencies, and the antenna's place.
         channels: Names with units, such as "yaw_rate_degps", that will come; speed_x, yaw_rate and
             steer must be among them.
         dt: Time from one yaw rate to the next (s).
@@ -81,6 +81,9 @@ class Stream:
         if not (0.0 < dt <= MAX_HOLE and dt < memory < math.inf):
             raise ValueError(f"expected 0 < dt <= {MAX_HOLE} s < memory, got {dt}, {memory}")
         wires = read_wires(vehicle)
+        if "accel" in wires.at:
+            raise ValueError("a stream takes accelerations of the centre of gravity: no at.accel")
+        self._at = wires.at
         self._channels: dict[str, tuple[int, float, float, float]] = {}
         for place, (name, (quantity, factor)) in enumerate(parsed.items()):
             shift = find_offset(name.casefold())
@@ -213,6 +216,7 @@ class Stream:
         fast = make_fast_rows(values)[0][start - before :]
         packets = make_packets(values, before, self.dt)[0]
         packets = packets[packets[:, PACKET.captured] >= start]
+        move_course(fast, packets, start, self._at)
         self._snapshots = {
             tick: state
             for tick, state in self._snapshots.items()

@@ -182,7 +182,8 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
         return
     result.car = fitted
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
-    result.wires = SignalCalibration(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
+    steering = 1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset
+    result.wires = SignalCalibration(*steering, late, at=stated.at)
     first = Theta(gain=stated.gain, offset=stated.offset)
     residuals = [compute_residual(car, parameters, w) for parameters in (first, theta)]
     rates = [float(np.sqrt(np.mean(left**2, axis=(0, 2)))[0]) for left in residuals]

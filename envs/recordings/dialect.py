@@ -161,7 +161,8 @@ SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sam
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
 }
-SLOW_QUANTITIES = {*SENSORS["camera"], *SENSORS["gps"]}
+LATENCIES = {sensor: f"{sensor}_latency" for sensor in SENSORS}  # of each sample (s)
+SLOW_QUANTITIES = {*SENSORS["camera"], *SENSORS["gps"], *LATENCIES.values()}
 TRUTH = {"sideslip", "speed_y"}  # may be unknown in any row
 KINDS = ("fresh", "held", "interpolated")
 """Values between a slow sensor's samples: samples too, the last one again, or a line."""

@@ -12,7 +12,7 @@ from ..record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Fast, Log, R
 from ..sensors.link import SlowSensor
 from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
 from ..ticks import TICK
-from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
+from .dialect import LATENCIES, LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
 from .tables import name_log, read_quantities
 
 if TYPE_CHECKING:
@@ -156,9 +156,16 @@ def make_packets(
         if sensor == "gps":
             columns[:, 0] = np.arctan2(np.sin(columns[:, 0]), np.cos(columns[:, 0]))
             quality[values["speed_x"][known] < COURSE_SPEED] = 0.0
-        packets.append(make_packet_rows(sensor, ticks, ticks, columns, quality))
+        late = np.nan_to_num(values.get(LATENCIES[sensor], absent)[known]) / dt
+        late = np.maximum(np.ceil(late - _STILL), 0.0)  # no estimator has it before it came
+        packets.append(make_packet_rows(sensor, ticks, ticks + late, columns, quality))
         rows = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
-        clocks[sensor] = SlowSensor(period=rows * dt, phase=(first + int(known[0])) % rows * dt)
+        clocks[sensor] = SlowSensor(
+            period=rows * dt,
+            delays=(float(late.min()) * dt,),
+            phase=(first + int(known[0])) % rows * dt,
+            jitter=float(np.ptp(late)) * dt,
+        )
     all_packets = np.concatenate(packets)
     order = np.lexsort((all_packets[:, PACKET.sensor], all_packets[:, PACKET.arrived]))
     return all_packets[order], clocks
@@ -192,10 +199,10 @@ def read_parts(
     """Read a recorded drive from a table (needs the extra `report`).
 
     Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
-    between their samples. One is captured and arrives in its row, and the sensor's period is the
-    longest that has every sample on its clock. truth["beta"] is the sideslip angle, or
-    atan2(speed_y, speed_x) where only that is logged; 0 at 0.5 m/s and below, NaN where unknown,
-    left out where the log has neither.
+    between their samples. One is captured in its row, and arrives there or by its gps_latency or
+    camera_latency later; the sensor's period is the longest that has every sample on its clock.
+    truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only that is logged; 0 at
+    0.5 m/s and below, NaN where unknown, left out where the log has neither.
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
@@ -205,7 +212,7 @@ def read_parts(
     sample lacks the sensor.
 
     Args:
-        source: Table, or its file (CSV, Parquet, MATLAB, MDF). Columns are named as in
+        source: Table, or its file (see `tables.CONTAINERS`). Columns are named as in
             `tables.COLUMNS`; unknown ones are ignored.
         mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
             `tables.parse_mapping` makes it.

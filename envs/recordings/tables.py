@@ -1,20 +1,32 @@
 """Tables on disk as named quantities in SI units (needs the extra `report`).
 
-CSV, Parquet, MATLAB and MDF are told apart by content. Columns have our names or mapped ones.
+Files are told apart by content. Columns have our names or mapped ones.
 """
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..io import read_document
 from ..numerics import require_extra
 from ..record import Array
 from ..validation import join_names, short_repr
 from ..vehicle.parameters import GRAVITY
-from .dialect import KINDS, find_samples, find_unit, read_text
+from .containers import (
+    DBC,
+    LogTable,
+    find_trace_reader,
+    is_bag,
+    read_bag,
+    read_can,
+    read_matlab,
+    read_mdf,
+    read_vbo,
+)
+from .dialect import KINDS, LATENCIES, SENSORS, find_samples, find_unit, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,17 +35,14 @@ if TYPE_CHECKING:
     """File of a recorded drive, or its table in memory."""
 
 
-class _LogTable(NamedTuple):
-    """A file's columns as they stand there."""
-
-    frame: "pd.DataFrame"  # names may repeat
-    units: list[str]  # "" for unknown
-    names: list[str]  # of all columns; an MDF's frame has only the wanted ones
-    remarks: list[str]  # sentences on how the file was read
+CONTAINERS = "CSV, Parquet, MATLAB, MDF, a CAN trace, a bag or VBO"
+_HEAD_BYTES = 1 << 16  # in which a file shows what it is
 
 
-def _read_table(path: Path, is_wanted: Callable[[str], bool]) -> _LogTable:
-    """Read a file's columns: text of any dialect, Parquet, MATLAB or MDF, recognised by content.
+def _read_table(
+    path: Path, is_wanted: Callable[[str], bool], mapping: Mapping[str, str]
+) -> LogTable:
+    """Read a file's columns, its kind recognised by its beginning.
 
     Raises FileNotFoundError, ValueError for a file that is no table, ImportError without an extra.
     """
@@ -41,76 +50,50 @@ def _read_table(path: Path, is_wanted: Callable[[str], bool]) -> _LogTable:
         import pandas as pd
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    if not path.is_file():
+    if path.is_dir() and not is_bag(path, b""):
         raise ValueError(f"{path}: expected a file, found a folder")
-    data = path.read_bytes()
-    if not data[:65536].strip():
-        raise ValueError(f"{path}: the file is empty")
+    head = b"" if path.is_dir() else _read_head(path)
     units: list[str] = []
     remarks: list[str] = []
+    dbc = mapping.get(DBC, "")
     try:
-        if data.startswith(b"MDF "):
-            return _read_mdf(path, is_wanted)
-        if data.startswith(b"PAR1"):
+        if head.startswith(b"MDF "):
+            return read_mdf(path, is_wanted, dbc)
+        if reader := find_trace_reader(head):
+            return read_can(path, reader, is_wanted, dbc)
+        if is_bag(path, head):
+            return read_bag(path, mapping, _find_sensor)
+        if head.startswith(b"PAR1"):
             frame = pd.read_parquet(path)
-        elif data.startswith(b"MATLAB"):
-            frame = _read_matlab(path, data)
+        elif head.startswith(b"MATLAB"):
+            frame = read_matlab(path, head)
+        elif head.startswith(b"File created") and b"[column names]" in head:
+            frame = read_vbo(path.read_bytes())
         else:
-            frame, units, remarks = read_text(data, is_wanted)
-    except (MemoryError, ImportError):
+            frame, units, remarks = read_text(path.read_bytes(), is_wanted)
+    except (MemoryError, ImportError, FileNotFoundError):
         raise
-    except Exception as error:  # of scipy and asammdf anything, where a file is damaged
+    except Exception as error:  # of a library anything, where a file is damaged
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
-        message = f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
+        message = f"{path}: expected {CONTAINERS}, but {reason:.300}"
         raise ValueError(message) from None
     names = [str(name).strip() for name in frame.columns]
-    return _LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
+    return LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
 
 
-def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
-    """Read the numeric vectors of the commonest length; ValueError for a file of version 7.3."""
-    import pandas as pd
-    from scipy.io import loadmat
-
-    if head.startswith(b"MATLAB 7.3"):
-        raise ValueError("it is MATLAB 7.3 (HDF5); save it with -v7")
-    columns = {
-        name: np.ravel(values)
-        for name, values in loadmat(path, squeeze_me=True, simplify_cells=True).items()
-        if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiub"
-    }
-    lengths = [len(values) for values in columns.values()]
-    common_length = max(set(lengths), key=lengths.count, default=0)
-    return pd.DataFrame({name: x for name, x in columns.items() if len(x) == common_length})
+def _read_head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    if not head.strip():
+        raise ValueError(f"{path}: the file is empty")
+    return head
 
 
-def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> _LogTable:
-    """Read the wanted channels in rows at the stamps of all groups, NaN where one has none."""
-    with require_extra("mdf", "reading MDF needs asammdf"):
-        from asammdf import MDF
-    import pandas as pd
-
-    chosen: dict[str, tuple[int, int]] = {}
-    columns, units = {}, ["s"]
-    with MDF(path) as file:
-        for name, entries in file.channels_db.items():
-            places = [place for place in entries if file.masters_db.get(place[0]) != place[1]]
-            labels = [f"{name} (group {g})" if len(places) > 1 else name for g, _ in places]
-            wanted = [item for item in zip(labels, places, strict=True) if is_wanted(item[0])]
-            if not wanted and len(places) > 1 and is_wanted(name):
-                raise ValueError(f"channels share a name; --map one of {', '.join(labels)}")
-            chosen.update(wanted)
-        channels = [(None, *place) for place in chosen.values()]
-        signals = file.select(channels, ignore_value2text_conversions=True, validate=True)
-        names = list(file.channels_db)
-    for name, signal in zip(chosen, signals, strict=True):
-        if signal.samples.ndim == 1 and signal.samples.dtype.kind in "fiub" and name != "time_s":
-            column = pd.Series(signal.samples, signal.timestamps)
-            columns[name] = column[~column.index.duplicated()]
-            units.append(find_unit(signal.unit))
-    frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
-    return _LogTable(frame.rename_axis("time_s").reset_index(), units, names, [])
+def _find_sensor(name: str) -> str:
+    """Find the slow sensor whose samples a column shows, "" for none."""
+    quantity = parse_column_name(name)[0]
+    return next((sensor for sensor, names in SENSORS.items() if quantity == names[0]), "")
 
 
 _LARGEST = 1e15  # in SI units
@@ -131,7 +114,7 @@ COLUMNS: dict[str, dict[str, float]] = {
     "steer_command": _ANGLE, "accel_command": _ACCELERATION, "curvature": _CURVATURE,
     "course": _ANGLE | {"degnorth": -np.pi / 180.0}, "gps_speed": _SPEED, "gps_x": _LENGTH,
     "gps_y": _LENGTH, "gps_hdop": _NUMBER, "gps_satellites": _NUMBER, "camera_psi": _ANGLE,
-    "camera_y_l": _LENGTH,
+    "camera_y_l": _LENGTH, **{name: {"s": 1.0, "ms": 1e-3} for name in LATENCIES.values()},
 }  # fmt: skip
 """What a log may hold and the units it may come in, with their factors to SI. A column is called
 quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are positive to the
@@ -186,23 +169,34 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
     """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
 
     Args:
-        texts: Texts of the form NAME=COLUMN.
+        texts: Texts of the form NAME=COLUMN, where dbc=FILE names the description of a CAN trace,
+            and TOML files that hold the same names and columns; a file's DBC lies beside it.
 
     Returns:
         Our column names to the log's.
 
     Raises:
+        FileNotFoundError: For a TOML file that does not exist.
         ValueError: For a text of another form, an unknown name and a name mapped twice.
     """
     mapping: dict[str, str] = {}
     for text in texts:
         name, _, column = (part.strip() for part in text.partition("="))
-        if not (name and column):
+        if text.endswith(".toml") and not column:
+            entries = read_document(Path(text), "mapping")
+            entries |= {DBC: str(Path(text).parent / str(entries[DBC]))} if DBC in entries else {}
+        elif name and column:
+            entries = {name: column}
+        else:
             raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
-        if name in mapping:
-            raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
-        parse_column_name(name)
-        mapping[name] = column
+        for name, column in entries.items():
+            if name in mapping:
+                raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
+            if name != DBC:
+                parse_column_name(name)
+            if not isinstance(column, str):
+                raise ValueError(f"{text}: {name} is a column's name, got {short_repr(column)}")
+            mapping[name] = column
     return mapping
 
 
@@ -231,17 +225,20 @@ def read_quantities(
         ValueError: For a missing column, one given twice, a value that is no finite number, NaN,
             and fewer than two rows.
     """
-    wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
+    columns_mapped = {name: column for name, column in mapping.items() if name != DBC}
+    wanted = {*COLUMNS, *map(str.casefold, columns_mapped.values())}
     if isinstance(source, str | Path):
         table = _read_table(
-            Path(source), lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
+            Path(source),
+            lambda name: name.casefold() in wanted or bool(_match_column(name, "")),
+            mapping,
         )
     else:
         names = [str(name).strip() for name in source.columns]
-        table = _LogTable(source.set_axis(names, axis=1), [""] * len(names), names, [])
+        table = LogTable(source.set_axis(names, axis=1), [""] * len(names), names, [])
     remarks = [*table.remarks]
     try:
-        columns = _find_columns(table, mapping, remarks)
+        columns = _find_columns(table, columns_mapped, remarks)
         missing = [_make_column_name(name) for name in needed if name not in columns]
         if missing:
             raise ValueError(
@@ -296,7 +293,7 @@ def _match_column(name: str, unit: str) -> str:
 
 
 def _find_columns(
-    table: _LogTable, mapping: Mapping[str, str], remarks: list[str]
+    table: LogTable, mapping: Mapping[str, str], remarks: list[str]
 ) -> dict[str, tuple[int, str]]:
     """Find each quantity's place and name: by the mapping, by ours, by names with units; remark."""
     names, quantities = [str(name) for name in table.frame.columns], set()
@@ -343,7 +340,7 @@ def _find_columns(
     return columns
 
 
-def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str]) -> Array:
+def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
     """Convert a column to SI units; ValueError names the first value that is no finite number.
 
     A time that is far off in its unit, but not in another since 1970, is read in that, which is

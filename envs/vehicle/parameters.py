@@ -189,8 +189,8 @@ VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
 """A vehicle's name, file, parameters or itself, as `make_vehicle` takes it."""
 
 _STIFFNESS = ("front_stiffness", "rear_stiffness")
-WIRE_TABLES = ("steering", "latency", "noise")
-"""Tables of a vehicle's file that `sideslip identify` writes and only `sideslip replay` reads."""
+WIRE_TABLES = ("steering", "latency", "noise", "at")
+"""Tables of a vehicle's file that are of its sensors: `sideslip identify` writes them."""
 _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 _YOUNGER = ("relaxation",)  # parameters that complete mappings in older files lack

@@ -1,0 +1,371 @@
+"""Files of loggers as tables: MATLAB, MDF, CAN traces, ROS bags and MCAP, VBOX.
+
+Each channel keeps the stamps that it has: rows stand at the stamps of all, NaN where one has none.
+Nothing is interpolated or held here.
+"""
+
+import io
+import re
+from array import array
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..numerics import require_extra
+from ..validation import join_names
+from .dialect import find_unit, to_metres
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from cantools.database import Database
+
+_TRACES = {  # reader of python-can, by what its files begin with
+    "BLFReader": rb"LOGG",
+    "ASCReader": rb"date [^\n]*\n\s*base +(hex|dec)",
+    "CanutilsLogReader": rb"\s*\(\d+\.\d+\) +\S+ +[0-9A-Fa-f]+#",
+    "TRCReader": rb";\$FILEVERSION",
+}
+_BAG = re.compile(rb"\x89MCAP|SQLite format 3|#ROSBAG")
+DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
+_DBC_NEEDED = "a CAN trace needs its description: --map dbc=FILE"
+
+
+class LogTable(NamedTuple):
+    """A file's columns as they stand there."""
+
+    frame: "pd.DataFrame"  # names may repeat
+    units: list[str]  # "" for unknown
+    names: list[str]  # of all columns; a frame may have only the wanted ones
+    remarks: list[str]  # sentences on how the file was read
+
+
+class _Channel(NamedTuple):
+    """Samples of a channel: stamps (s) and values, and how late they came (s) where that is known.
+
+    Arrays of doubles, so that a long trace costs 16 or 24 bytes a sample.
+    """
+
+    stamps: "array[float]"
+    values: "array[float]"
+    late: "array[float]"
+
+    @classmethod
+    def make(cls) -> "_Channel":
+        """Make an empty one."""
+        return cls(array("d"), array("d"), array("d"))
+
+
+def _join_channels(
+    channels: Mapping[str, tuple[Any, Any]], units: Mapping[str, str], names: list[str]
+) -> LogTable:
+    """Join channels of (stamps, values) to rows at the stamps of all; of equal stamps the first."""
+    import pandas as pd
+
+    columns = {}
+    for name, (stamps, values) in channels.items():
+        column = pd.Series(np.asarray(values, np.float64), np.asarray(stamps, np.float64))
+        columns[name] = column[~column.index.duplicated()]
+    frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
+    known = ["s", *(units.get(name, "") for name in columns)]
+    return LogTable(frame.rename_axis("time_s").reset_index(), known, names, [])
+
+
+def is_bag(path: Path, head: bytes) -> bool:
+    """Check whether a path is a ROS bag, or the folder of one.
+
+    Args:
+        path: File or folder.
+        head: Beginning of the file.
+
+    Returns:
+        True if it is.
+    """
+    return (path / "metadata.yaml").is_file() or bool(_BAG.match(head))
+
+
+def find_trace_reader(head: bytes) -> str:
+    """Find the reader of a CAN trace.
+
+    Args:
+        head: Beginning of the file.
+
+    Returns:
+        Name of python-can's reader, "" for another file.
+    """
+    return next((name for name, text in _TRACES.items() if re.match(text, head)), "")
+
+
+def read_matlab(path: Path, data: bytes) -> "pd.DataFrame":
+    """Read the numeric vectors of the commonest length from a MATLAB file of any version.
+
+    Args:
+        path: File.
+        data: Its beginning.
+
+    Returns:
+        A column a vector.
+    """
+    import pandas as pd
+
+    if data.startswith(b"MATLAB 7.3"):
+        with require_extra("mat", "reading MATLAB 7.3 needs h5py"):
+            import h5py
+
+        with h5py.File(path) as file:
+            loaded = {name: np.asarray(x) for name, x in file.items() if hasattr(x, "dtype")}
+            vectors = {name: x.squeeze() for name, x in loaded.items()}
+    else:
+        from scipy.io import loadmat
+
+        vectors = loadmat(path, squeeze_me=True, simplify_cells=True)
+    columns = {
+        name: values
+        for name, values in vectors.items()
+        if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiub"
+    }
+    lengths = [len(values) for values in columns.values()]
+    common_length = max(set(lengths), key=lengths.count, default=0)
+    return pd.DataFrame({name: x for name, x in columns.items() if len(x) == common_length})
+
+
+def read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
+    """Read the wanted channels of an MDF file; of one with CAN frames those of its description.
+
+    Args:
+        path: File.
+        is_wanted: Whether a channel's name is looked for.
+        dbc: Description of the frames, "" for none.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: Two wanted channels have one name, or frames lack their description.
+    """
+    with require_extra("mdf", "reading MDF needs asammdf"):
+        from asammdf import MDF
+
+    chosen: dict[str, tuple[int, int]] = {}
+    with MDF(path) as recorded:
+        has_frames = any("CAN_DataFrame" in name for name in recorded.channels_db)
+        if has_frames and not dbc:
+            raise ValueError(_DBC_NEEDED)
+        file = recorded.extract_bus_logging({"CAN": [(dbc, 0)]}) if has_frames else recorded
+        for name, entries in file.channels_db.items():
+            places = [place for place in entries if file.masters_db.get(place[0]) != place[1]]
+            labels = [f"{name} (group {g})" if len(places) > 1 else name for g, _ in places]
+            wanted = [item for item in zip(labels, places, strict=True) if is_wanted(item[0])]
+            if not wanted and len(places) > 1 and is_wanted(name):
+                raise ValueError(f"channels share a name; --map one of {', '.join(labels)}")
+            chosen.update(wanted)
+        channels = [(None, *place) for place in chosen.values()]
+        signals = file.select(channels, ignore_value2text_conversions=True, validate=True)
+        names = list(file.channels_db)
+    columns, units = {}, {}
+    for name, signal in zip(chosen, signals, strict=True):
+        if signal.samples.ndim == 1 and signal.samples.dtype.kind in "fiub" and name != "time_s":
+            columns[name] = signal.timestamps, signal.samples
+            units[name] = find_unit(signal.unit)
+    return _join_channels(columns, units, names)
+
+
+def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
+    """Read the wanted signals of a CAN trace (BLF, ASC, candump, TRC), a stamp a frame.
+
+    A signal is called as in its description, or MESSAGE.SIGNAL, which is needed where two messages
+    share its name. Frames are read one by one: memory holds the wanted samples alone.
+
+    Args:
+        path: File.
+        reader: Name of python-can's reader.
+        is_wanted: Whether a signal's name is looked for.
+        dbc: Description of the frames (DBC, ARXML, KCD, SYM), "" for none.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: No description, one of another car, a name of two signals, and a trace without
+            a frame of any wanted signal.
+    """
+    with require_extra("can", "reading a CAN trace needs python-can and cantools"):
+        import can
+        from cantools.database import DecodeError
+
+    database = _load_database(dbc)
+    names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
+    short = [name.partition(".")[2] for name in names]
+    messages, channels, units = {}, dict[str, _Channel](), dict[str, str]()
+    for message in database.messages:
+        wanted = {}
+        for signal in message.signals:
+            for label in (f"{message.name}.{signal.name}", signal.name):
+                if is_wanted(label):
+                    if label == signal.name and short.count(label) > 1:
+                        both = [x for x in names if x.endswith(f".{label}")]
+                        raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
+                    wanted[signal.name], channels[label] = label, _Channel.make()
+                    units[label] = find_unit(signal.unit or "")
+                    break
+        if wanted:
+            messages[message.frame_id, message.is_extended_frame] = message, wanted
+    remarks, seen_ids, n_short, cut = [], set[int](), 0, ""
+    try:
+        frames = getattr(can, reader)(path)
+        if getattr(frames, "file_size", 0) > path.stat().st_size:
+            cut = "it is shorter than it says"
+        for frame in frames:
+            seen_ids.add(frame.arbitration_id)
+            message, wanted = messages.get((frame.arbitration_id, frame.is_extended_id), (None, {}))
+            if message is None or frame.is_error_frame or frame.is_remote_frame:
+                continue
+            try:
+                decoded = message.decode(bytes(frame.data), decode_choices=False)
+            except DecodeError:
+                decoded = {}
+            if not decoded or len(frame.data) != frame.dlc:
+                n_short += 1
+                continue
+            for name, label in wanted.items():
+                if name in decoded:  # a multiplexed one is not in every frame
+                    channels[label].stamps.append(frame.timestamp)
+                    channels[label].values.append(float(decoded[name]))
+    except Exception as error:  # of python-can anything, where a file is damaged
+        if not any(channel.stamps for channel in channels.values()):
+            raise
+        cut = str(error) or type(error).__name__
+    if cut:
+        remarks.append(f"WARNING: the trace is cut or damaged, and read up to there: {cut}.")
+    if n_short:
+        remarks.append(f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.")
+    sent = [message for message in database.messages if message.frame_id in seen_ids]
+    if seen_ids and not sent:
+        ids = ", ".join(f"0x{x:x}" for x in sorted(seen_ids)[:4])
+        raise ValueError(f"none of its {len(seen_ids)} ids ({ids}, ...) is in {dbc}")
+    columns = {name: (x.stamps, x.values) for name, x in channels.items() if x.stamps}
+    names = [f"{message.name}.{signal.name}" for message in sent for signal in message.signals]
+    return _join_channels(columns, units, names)._replace(remarks=remarks)
+
+
+def _load_database(dbc: str) -> "Database":
+    """Load the description of frames; ValueError for none and for a file that is none."""
+    import cantools
+
+    if not dbc:
+        raise ValueError(_DBC_NEEDED)
+    try:
+        database = cantools.database.load_file(dbc, strict=False)
+    except (cantools.database.UnsupportedDatabaseFormatError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{dbc} describes no CAN frames: {reason:.150}") from None
+    if not hasattr(database, "messages"):
+        raise ValueError(f"{dbc} describes diagnostics, no CAN frames")
+    return database
+
+
+def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], str]) -> LogTable:
+    """Read the mapped fields of a ROS 1 or ROS 2 bag or an MCAP file.
+
+    A field is /TOPIC:FIELD.PART, as /imu:angular_velocity.z. A sample is captured at its header's
+    stamp and arrives at the log's time, where there is a header; else both are the log's.
+
+    Args:
+        path: File, or folder of a ROS 2 bag.
+        mapping: Our column names to fields.
+        sensor_of: Function from our column name to the slow sensor that has it, "" for none.
+
+    Returns:
+        The table; a column gps_latency_s or camera_latency_s says how late that sensor's came.
+
+    Raises:
+        ValueError: A topic or a field is not there, or messages are of an unknown kind.
+    """
+    with require_extra("bags", "reading a bag needs rosbags"):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+    mapping = {name: label for name, label in mapping.items() if name != DBC}
+    channels = {label: _Channel.make() for label in mapping.values()}
+    fields: dict[str, list[str]] = {}
+    for label in channels:
+        topic, _, field = label.partition(":")
+        fields.setdefault(topic, []).append(field)
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+        topics = sorted({connection.topic for connection in reader.connections})
+        if missing := [topic for topic in fields if topic not in topics]:
+            raise ValueError(f"no topic {missing[0]!r}; the bag has {join_names(topics)}")
+        used = [connection for connection in reader.connections if connection.topic in fields]
+        for connection, logged, raw in reader.messages(used):
+            message = reader.deserialize(raw, connection.msgtype)
+            captured = _read_stamp(message) or logged
+            for field in fields[connection.topic]:
+                channel = channels[f"{connection.topic}:{field}"]
+                channel.values.append(_read_field(message, connection.topic, field))
+                channel.stamps.append(1e-9 * captured)
+                channel.late.append(1e-9 * (logged - captured))
+    columns = {label: (x.stamps, x.values) for label, x in channels.items()}
+    for name, label in mapping.items():
+        if (sensor := sensor_of(name)) and any(channels[label].late):
+            stamps, _, late = channels[label]
+            columns.setdefault(f"{sensor}_latency_s", (stamps, late))
+    names = [f"{topic}:..." for topic in topics]
+    return _join_channels(columns, {}, names)
+
+
+def _read_stamp(message: Any) -> int:
+    """Read a header's stamp (ns), 0 without one."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+
+
+def _read_field(message: Any, topic: str, field: str) -> float:
+    """Read a number from a message by the names and places of its parts."""
+    value = message
+    for part in field.split("."):
+        try:
+            value = value[int(part)] if part.isdecimal() else getattr(value, part)
+        except (AttributeError, IndexError, TypeError):
+            parts = [x for x in getattr(value, "__dataclass_fields__", ()) if not x.startswith("_")]
+            text = f"{topic} has no field {field!r}: {part!r} is none of {join_names(parts)}"
+            raise ValueError(text) from None
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{topic}:{field} is no number, but {type(value).__name__}") from None
+
+
+_VBO_NAMES = {"time": "time_s", "velocity": "speed_x_kmh", "heading": "course_degnorth"}
+
+
+def read_vbo(data: bytes) -> "pd.DataFrame":
+    """Read a VBOX file: its time of day in s, its speed, heading and place by our names.
+
+    Args:
+        data: Content of the file.
+
+    Returns:
+        The table; other columns have the file's names.
+
+    Raises:
+        ValueError: A section is missing.
+    """
+    import pandas as pd
+
+    sections = re.split(r"^\[([^\]\n]+)\]\s*$", data.decode("cp1252"), flags=re.M)
+    parts = dict(zip(map(str.casefold, sections[1::2]), sections[2::2], strict=True))
+    if missing := [name for name in ("column names", "data") if not parts.get(name, "").strip()]:
+        raise ValueError(f"a VBOX file has the sections [column names] and [data]; no {missing[0]}")
+    names = [_VBO_NAMES.get(name.casefold(), name) for name in parts["column names"].split()]
+    frame = pd.read_csv(io.StringIO(parts["data"]), sep=r"\s+", names=names, index_col=False)
+    clock = frame["time_s"].to_numpy(np.float64)  # HHMMSS.sss
+    hours, minutes = clock // 10_000, clock // 100 % 100
+    frame["time_s"] = 3600.0 * hours + 60.0 * minutes + np.round(clock % 100.0, 6)
+    if {"lat", "long"} <= set(names):  # minutes north and west
+        degrees = [frame[name].to_numpy(np.float64) / sign for name, sign in _MINUTES]
+        frame["gps_x_m"], frame["gps_y_m"] = to_metres(*degrees, (degrees[0][0], degrees[1][0]))
+    return frame
+
+
+_MINUTES = (("lat", 60.0), ("long", -60.0))
