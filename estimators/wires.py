@@ -91,9 +91,8 @@ def read_wires(source: VehicleSource | None) -> SignalCalibration:
     path = Path(str(source))
     tables = read_document(path, "vehicle")
     try:
-        steering, *others = (dict(tables.get(name, {})) for name in WIRE_TABLES)
-        named = dict(zip(WIRE_TABLES[1:], others, strict=True))
-        return SignalCalibration(**steering, **named).check()
+        steering, latency, noise, at = (dict(tables.get(name, {})) for name in WIRE_TABLES)
+        return SignalCalibration(**steering, latency=latency, noise=noise, at=at).check()
     except (TypeError, ValueError) as error:
         raise type(error)(f"{path}: {error}") from None
 

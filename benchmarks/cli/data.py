@@ -63,7 +63,7 @@ class _Replay:
     """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
     has no gyro, filter the fixes with noise that follows HDOP or does not."""
 
-    log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.", ...)
+    log: Path = take_argument("A recorded drive: a table, CAN trace, bag or NMEA.", ...)
     vehicle: Text = take(
         "A name, a TOML or JSON file, or `identify`: found in the log itself.",
         autocompletion=complete("vehicles"),
@@ -132,7 +132,7 @@ class _Identify:
     intervals, and which of them the log cannot tell; exit status 1, and no file, where nothing is
     identified."""
 
-    log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).", ...)
+    log: Path = take_argument("A recorded drive: a table, CAN trace or bag.", ...)
     vehicle: str = take(
         "The car that is stated: its mass and arms stay, the search starts there.",
         "passenger-car",

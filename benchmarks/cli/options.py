@@ -59,7 +59,10 @@ _SHARED: dict[str, Callable[[], Any]] = {
     "jobs": partial(take, "Number of parallel processes.", None, "--jobs", "-j", min=1),
     "json": partial(take, "Write the rows as JSON.", ends=".json"),
     "mapping": partial(
-        take, "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.", None, "--map"
+        take,
+        "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r), dbc=FILE, or a TOML file; repeatable.",
+        None,
+        "--map",
     ),
     "parquet": partial(take, "Write the rows as Parquet.", ends=".parquet"),
     "seed": partial(take, "Seed of the sampler; another on each machine of a study.", 0),

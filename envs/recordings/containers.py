@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..numerics import require_extra
 from ..validation import join_names
@@ -19,7 +20,7 @@ from .dialect import find_unit, to_metres
 
 if TYPE_CHECKING:
     import pandas as pd
-    from cantools.database import Database
+    from cantools.database.can import Database
 
 _TRACES = {  # reader of python-can, by what its files begin with
     "BLFReader": rb"LOGG",
@@ -58,7 +59,7 @@ class _Channel(NamedTuple):
 
 
 def _join_channels(
-    channels: Mapping[str, tuple[Any, Any]], units: Mapping[str, str], names: list[str]
+    channels: Mapping[str, tuple[ArrayLike, ArrayLike]], units: Mapping[str, str], names: list[str]
 ) -> LogTable:
     """Join channels of (stamps, values) to rows at the stamps of all; of equal stamps the first."""
     import pandas as pd
@@ -197,7 +198,8 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
     database = _load_database(dbc)
     names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
     short = [name.partition(".")[2] for name in names]
-    messages, channels, units = {}, dict[str, _Channel](), dict[str, str]()
+    messages: dict[tuple[int, bool], tuple[Any, dict[str, str]]] = {}
+    channels, units = dict[str, _Channel](), dict[str, str]()
     for message in database.messages:
         wanted = {}
         for signal in message.signals:
@@ -218,9 +220,10 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
             cut = "it is shorter than it says"
         for frame in frames:
             seen_ids.add(frame.arbitration_id)
-            message, wanted = messages.get((frame.arbitration_id, frame.is_extended_id), (None, {}))
-            if message is None or frame.is_error_frame or frame.is_remote_frame:
+            key = frame.arbitration_id, frame.is_extended_id
+            if key not in messages or frame.is_error_frame or frame.is_remote_frame:
                 continue
+            message, wanted = messages[key]
             try:
                 decoded = message.decode(bytes(frame.data), decode_choices=False)
             except DecodeError:
@@ -251,16 +254,17 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
 
 def _load_database(dbc: str) -> "Database":
     """Load the description of frames; ValueError for none and for a file that is none."""
-    import cantools
+    from cantools.database import errors, load_file
+    from cantools.database.can import Database
 
     if not dbc:
         raise ValueError(_DBC_NEEDED)
     try:
-        database = cantools.database.load_file(dbc, strict=False)
-    except (cantools.database.UnsupportedDatabaseFormatError, UnicodeDecodeError) as error:
+        database = load_file(dbc, strict=False)
+    except (errors.Error, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{dbc} describes no CAN frames: {reason:.150}") from None
-    if not hasattr(database, "messages"):
+    if not isinstance(database, Database):
         raise ValueError(f"{dbc} describes diagnostics, no CAN frames")
     return database
 
@@ -314,15 +318,15 @@ def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], 
     return _join_channels(columns, {}, names)
 
 
-def _read_stamp(message: Any) -> int:
+def _read_stamp(message: object) -> int:
     """Read a header's stamp (ns), 0 without one."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+    return 0 if stamp is None else int(stamp.sec * 10**9 + stamp.nanosec)
 
 
-def _read_field(message: Any, topic: str, field: str) -> float:
+def _read_field(message: object, topic: str, field: str) -> float:
     """Read a number from a message by the names and places of its parts."""
-    value = message
+    value: Any = message
     for part in field.split("."):
         try:
             value = value[int(part)] if part.isdecimal() else getattr(value, part)
@@ -363,9 +367,6 @@ def read_vbo(data: bytes) -> "pd.DataFrame":
     hours, minutes = clock // 10_000, clock // 100 % 100
     frame["time_s"] = 3600.0 * hours + 60.0 * minutes + np.round(clock % 100.0, 6)
     if {"lat", "long"} <= set(names):  # minutes north and west
-        degrees = [frame[name].to_numpy(np.float64) / sign for name, sign in _MINUTES]
-        frame["gps_x_m"], frame["gps_y_m"] = to_metres(*degrees, (degrees[0][0], degrees[1][0]))
+        north, east = frame["lat"].to_numpy() / 60.0, frame["long"].to_numpy() / -60.0
+        frame["gps_x_m"], frame["gps_y_m"] = to_metres(north, east, (north[0], east[0]))
     return frame
-
-
-_MINUTES = (("lat", 60.0), ("long", -60.0))

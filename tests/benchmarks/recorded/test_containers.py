@@ -57,8 +57,7 @@ def table() -> pd.DataFrame:
 
 def frames() -> list[Any]:
     database, sent = cantools.database.load_string(DBC), []
-    for row in table().itertuples(index=False):
-        values = row._asdict()
+    for values in table().to_dict("records"):
         known = [("Motion", FAST_COLUMNS)]
         known += [("Gps", {"course_rad": "Course"})] if np.isfinite(values["course_rad"]) else []
         for name, columns in known:
@@ -243,7 +242,8 @@ def test_a_header_says_when_a_sample_was_taken_and_the_log_when_it_came(tmp_path
 
 
 def test_a_vbox_has_its_own_names_and_units(tmp_path: Path) -> None:
-    text = "File created on 1/1/2026\n[column names]\nsats time lat long velocity heading Yaw Steer\n[data]\n"
+    text = "File created on 1/1/2026\n[column names]\n"
+    text += "sats time lat long velocity heading Yaw Steer\n[data]\n"
     for i in range(400):
         t = 59.0 + 0.01 * i
         text += f"008 0959{t:06.3f} {3000.0 + 1e-4 * i:+.6f} {-480.0:+.6f} 72.0 090.0 5.0 1.0\n"

@@ -1,5 +1,6 @@
 """Steering, latencies and noise: in a file, and applied to a log."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from .slalom import columns, saved
 
 
 def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
-    wires = SignalCalibration(15.0, -1, 0.01, {"gps": 0.2, "steer": -0.02}, {"gyro_noise": 0.004})
+    late, places = {"gps": 0.2, "steer": -0.02}, {"gps": [1.5, 0.0, 1.2]}
+    wires = SignalCalibration(15.0, -1, 0.01, late, {"gyro_noise": 0.004}, places)
     write_vehicle(tmp_path / "car.toml", PASSENGER_CAR, wires)
     assert make_vehicle(tmp_path / "car.toml") == PASSENGER_CAR
     assert read_wires(tmp_path / "car.toml") == wires
@@ -45,6 +47,9 @@ def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
             "noise gyro_noise is a number of zero or more, got 'loud'",
         ),
         ("noise = {gyro_nois = 0.1}", "did you mean 'gyro_noise'"),
+        ("at = {gps = [1.0, 0.0]}", r"gps sits at \[x, y, z\] m forward, left, up, within 10 m"),
+        ("at = {gps = [1000.0, 0.0, 0.0]}", "within 10 m, got"),
+        ("at = {radar = [1.0, 0.0, 0.0]}", "sensor with a place 'radar'"),
     ],
 )
 def test_bad_wires_are_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -105,3 +110,54 @@ def test_options_of_estimators() -> None:
     assert found == {"joint": {"robust": 4, "gate": 0.9}, "dakf": {"q_beta": 1e-4}}
     with pytest.raises(ValueError, match=r"ESTIMATOR\.NAME=VALUE, got 'robust=4'"):
         _parse_estimator_options(["robust=4"])
+
+
+def test_a_sensor_ahead_of_the_centre_of_gravity_is_moved_there() -> None:
+    """Rigid body: v = v_cg + w x p, a = a_cg + w' x p + w x (w x p), with known motion."""
+    right, _ = drive(1)
+    t, n = right.time, len(right.time)
+    rate, slope = 0.3 * np.sin(t), 0.3 * np.cos(t)
+    roll_rate, slip, speed = 0.05 * np.cos(2.0 * t), 0.03 * np.sin(t), np.full(n, 20.0)
+    x, y, z = place = (1.5, -0.4, 1.2)
+    fast = right.record.fast.copy()
+    fast[:, [FAST.gyro, FAST.roll_rate]] = np.stack([rate, roll_rate], axis=1)
+    fast[:, [FAST.wheel_left, FAST.wheel_right]] = speed[:, None]
+    fast[:, FAST.accel_y] = 1.0 + slope * x - rate**2 * y
+    fast[:, FAST.accel_x] = 2.0 - slope * y - rate**2 * x
+    v_y = speed * np.tan(slip) + rate * x - roll_rate * z
+    shown = np.arctan2(v_y, speed - rate * y)
+    packets = right.record.packets.copy()
+    rows = packets[:, PACKET.captured].astype(int) - right.record.first
+    packets[:, PACKET.value] = shown[rows]
+    record = dataclasses.replace(right.record, fast=fast, packets=packets)
+    log = dataclasses.replace(right, record=record, truth={"beta": shown})
+    moved = apply_wires(
+        log, SignalCalibration(at=dict.fromkeys(("gps", "sideslip", "accel"), place))
+    )
+    assert np.abs(shown - slip).max() > 0.02
+    np.testing.assert_allclose(moved.truth["beta"], slip, atol=3e-4)  # slips are small
+    np.testing.assert_allclose(moved.record.packets[:, PACKET.value], slip[rows], atol=3e-4)
+    inner = slice(10, -10)
+    np.testing.assert_allclose(moved.record.fast[inner, FAST.accel_y], 1.0, atol=1e-3)
+    np.testing.assert_allclose(moved.record.fast[inner, FAST.accel_x], 2.0, atol=1e-3)
+
+
+def test_a_stream_moves_the_course_as_the_whole_record_does(tmp_path: Path) -> None:
+    import sideslip
+
+    table = as_table(drive(2)[0]).iloc[:600]
+    car = tmp_path / "car.toml"
+    write_vehicle(car, PASSENGER_CAR, SignalCalibration(at={"gps": [1.5, 0.0, 0.0]}))
+    names = [str(name) for name in table if name != "time_s"]
+    stream = sideslip.Stream(car, names)
+    for row in table.to_dict("records"):
+        for name in names:
+            if np.isfinite(value := float(row[name])):
+                stream.push(name, float(row["time_s"]), value)
+    answer, whole = stream.estimate(), sideslip.estimate(table, car).iloc[-1]
+    assert answer is not None and answer.sideslip == pytest.approx(whole["sideslip_rad"], abs=1e-9)
+    plain = sideslip.estimate(table, "passenger-car").iloc[-1]
+    assert abs(plain["sideslip_rad"] - whole["sideslip_rad"]) > 1e-4
+    write_vehicle(car, PASSENGER_CAR, SignalCalibration(at={"accel": [1.0, 0.0, 0.0]}))
+    with pytest.raises(ValueError, match="accelerations of the centre of gravity"):
+        sideslip.Stream(car, names)

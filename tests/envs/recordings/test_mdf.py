@@ -109,7 +109,7 @@ def test_a_damaged_file_and_a_missing_extra(
 ) -> None:
     path = tmp_path / "drive.mf4"
     path.write_bytes(b"MDF     4.10" + bytes(200))
-    with pytest.raises(ValueError, match=r"drive\.mf4: expected CSV, Parquet, MATLAB, MDF, a CAN trace, a bag or VBO, but"):
+    with pytest.raises(ValueError, match=r"drive\.mf4: expected CSV, .* or VBO, but"):
         read_log(path)
     gc.collect()  # asammdf's own `__del__` fails where it could not open the file
     monkeypatch.setitem(sys.modules, "asammdf", None)
