@@ -186,7 +186,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         Returns:
             The observation and the info at tick 0.
         """
-        config = self.config.apply_options(options or {})
+        config = self.config.apply_options(self._adapt_options(dict(options or {})))
         super().reset(seed=seed)  # refused options leave everything as it was
         self._episode = config
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
@@ -249,6 +249,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             done -= WILD
             warn_once(self, command)
         return done
+
+    def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Adapt options of reset to what a subclass drives; ValueError for one that it cannot."""
+        return options
 
     def _start_episode(self) -> None:
         """Begin an episode whose tick 0 is packed, with its picture."""
@@ -377,8 +381,12 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             snapshot: Return value of `get_state`.
 
         Raises:
-            ValueError: If it has another control period, other sensors or another observation.
+            ValueError: If it is of another car, road, control period, sensors or observation.
         """
+        self._restore(snapshot)
+
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore a snapshot; subclasses have more in theirs."""
         if np.shape(snapshot["rows"]) != self.rows.shape:
             ticks, own_ticks = len(snapshot["rows"]), len(self.rows)
             raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")

@@ -18,8 +18,14 @@ from ..scenarios.road import ROADS, make_path
 from ..scenarios.scenario import MIN_GPS_PERIOD, Scenario
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
 from ..scenarios.world import IDEAL, World
-from ..sensors.camera import FieldOfView
-from ..sensors.camera.analytic import DELAYS, MAX_DELAY, VISIONS, count_delay_ticks, load_detector
+from ..sensors.camera.analytic import (
+    DELAYS,
+    MAX_DELAY,
+    VISIONS,
+    FieldOfView,
+    count_delay_ticks,
+    load_detector,
+)
 from ..sensors.errors import IDEAL_SENSORS
 from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link, SlowSensor, make_link

@@ -228,15 +228,6 @@ def _observe_slow(row: EpisodeArrays, k: int, count: int) -> None:
 
 
 @jit
-def _write_report(report: Vector, z: Vector) -> None:
-    """Write time, yaw rate, heading and failure of the state into the report."""
-    report[REPORT.t] = z[Z.clock.tick] * TICK
-    report[REPORT.gamma] = z[Z.motion.gamma]
-    report[REPORT.psi] = z[Z.motion.psi]
-    report[REPORT.failure] = z[Z.clock.failure]
-
-
-@jit
 def finish_step(row: EpisodeArrays, n: int, done: int) -> None:
     """Do slow sensors, observation and report of one vehicle's step.
 
@@ -323,9 +314,11 @@ def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int) -> None:
 @jit
 def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
     """Write the report, and the observation of the slow sensors from entry k on."""
-    report = row.report
+    report, z = row.report, row.z
     _observe_slow(row, k, count)
-    _write_report(report, row.z)
+    report[REPORT.t] = z[Z.clock.tick] * TICK
+    report[REPORT.gamma], report[REPORT.psi] = z[Z.motion.gamma], z[Z.motion.psi]
+    report[REPORT.failure] = z[Z.clock.failure]
     report[REPORT.reward] = -report[REPORT.cost]
     report[REPORT.packets] = count
 
@@ -343,24 +336,13 @@ def finish_reset(
         steer: Steering angle (rad).
         target: Coefficients of the references.
     """
-    z, rows, switches, report = row.z, row.rows, row.switches, row.report
+    rows, report = row.rows, row.report
     count = _sample_slow_sensors(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    command = rows[0, FAST.steer_command]
-    refs = compute_reference(command, v, target, switches[FLAGS.reference])
-    write(z, refs, Z.refs)
-    n_rows = 1
-    if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
-        for j in range(1, len(rows)):
-            copy_into(rows[0], rows[j])
-        n_rows = len(rows)
-    observe(row, n_rows, count, refs)
-    _write_report(report, z)
-    report[REPORT.beta] = beta
+    refs = compute_reference(rows[0, FAST.steer_command], v, target, row.switches[FLAGS.reference])
+    write(row.z, refs, Z.refs)
+    report[REPORT.beta], report[REPORT.steer] = beta, steer
     report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
-    report[REPORT.steer] = steer
-    report[REPORT.yaw_moment] = 0.0
-    report[REPORT.cost] = 0.0
+    report[REPORT.yaw_moment] = report[REPORT.cost] = report[REPORT.ended] = 0.0
+    _finish_report(row, _observe_step(row, len(rows), 1), count)  # tick 0 stands for all samples
     report[REPORT.reward] = 0.0
-    report[REPORT.packets] = count
-    report[REPORT.ended] = 0.0

@@ -28,7 +28,6 @@ from .tick import StepParams
 from .window import compute_profile_angle
 
 _GUST_ARM = 0.2  # m ahead of the centre of gravity, as of tie-vision's wind
-_LEAD_ACCELERATION = 0.5  # m/s2
 
 
 @jit
@@ -94,15 +93,6 @@ def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + GRAVITY * sincos(d.accel_roll)[0]
     p[P.slow[GPS].stamp] = round_to_ticks(d.gps_stamp)
     z[Z.errors.curvature] = compute_car_curvature(read(z, Z.motion), read(p, P.road))
-
-
-@jit
-def _write_gentle_steering(p: Vector, speed: Scalar) -> None:
-    """Write the gentle steering before the manoeuvre, of about `_LEAD_ACCELERATION` a sine."""
-    target, v = read(p, P.target), maximum(speed, 1.0)
-    gain = maximum(1.0 + target.G * v * v, 0.2) / (target.per_l * v * v)  # dakf-stability (23)
-    profile = p[P.steering_profile[0] :]
-    write_gentle_steering(p[P.task.lead_in], _LEAD_ACCELERATION * gain, profile)
 
 
 @jit
@@ -173,9 +163,10 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     write(p, draw_car(d, read(p, P.car)), P.car)
     change_tick = select(d.tyre_change_time > 0.0, round_to_ticks(d.tyre_change_time), FOREVER)
     write(p, (change_tick, d.front_change, d.rear_change, d.friction_change), P.tyre_change)
-    write_steering(switches[FLAGS.steering], d, p[P.steering_profile[0] :])
+    profile, target = p[P.steering_profile[0] :], read(p, P.target)
+    write_steering(switches[FLAGS.steering], d, profile)
     if lead_in > 0.0:
-        _write_gentle_steering(p, d.speed)
+        write_gentle_steering(p[P.task.lead_in], d.speed, target, profile)
     if d.side < 0.5:
         for i in range(PARAMS_WIDTH + 1, len(p)):  # a trace
             p[i] = 0.0 - p[i]
@@ -189,7 +180,7 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     _write_surroundings(p, d, motion.s, motion.v_x)
     _write_errors(p, z, d)
     n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
-    road, target = read(p, P.road), read(p, P.target)
+    road = read(p, P.road)
     steer = compute_profile_angle(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
         driver, path = read(p, P.driver), read(p, P.path)

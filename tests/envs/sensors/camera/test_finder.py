@@ -12,8 +12,7 @@ pytest.importorskip("cv2")
 import cv2
 
 from sideslip.envs.numerics.jit import as_python
-from sideslip.envs.sensors.camera import FieldOfView
-from sideslip.envs.sensors.camera.analytic import compute_preview_offset
+from sideslip.envs.sensors.camera.analytic import FieldOfView, compute_preview_offset
 from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _CameraMount, _search_starts
 from sideslip.envs.sensors.camera.pinhole import Pinhole
