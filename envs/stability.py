@@ -158,6 +158,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         self.control_period, self.reference = int(control_period), reference
         self._episode = self.config.base
         self._init_rendering(render_mode)
+        self.annotations = {}
         self.camera: CameraSimulator | None = None  # with `vision="image"`; has the newest picture
         if vision == "image":
             self.camera = CameraSimulator(delay or "fitted", appearance)

@@ -11,9 +11,9 @@ from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, sele
 from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
-from ..task import AGE_CAP, N_SAMPLED, REPORT, ReferenceParams, compute_reference
+from ..task import AGE_CAP, N_SAMPLED, REPORT, compute_reference
 from ..ticks import NEVER, TICK
-from ..vehicle.dynamics import Motion
+from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import FLAGS, EpisodeArrays, P, Z
 from .window import WINDOW
 
@@ -324,24 +324,20 @@ def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
 
 
 @jit
-def finish_reset(
-    row: EpisodeArrays, motion: Motion, beta: Scalar, steer: Scalar, target: ReferenceParams
-) -> None:
+def finish_reset(row: EpisodeArrays) -> None:
     """Do slow sensors, references, observation and report of tick 0.
 
     Args:
-        row: Arrays of the episode, whose first fast row is written.
-        motion: Motion of the car.
-        beta: Sideslip angle (rad).
-        steer: Steering angle (rad).
-        target: Coefficients of the references.
+        row: Arrays of the episode, whose state and first fast row are written.
     """
-    rows, report = row.rows, row.report
+    z, rows, switches, report = row.z, row.rows, row.switches, row.report
+    motion, target = read(z, Z.motion), read(row.p, P.target)
     count = _sample_slow_sensors(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    refs = compute_reference(rows[0, FAST.steer_command], v, target, row.switches[FLAGS.reference])
-    write(row.z, refs, Z.refs)
-    report[REPORT.beta], report[REPORT.steer] = beta, steer
+    refs = compute_reference(rows[0, FAST.steer_command], v, target, switches[FLAGS.reference])
+    write(z, refs, Z.refs)
+    beta = compute_sideslip_angle(motion.v_x, motion.v_y, switches[FLAGS.small_angle])
+    report[REPORT.beta], report[REPORT.steer] = beta, z[Z.drive.delta_f]
     report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
     report[REPORT.yaw_moment] = report[REPORT.cost] = report[REPORT.ended] = 0.0
     _finish_report(row, _observe_step(row, len(rows), 1), count)  # tick 0 stands for all samples

@@ -1,9 +1,9 @@
 """Reset of an episode: its draws from a key, and tick 0; compiled."""
 
-from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos
+from ..numerics.functions import CHANNELS, PI, draw_normals, draw_uniforms, exp, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import Scalar, Vector, from_word, maximum, select
+from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, select
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
 from ..scenarios.driver import compute_target_angle
@@ -11,15 +11,9 @@ from ..scenarios.road import add_weave, transform_path
 from ..scenarios.steering import DRIVER, WANDER, write_gentle_steering, write_steering
 from ..sensors.errors import ErrorState, SensorErrors, apply_sensor_errors
 from ..sensors.inertial import NormalDraws, compute_fast_row
-from ..sensors.link import draw_clock_phase
 from ..sensors.slow import GPS, draw_first_drift
 from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
-from ..vehicle.dynamics import (
-    Motion,
-    compute_car_curvature,
-    compute_gravity,
-    compute_sideslip_angle,
-)
+from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity
 from ..vehicle.parameters import GRAVITY
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import NEVER_DUE, finish_reset
@@ -173,8 +167,7 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     p[P.speed_profile.speed] = d.speed
     for i in range(STATE_WIDTH):
         z[i] = 0.0
-    small_angle = switches[FLAGS.small_angle]
-    _write_motion(z, d, start.motion, small_angle)
+    _write_motion(z, d, start.motion, switches[FLAGS.small_angle])
     _write_sensors(p, d, start.low, start.high)
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
@@ -195,11 +188,12 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     z[Z.clock.redraws], z[Z.clock.next_due] = redraws, NEVER_DUE
     for sensor in range(len(Z.slow)):
         link, column = read(p, P.slow[sensor]), Z.slow[sensor]
-        phase = draw_clock_phase(link, key_low, key_high, sensor)
+        share = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)[0]
+        phase = select(link.phase < 0.0, floor(share * link.period), link.phase)
+        phase = phase + select(phase + link.stamp < 0.0, link.period, 0.0)  # no stamp before tick 0
         z[column.next_capture] = select(link.period > 0.0, phase, NEVER)
         z[column.captured] = NEVER
         z[column.drift] = draw_first_drift(sensor, read(p, P.sky), key_low, key_high)
-    beta = compute_sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = draw_normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = draw_normals(key_low, key_high, 0, CHANNELS.wheels)
     vibration = draw_normals(key_low, key_high, 0, CHANNELS.errors)[0]
@@ -207,4 +201,4 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     draws, variant = NormalDraws(fast, wheels, vibration), make_step_variant(p, switches)
     row_0 = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
     write(row.rows[0], row_0, FAST)
-    finish_reset(row, motion, beta, steer, target)
+    finish_reset(row)

@@ -50,14 +50,11 @@ class RenderMixin:
         raise NotImplementedError
 
     def _record_step(self) -> None:
-        """Record what a reset or a step led to, and show it in the window if there is one.
-
-        Called where `_traces` has some. The window is an estimate behind: wrappers estimate later.
-        """
+        """Record a reset or a step where `_traces` has some, and show it in the window."""
         for row, trace in enumerate(self._traces):
             episode = self._get_episode(row)
             trace.add(episode.report, episode.state)
-        if self.render_mode == "human":
+        if self.render_mode == "human":  # an estimate behind: wrappers estimate later
             self._show()
 
     def _show(self) -> None:
@@ -117,9 +114,7 @@ class RenderMixin:
 class SingleRenderMixin(RenderMixin):
     """A single environment that draws its car."""
 
-    def _init_rendering(self, mode: str | None) -> None:
-        super()._init_rendering(mode)
-        self.annotations: dict[str, tuple[float, float]] = {}
+    annotations: dict[str, tuple[float, float]]  # estimates of the newest step
 
     def annotate(self, label: str, beta: float, std: float) -> None:
         """Annotate the newest step with a wrapper's estimate, to be drawn beside the truth.

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos, wrap
+from ..numerics.functions import CHANNELS, PI, compute_sine, draw_normals, exp, sincos, wrap
 from ..numerics.jit import jit
 from ..numerics.primitives import (
     Scalar,
@@ -25,7 +25,7 @@ from ..validation import check_mapping, describe_unknown
 from ..vehicle.dynamics import CarParams, Motion, RoadParams, compute_sideslip_angle
 from ..vehicle.tyres import MIN_SPEED
 from .camera.analytic import CAMERA_KIND, FieldOfView, compute_lane_quality, sample_camera
-from .errors import SensorErrors, compute_course_error
+from .errors import SensorErrors
 from .inertial import Noise
 from .link import Blocks, Link, PacketValue, SlowKind, SlowSensor
 
@@ -114,9 +114,9 @@ def _sample_gps(context: MeasurementContext, hdop: Scalar, n: Vector) -> tuple[V
     v = sqrt(v_x * v_x + v_y * v_y)
     # course = psi + beta, dakf-stability (3), with the antenna's beta
     angle = motion.psi + compute_sideslip_angle(v_x, v_y, context.small_angle)
-    angle = angle + compute_course_error(
-        to_float(to_int(context.tick)), maximum(v, MIN_SPEED), context.errors
-    )
+    errors, tick = context.errors, to_float(to_int(context.tick))
+    wave = compute_sine(errors.course_rate * tick + errors.course_phase)  # varies slowly
+    angle = angle + errors.course_error / maximum(v, MIN_SPEED) * wave
     values = (
         wrap(angle + noise.course * noise_scale / maximum(v, MIN_SPEED) * n[0]),
         v + noise.gps_speed * noise_scale * n[1],
