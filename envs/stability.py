@@ -354,11 +354,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         """The slow sensors by name, with the clock phase that this episode drew."""
         return self._get_episode().slow_sensors
 
-    @property
-    def redraws(self) -> int:
-        """Number of unstable draws that this reset rejected."""
-        return int(self._row.z[Z.clock.redraws])
-
     def _get_episode(self, row: int = 0) -> Episode:
         arrays = self._row
         rows, packets = arrays.rows[: self.ticks_done], arrays.packets[: self.delivered]

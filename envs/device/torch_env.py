@@ -174,7 +174,7 @@ class DeviceVectorEnv(TensorVectorEnv):
         """Get the state of the rows and the newest step's outcome, the env's own tensors."""
         return self._rows.state, self._rows.outcome
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> Any:
         """Copy the state of all rows, which `StabilityVectorEnv.set_state` takes too."""
         self._rows.download(self.engine.arrays)
         return super().get_state()
