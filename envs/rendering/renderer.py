@@ -151,8 +151,5 @@ class VectorRenderMixin(RenderMixin):
         for row in np.flatnonzero(rows[: len(self._traces)]):
             self._traces[row].add_estimate(label, beta[row], std[row])
 
-    def render(self) -> tuple[Frame, ...] | None:
-        """Return a frame of each car in the mode "rgb_array", else None."""
-        return self._render_frames()
-
+    render = RenderMixin._render_frames
     close_extras = RenderMixin._close_window
