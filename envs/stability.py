@@ -158,6 +158,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         self.control_period, self.reference = int(control_period), reference
         self._episode = self.config.base
         self._init_rendering(render_mode)
+        self.annotations = {}
         self.camera: CameraSimulator | None = None  # with `vision="image"`; has the newest picture
         if vision == "image":
             self.camera = CameraSimulator(delay or "fitted", appearance)
@@ -186,7 +187,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         Returns:
             The observation and the info at tick 0.
         """
-        config = self.config.apply_options(options or {})
+        config = self.config.apply_options(self._adapt_options(dict(options or {})))
         super().reset(seed=seed)  # refused options leave everything as it was
         self._episode = config
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
@@ -249,6 +250,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             done -= WILD
             warn_once(self, command)
         return done
+
+    def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Adapt options of reset to what a subclass drives; ValueError for one that it cannot."""
+        return options
 
     def _start_episode(self) -> None:
         """Begin an episode whose tick 0 is packed, with its picture."""
@@ -349,11 +354,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         """The slow sensors by name, with the clock phase that this episode drew."""
         return self._get_episode().slow_sensors
 
-    @property
-    def redraws(self) -> int:
-        """Number of unstable draws that this reset rejected."""
-        return int(self._row.z[Z.clock.redraws])
-
     def _get_episode(self, row: int = 0) -> Episode:
         arrays = self._row
         rows, packets = arrays.rows[: self.ticks_done], arrays.packets[: self.delivered]
@@ -377,8 +377,12 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             snapshot: Return value of `get_state`.
 
         Raises:
-            ValueError: If it has another control period, other sensors or another observation.
+            ValueError: If it is of another car, road, control period, sensors or observation.
         """
+        self._restore(snapshot)
+
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore a snapshot; subclasses have more in theirs."""
         if np.shape(snapshot["rows"]) != self.rows.shape:
             ticks, own_ticks = len(snapshot["rows"]), len(self.rows)
             raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")

@@ -4,10 +4,9 @@ import dataclasses
 import difflib
 import inspect
 import math
-import operator
 import reprlib
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -180,79 +179,6 @@ def format_rows(rows: npt.ArrayLike) -> str:
         return f"row {numbers[0]}"
     dots = ", ..." if len(numbers) > _MAX_LISTED_ROWS else ""
     return f"rows {', '.join(map(str, numbers[:_MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
-
-
-def parse_seeds(seed: object, count: int) -> list[int | None]:
-    """Make a seed for each row; ValueError or TypeError for none.
-
-    Args:
-        seed: A number s, of which row i gets s + i, a list (N,) of numbers or None, or None.
-        count: Number of rows N.
-
-    Returns:
-        Seed of each row, or None.
-    """
-    if seed is None:
-        return [None] * count
-    if isinstance(seed, int | np.integer):
-        seeds: list[int | None] = [int(seed) + i for i in range(count)]
-    else:
-        if not isinstance(seed, Sequence | np.ndarray):
-            raise TypeError(f"seed: an int or a list of {count}, got {short_repr(seed)}")
-        if len(seed) != count:
-            raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
-        seeds = [None if entry is None else operator.index(entry) for entry in seed]
-    bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
-    if bad:
-        got = short_repr(seeds[bad[0]])
-        raise ValueError(f"seed: {format_rows(bad)} would get a negative seed, {got}")
-    return seeds
-
-
-def parse_reset_mask(mask: Any, count: int) -> Mask:
-    """Parse options["reset_mask"], all rows without it; TypeError or ValueError for no mask.
-
-    Args:
-        mask: The mask, an array or a tensor, or None.
-        count: Number of rows N.
-
-    Returns:
-        A mask of the rows, shape (N,).
-    """
-    if mask is None:
-        return np.ones(count, np.bool_)
-    mask = mask.cpu().numpy() if hasattr(mask, "cpu") else mask
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        what = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise TypeError(f"options['reset_mask'] is an array of bool, got {what}")
-    if mask.shape != (count,):
-        raise ValueError(f"options['reset_mask'] has shape ({count},), got {mask.shape}")
-    if not mask.any():
-        raise ValueError("options['reset_mask'] resets no row")
-    return mask
-
-
-def split_options(options: Mapping[str, object], count: int) -> list[dict[str, Any]]:
-    """Split options of reset by rows: a list, tuple or array has one, or None, for each row.
-
-    Args:
-        options: Options by name.
-        count: Number of rows N.
-
-    Returns:
-        Options of each row by name.
-    """
-    columns = {}
-    for name, value in options.items():
-        if isinstance(value, np.ndarray) and value.ndim > 0:
-            value = value.tolist()
-        if not isinstance(value, list | tuple):
-            value = [value] * count
-        elif len(value) != count:
-            raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
-        columns[name] = value
-    rows = range(count)
-    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
 
 
 def parse_action(action: object, width: int, fail: bool) -> Actions:

@@ -289,18 +289,3 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
     def slow_sensors(self) -> Sequence[dict[str, SlowSensor]]:
         """Each row's slow sensors by name, with the clock phases that its episode drew."""
         return self._map_episodes(lambda episode: episode.slow_sensors)
-
-    def get_state(self) -> dict[str, Any]:
-        """Copy the state of all rows, from which `set_state` continues bit for bit."""
-        return self._copy_state()
-
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Return value of `get_state`.
-
-        Raises:
-            ValueError: If it has another number of rows, control period or observation.
-        """
-        self._restore_state(snapshot)

@@ -62,11 +62,8 @@ def _compute_static_gain(car: Bicycle, V: Scalar) -> Scalar:
 @jit
 def _compute_sideslip_gain(car: Bicycle, V: Scalar) -> Scalar:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
-    m = car.m
-    a11, _, a21, a22, _, _, b22 = compute_bicycle_coefficients(
-        m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
-    )
-    yaw_rate = a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
+    a11, _, a21, a22, _, _, b22 = compute_bicycle_coefficients(car, V)
+    yaw_rate = a11 * car.m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
     return -(a21 + a22 * yaw_rate) / b22
 
 

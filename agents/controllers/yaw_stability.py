@@ -52,9 +52,7 @@ class BicyclePlant(NamedTuple):
 @jit
 def _compute_plant(car: Bicycle, V: Scalar) -> BicyclePlant:
     """Compute the plant of a nominal car at a speed (m/s)."""
-    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
-        car.m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
-    )
+    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(car, V)
     return BicyclePlant(a11, a12, a21, a22, b11, b21, b22)
 
 

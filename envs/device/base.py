@@ -89,10 +89,6 @@ class TensorVectorEnv(BatchEnv[Tensor]):
     def tensors(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Get the state of the rows and the newest step's outcome, the env's own tensors."""
 
-    @abstractmethod
-    def get_state(self) -> Any:
-        """Copy the state of all rows, from which `set_state` continues bit for bit."""
-
     def set_state(self, snapshot: Any) -> None:
         """Restore a snapshot of this env, or of one built with the same arguments.
 

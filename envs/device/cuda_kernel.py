@@ -112,9 +112,7 @@ class DeviceArrays(NamedTuple):
     over: Vector  # RUNS, _OVER or ASKED
     generators: Matrix  # as `_draw_key` reads them
     which: Vector  # index in starts of a row that is asked for
-    starts: (
-        Matrix  # packed one behind the other: parameters, low, high, motion; the first: no options
-    )
+    starts: Matrix  # packed: parameters, low, high, motion behind each other; 0: no options
     switches: Matrix  # of the starts
     bounds: Matrix
     actions: Matrix
@@ -252,7 +250,9 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
     Returns:
         Function of N, whether rows are reset, and pointers to `DeviceArrays`.
     """
-    step, make_array = to_cuda(_step_row, real), _get_numbers if SIMULATED else carray
+    step, make_array = to_cuda(_step_row, real), carray
+    if SIMULATED:
+        make_array = lambda pointer, shape: pointer.numbers  # noqa: E731
     floats = types.float32 if real is np.float32 else types.float64
     width, entries, inputs = constants.width, constants.entries, constants.inputs
     packed, flags, record = width + sum(_DRAWN), len(FLAGS), constants.record
@@ -290,8 +290,3 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
         step(i, resets, constants, memory, thread_arrays)
 
     return step_kernel
-
-
-def _get_numbers(array: Vector, shape: tuple[int, ...]) -> Vector:
-    """Get the array of a simulated pointer."""
-    return array.numbers

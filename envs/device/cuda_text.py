@@ -76,7 +76,7 @@ def _compile_device(function: Any) -> Any:
 
 
 def _make_table(real: Any) -> dict[str, _Function]:
-    """Make CUDA's own primitives by the names that the equations use."""
+    """Make CUDA's own primitives by the names that the equations use; Python's serve for others."""
     from numba.cuda import libdevice
 
     single = real is np.float32
@@ -85,24 +85,14 @@ def _make_table(real: Any) -> dict[str, _Function]:
     sqrt = libdevice.fsqrt_rn if single else libdevice.dsqrt_rn
     frexp = libdevice.frexpf if single else libdevice.frexp
     functions = {
-        "minimum": lambda a, b: a if a < b else b,
-        "maximum": lambda a, b: a if a > b else b,
         "absolute": lambda a: fabs(a),
         "floor": lambda a: floor(a),
         "sqrt": lambda a: sqrt(a),
-        "select": lambda condition, a, b: a if condition else b,
         "to_float": lambda a: real(a),
         "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
-        "to_int": lambda a: int(a),
-        "to_word": lambda a: int(a),  # a float64 has a word's value, a float32 its bits
         "from_word": lambda a: real(a),
-        "any_lane": lambda condition: condition,
-        "lane_width": lambda array: 1,
-        "load_lanes": lambda array, where, first: read(array, where, first),
-        "count_lanes": lambda: 1,
-        "iota": lambda first: first,
     }
-    if single:
+    if single:  # a float64 has a word's value, a float32 its bits
         functions["to_word"] = lambda a: int(libdevice.float_as_int(a))
         functions["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
     return {name: _compile_device(f) for name, f in functions.items()} | _register_access()

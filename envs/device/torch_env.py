@@ -9,6 +9,7 @@ from typing import Any
 from gymnasium.vector import AutoresetMode
 
 from ..engine.batch import IntArray, NumbaEngine
+from ..engine.batch_env import BatchEnv
 from ..engine.config import EpisodeConfig
 from ..engine.layout import P
 from ..engine.step import get_start_variant
@@ -173,14 +174,14 @@ class DeviceVectorEnv(TensorVectorEnv):
         """Get the state of the rows and the newest step's outcome, the env's own tensors."""
         return self._rows.state, self._rows.outcome
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> Any:
         """Copy the state of all rows, which `StabilityVectorEnv.set_state` takes too."""
         self._rows.download(self.engine.arrays)
-        return self._copy_state()
+        return super().get_state()
 
     def _restore(self, snapshot: Mapping[str, Any]) -> None:
         links, capacities = self._collect_links(snapshot["configs"])
-        self._restore_state(snapshot)
+        BatchEnv.set_state(self, snapshot)
         self._links = links
         self._build(capacities)
 

@@ -97,14 +97,6 @@ def _get_episode_arrays(
     )  # fmt: skip
 
 
-@jit
-def _get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
-    """Get the start of one of several episodes."""
-    return EpisodeStart(
-        starts.params[i], starts.low[i], starts.high[i], starts.switches[i], starts.motion[i]
-    )
-
-
 @noinline
 def _step_lanes(count: int, batch: BatchArrays, actions: Matrix, buffers: _LaneBuffers) -> bool:
     """Step the block's first `count` members; False, and nothing changes, where one ends early."""
@@ -250,7 +242,10 @@ def _reset_rows(
         final.ticks_done[i], final.delivered[i] = batch.ticks_done[i], batch.delivered[i]
         key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
         row = _get_episode_arrays(batch, i, buffers.block.bounds, buffers.window)
-        reset_vehicle(_get_episode_start(starts, t), key_low, key_high, row)
+        start = EpisodeStart(
+            starts.params[t], starts.low[t], starts.high[t], starts.switches[t], starts.motion[t]
+        )
+        reset_vehicle(start, key_low, key_high, row)
         batch.ticks_done[i] = 1
         batch.delivered[i] = int(batch.reports[i, REPORT.packets])
 

@@ -1,6 +1,7 @@
 """`BatchEnv`: what environments of many cars share, whichever engine steps them."""
 
 import copy
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Generic, TypeVar
@@ -12,7 +13,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..validation import Mask, format_rows, parse_reset_mask, parse_seeds, short_repr, split_options
+from ..validation import Mask, format_rows, short_repr
 from .batch import IntArray, NumbaEngine
 from .config import EnvConfig, EpisodeConfig
 
@@ -69,7 +70,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
             ResetNeeded: If a mask leaves out rows that were never started.
         """
         N, remaining = self.num_envs, dict(options or {})
-        seeds, mask = parse_seeds(seed, N), parse_reset_mask(remaining.pop("reset_mask", None), N)
+        seeds, mask = _parse_seeds(seed, N), _parse_reset_mask(remaining.pop("reset_mask", None), N)
         if not (self._started or mask.all()):
             raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
         chosen = np.flatnonzero(mask)
@@ -120,7 +121,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
     ) -> tuple[list[EpisodeConfig], IntArray]:
         """Make configs with options of reset; (configs, index (M,) of each chosen row's)."""
         N, index = self.num_envs, np.empty_like(chosen)
-        row_options = split_options(options, N) if options else [{}] * N
+        row_options = _split_options(options, N) if options else [{}] * N
         configs: list[EpisodeConfig] = []
         known: dict[tuple[object, ...], int] = {}  # rows with the same objects share a config
         for m, i in enumerate(chosen.tolist()):
@@ -168,15 +169,22 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         generators = self.np_random  # a row without one gets one now
         return tuple(self.seeds[: len(generators)])
 
-    def _copy_state(self) -> dict[str, Any]:
-        """Copy the state of all rows, whose arrays the engine on the host has."""
+    def get_state(self) -> Any:
+        """Copy the state of all rows, from which `set_state` continues bit for bit."""
         parts = self.engine.arrays._asdict()
         arrays: dict[str, Any] = {name: array.copy() for name, array in parts.items()}
         arrays |= {"configs": list(self.configs), "seeds": list(self.seeds), "layout": self.layout}
         return arrays | {"rng": copy.deepcopy(self.generators), "started": self._started}
 
-    def _restore_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a copy of `_copy_state`; ValueError for one of other rows, ticks or entries."""
+    def set_state(self, snapshot: Any) -> None:
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Return value of `get_state`.
+
+        Raises:
+            ValueError: If it has another number of rows, control period or observation.
+        """
         shape, own_shape = np.shape(snapshot["rows"]), self.engine.arrays.rows.shape
         if shape != own_shape:
             sizes = f"this env {own_shape[0]} of {own_shape[1]}"
@@ -189,3 +197,52 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
         self._started, self._has_over = snapshot["started"], bool(self.engine.arrays.over.any())
+
+
+def _parse_seeds(seed: object, count: int) -> list[int | None]:
+    """Make a seed for each row from s (row i gets s + i), a list (N,) of them or None."""
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        seeds: list[int | None] = [int(seed) + i for i in range(count)]
+    else:
+        if not isinstance(seed, Sequence | np.ndarray):
+            raise TypeError(f"seed: an int or a list of {count}, got {short_repr(seed)}")
+        if len(seed) != count:
+            raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
+        seeds = [None if entry is None else operator.index(entry) for entry in seed]
+    bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
+    if bad:
+        got = short_repr(seeds[bad[0]])
+        raise ValueError(f"seed: {format_rows(bad)} would get a negative seed, {got}")
+    return seeds
+
+
+def _parse_reset_mask(mask: Any, count: int) -> Mask:
+    """Parse options["reset_mask"], an array or a tensor (N,) of bool; all rows without it."""
+    if mask is None:
+        return np.ones(count, np.bool_)
+    mask = mask.cpu().numpy() if hasattr(mask, "cpu") else mask
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        what = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise TypeError(f"options['reset_mask'] is an array of bool, got {what}")
+    if mask.shape != (count,):
+        raise ValueError(f"options['reset_mask'] has shape ({count},), got {mask.shape}")
+    if not mask.any():
+        raise ValueError("options['reset_mask'] resets no row")
+    return mask
+
+
+def _split_options(options: Mapping[str, object], count: int) -> list[dict[str, Any]]:
+    """Split options of reset by rows: a list, tuple or array has one, or None, for each row."""
+    columns = {}
+    for name, value in options.items():
+        if isinstance(value, np.ndarray) and value.ndim > 0:
+            value = value.tolist()
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
+        columns[name] = value
+    rows = range(count)
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]

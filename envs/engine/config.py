@@ -18,8 +18,14 @@ from ..scenarios.road import ROADS, make_path
 from ..scenarios.scenario import MIN_GPS_PERIOD, Scenario
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
 from ..scenarios.world import IDEAL, World
-from ..sensors.camera import FieldOfView
-from ..sensors.camera.analytic import DELAYS, MAX_DELAY, VISIONS, count_delay_ticks, load_detector
+from ..sensors.camera.analytic import (
+    DELAYS,
+    MAX_DELAY,
+    VISIONS,
+    FieldOfView,
+    count_delay_ticks,
+    load_detector,
+)
 from ..sensors.errors import IDEAL_SENSORS
 from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link, SlowSensor, make_link
@@ -148,13 +154,6 @@ def _compute_gains(exponent: float) -> tuple[float, float]:
     """Compute (decay, noise gain) of an Ornstein-Uhlenbeck process over a step."""
     decay = math.exp(exponent)
     return decay, math.sqrt(1.0 - decay * decay)
-
-
-def _list_numbers(part: tuple[Any, ...] | float) -> list[float]:
-    """List the numbers of nested tuples, in order."""
-    if not isinstance(part, tuple):
-        return [part]
-    return [number for item in part for number in _list_numbers(item)]
 
 
 def _apply_scenario_clocks(
@@ -377,7 +376,7 @@ class EnvConfig:
         low, high = scenario.get_draw_ranges(world)
         angles = scenario.trace  # as `steering.interpolate_trace` reads them
         trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
-        packed = np.array(_list_numbers(params) + trace, np.float64)
+        packed = np.concatenate([*map(np.ravel, params), trace])
         motion = np.full(len(Motion._fields), np.nan) if motion is None else motion
         start = EpisodeStart(packed, low, high, np.array(switches, np.int64), motion)
         assert len(start.params) == PARAMS_WIDTH or scenario.trace

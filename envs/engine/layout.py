@@ -12,7 +12,7 @@ from ..record import PACKET_WIDTH
 from ..scenarios.driver import DriverParams, SpeedProfile, Wind
 from ..scenarios.road import NominalMotion, TrackPath
 from ..scenarios.steering import STEERING_WIDTH
-from ..sensors.camera import FieldOfView
+from ..sensors.camera.analytic import FieldOfView
 from ..sensors.errors import ErrorState, SensorErrors
 from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link

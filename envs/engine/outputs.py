@@ -11,9 +11,9 @@ from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, sele
 from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
-from ..task import AGE_CAP, N_SAMPLED, REPORT, ReferenceParams, compute_reference
+from ..task import AGE_CAP, N_SAMPLED, REPORT, compute_reference
 from ..ticks import NEVER, TICK
-from ..vehicle.dynamics import Motion
+from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import FLAGS, EpisodeArrays, P, Z
 from .window import WINDOW
 
@@ -228,15 +228,6 @@ def _observe_slow(row: EpisodeArrays, k: int, count: int) -> None:
 
 
 @jit
-def _write_report(report: Vector, z: Vector) -> None:
-    """Write time, yaw rate, heading and failure of the state into the report."""
-    report[REPORT.t] = z[Z.clock.tick] * TICK
-    report[REPORT.gamma] = z[Z.motion.gamma]
-    report[REPORT.psi] = z[Z.motion.psi]
-    report[REPORT.failure] = z[Z.clock.failure]
-
-
-@jit
 def finish_step(row: EpisodeArrays, n: int, done: int) -> None:
     """Do slow sensors, observation and report of one vehicle's step.
 
@@ -323,44 +314,31 @@ def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int) -> None:
 @jit
 def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
     """Write the report, and the observation of the slow sensors from entry k on."""
-    report = row.report
+    report, z = row.report, row.z
     _observe_slow(row, k, count)
-    _write_report(report, row.z)
+    report[REPORT.t] = z[Z.clock.tick] * TICK
+    report[REPORT.gamma], report[REPORT.psi] = z[Z.motion.gamma], z[Z.motion.psi]
+    report[REPORT.failure] = z[Z.clock.failure]
     report[REPORT.reward] = -report[REPORT.cost]
     report[REPORT.packets] = count
 
 
 @jit
-def finish_reset(
-    row: EpisodeArrays, motion: Motion, beta: Scalar, steer: Scalar, target: ReferenceParams
-) -> None:
+def finish_reset(row: EpisodeArrays) -> None:
     """Do slow sensors, references, observation and report of tick 0.
 
     Args:
-        row: Arrays of the episode, whose first fast row is written.
-        motion: Motion of the car.
-        beta: Sideslip angle (rad).
-        steer: Steering angle (rad).
-        target: Coefficients of the references.
+        row: Arrays of the episode, whose state and first fast row are written.
     """
     z, rows, switches, report = row.z, row.rows, row.switches, row.report
+    motion, target = read(z, Z.motion), read(row.p, P.target)
     count = _sample_slow_sensors(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    command = rows[0, FAST.steer_command]
-    refs = compute_reference(command, v, target, switches[FLAGS.reference])
+    refs = compute_reference(rows[0, FAST.steer_command], v, target, switches[FLAGS.reference])
     write(z, refs, Z.refs)
-    n_rows = 1
-    if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
-        for j in range(1, len(rows)):
-            copy_into(rows[0], rows[j])
-        n_rows = len(rows)
-    observe(row, n_rows, count, refs)
-    _write_report(report, z)
-    report[REPORT.beta] = beta
+    beta = compute_sideslip_angle(motion.v_x, motion.v_y, switches[FLAGS.small_angle])
+    report[REPORT.beta], report[REPORT.steer] = beta, z[Z.drive.delta_f]
     report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
-    report[REPORT.steer] = steer
-    report[REPORT.yaw_moment] = 0.0
-    report[REPORT.cost] = 0.0
+    report[REPORT.yaw_moment] = report[REPORT.cost] = report[REPORT.ended] = 0.0
+    _finish_report(row, _observe_step(row, len(rows), 1), count)  # tick 0 stands for all samples
     report[REPORT.reward] = 0.0
-    report[REPORT.packets] = count
-    report[REPORT.ended] = 0.0

@@ -1,9 +1,9 @@
 """Reset of an episode: its draws from a key, and tick 0; compiled."""
 
-from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos
+from ..numerics.functions import CHANNELS, PI, draw_normals, draw_uniforms, exp, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import Scalar, Vector, from_word, maximum, select
+from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, select
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
 from ..scenarios.driver import compute_target_angle
@@ -11,15 +11,9 @@ from ..scenarios.road import add_weave, transform_path
 from ..scenarios.steering import DRIVER, WANDER, write_gentle_steering, write_steering
 from ..sensors.errors import ErrorState, SensorErrors, apply_sensor_errors
 from ..sensors.inertial import NormalDraws, compute_fast_row
-from ..sensors.link import draw_clock_phase
 from ..sensors.slow import GPS, draw_first_drift
 from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
-from ..vehicle.dynamics import (
-    Motion,
-    compute_car_curvature,
-    compute_gravity,
-    compute_sideslip_angle,
-)
+from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity
 from ..vehicle.parameters import GRAVITY
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import NEVER_DUE, finish_reset
@@ -28,7 +22,6 @@ from .tick import StepParams
 from .window import compute_profile_angle
 
 _GUST_ARM = 0.2  # m ahead of the centre of gravity, as of tie-vision's wind
-_LEAD_ACCELERATION = 0.5  # m/s2
 
 
 @jit
@@ -94,15 +87,6 @@ def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + GRAVITY * sincos(d.accel_roll)[0]
     p[P.slow[GPS].stamp] = round_to_ticks(d.gps_stamp)
     z[Z.errors.curvature] = compute_car_curvature(read(z, Z.motion), read(p, P.road))
-
-
-@jit
-def _write_gentle_steering(p: Vector, speed: Scalar) -> None:
-    """Write the gentle steering before the manoeuvre, of about `_LEAD_ACCELERATION` a sine."""
-    target, v = read(p, P.target), maximum(speed, 1.0)
-    gain = maximum(1.0 + target.G * v * v, 0.2) / (target.per_l * v * v)  # dakf-stability (23)
-    profile = p[P.steering_profile[0] :]
-    write_gentle_steering(p[P.task.lead_in], _LEAD_ACCELERATION * gain, profile)
 
 
 @jit
@@ -173,23 +157,23 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     write(p, draw_car(d, read(p, P.car)), P.car)
     change_tick = select(d.tyre_change_time > 0.0, round_to_ticks(d.tyre_change_time), FOREVER)
     write(p, (change_tick, d.front_change, d.rear_change, d.friction_change), P.tyre_change)
-    write_steering(switches[FLAGS.steering], d, p[P.steering_profile[0] :])
+    profile, target = p[P.steering_profile[0] :], read(p, P.target)
+    write_steering(switches[FLAGS.steering], d, profile)
     if lead_in > 0.0:
-        _write_gentle_steering(p, d.speed)
+        write_gentle_steering(p[P.task.lead_in], d.speed, target, profile)
     if d.side < 0.5:
         for i in range(PARAMS_WIDTH + 1, len(p)):  # a trace
             p[i] = 0.0 - p[i]
     p[P.speed_profile.speed] = d.speed
     for i in range(STATE_WIDTH):
         z[i] = 0.0
-    small_angle = switches[FLAGS.small_angle]
-    _write_motion(z, d, start.motion, small_angle)
+    _write_motion(z, d, start.motion, switches[FLAGS.small_angle])
     _write_sensors(p, d, start.low, start.high)
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
     _write_errors(p, z, d)
     n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
-    road, target = read(p, P.road), read(p, P.target)
+    road = read(p, P.road)
     steer = compute_profile_angle(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
         driver, path = read(p, P.driver), read(p, P.path)
@@ -204,11 +188,12 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     z[Z.clock.redraws], z[Z.clock.next_due] = redraws, NEVER_DUE
     for sensor in range(len(Z.slow)):
         link, column = read(p, P.slow[sensor]), Z.slow[sensor]
-        phase = draw_clock_phase(link, key_low, key_high, sensor)
+        share = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)[0]
+        phase = select(link.phase < 0.0, floor(share * link.period), link.phase)
+        phase = phase + select(phase + link.stamp < 0.0, link.period, 0.0)  # no stamp before tick 0
         z[column.next_capture] = select(link.period > 0.0, phase, NEVER)
         z[column.captured] = NEVER
         z[column.drift] = draw_first_drift(sensor, read(p, P.sky), key_low, key_high)
-    beta = compute_sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = draw_normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = draw_normals(key_low, key_high, 0, CHANNELS.wheels)
     vibration = draw_normals(key_low, key_high, 0, CHANNELS.errors)[0]
@@ -216,4 +201,4 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     draws, variant = NormalDraws(fast, wheels, vibration), make_step_variant(p, switches)
     row_0 = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
     write(row.rows[0], row_0, FAST)
-    finish_reset(row, motion, beta, steer, target)
+    finish_reset(row)

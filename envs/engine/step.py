@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from ..numerics.functions import clip
 from ..numerics.jit import inline, jit, noinline
-from ..numerics.packed import load_element, read, store_element, write
-from ..numerics.primitives import Scalar, Vector, any_lane, select
+from ..numerics.packed import lane_width, load_element, load_lanes, read, store_element, write
+from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task import (
@@ -25,6 +25,7 @@ from ..task import (
     compute_failure_cost,
     select_failure,
 )
+from ..ticks import TICK
 from ..vehicle.tyres import has_load_shift
 from .layout import FLAGS, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import finish_step
@@ -37,7 +38,7 @@ from .tick import (
     compute_static_load,
     integrate_tick,
 )
-from .window import TICK_COST, WINDOW, evaluate_cost, precompute_window, read_draws
+from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
 from .workspace import split_workspace
 
 SHARES = (0, 1)
@@ -116,11 +117,22 @@ def _read_effort(z: Vector, window: Vector, j: int) -> Scalar:
 
 
 @jit
-def _store_efforts(z: Vector, window: Vector, done: int) -> None:
-    """Store the yaw moment's share of the last `RATE_TICKS` ticks, `done` of them of this step."""
-    for i in range(RATE_TICKS):
-        effort = _read_effort(z, window, done + i)
-        store_element(z, effort, Z.past_efforts[0] + i)
+def _evaluate_cost(
+    window: Matrix, n: int, cost: Scalar, params: StepParams, variant: StepVariant
+) -> tuple[Scalar, int, bool]:
+    """Evaluate n ticks up to a failure: (cost, from 0 on; ticks; whether the last one fails)."""
+    for j in range(0, n, lane_width(window)):
+        motion = load_lanes(window, WINDOW.track, j)
+        cost_inputs = load_lanes(window, WINDOW.cost_inputs, j)
+        tick_cost = compute_tick_cost(motion, cost_inputs, params.task, params.path, variant)
+        spun, off = select(tick_cost.spun, 1.0, 0.0), select(tick_cost.off, 1.0, 0.0)
+        write(window, (tick_cost.cost, tick_cost.beta, spun, off), TICK_COST, j)
+    for j in range(n):
+        tick_cost = read(window, TICK_COST, j)
+        cost = cost + tick_cost.cost * TICK
+        if any_lane(tick_cost.spun + tick_cost.off != 0.0):
+            return cost, j + 1, True
+    return cost, n, False
 
 
 @jit
@@ -167,7 +179,7 @@ def integrate_step(
             write(window, measured.cost_inputs, WINDOW.cost_inputs, j)
             is_lost = any_lane(measured.lost)
             if is_lost or any_lane(tick >= task.duration) or j + 1 == n_run:
-                cost, done, failed = evaluate_cost(window, j + 1, 0.0 * N_z, params, variant)
+                cost, done, failed = _evaluate_cost(window, j + 1, 0.0 * N_z, params, variant)
                 if not is_single and (is_lost or failed or done < n):
                     return 0
                 n_run = done
@@ -182,7 +194,9 @@ def integrate_step(
                 cost = select(acts, cost, 0.0)
                 end = StepEnd(failure, beta, refs, tick, cost)
                 if variant.has_errors:
-                    _store_efforts(z, window, j + 1)
+                    for i in range(RATE_TICKS):  # of the last ticks, j + 1 of them of this step
+                        effort = _read_effort(z, window, j + 1 + i)
+                        store_element(z, effort, Z.past_efforts[0] + i)
                 write_final_state(row, state, measured, end, task.duration)
                 return j + 1
 

@@ -25,7 +25,6 @@ from ..sensors.errors import (
     SensorErrors,
     advance_errors,
     apply_sensor_errors,
-    compute_shifted_force,
 )
 from ..sensors.inertial import Noise, NormalDraws, compute_fast_row, compute_specific_force
 from ..task import ReferenceParams, compute_reference, filter_reference
@@ -294,12 +293,9 @@ def compute_inputs(
     )
     curvature, errors = compute_car_curvature(state.motion, params.road), state.errors
     if variant.has_errors:
-        limited_l, limited_r = (
-            limit_rate(drive.command_l, T_l, task.torque_slew),
-            limit_rate(drive.command_r, T_r, task.torque_slew),
-        )
-        T_l = select(task.torque_slew > 0.0, limited_l, T_l)
-        T_r = select(task.torque_slew > 0.0, limited_r, T_r)
+        is_limited = task.torque_slew > 0.0
+        T_l = select(is_limited, limit_rate(drive.command_l, T_l, task.torque_slew), T_l)
+        T_r = select(is_limited, limit_rate(drive.command_r, T_r, task.torque_slew), T_r)
         errors = advance_errors(errors, params.errors, curvature, state.motion.s, draws.vibration)
     F_w, N_w, N_x = compute_wind(tick, params.wind)
     left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
@@ -423,8 +419,12 @@ def integrate_tick(
     accel = compute_specific_force(before, motion, road, variant.small_angle, variant.roll)
     if variant.has_errors:
         wave = RoadParams(*(params.road[:3] + none + none + params.road[5:]))
-        gravity = compute_gravity(before, wave, variant.small_angle, 0.5 * TICK)
-        accel = compute_shifted_force(accel, before, motion, gravity, params.errors)
+        g_x, g_y = compute_gravity(before, wave, variant.small_angle, 0.5 * TICK)
+        # the accelerometer is ahead of the centre of gravity
+        ahead, turning = params.errors.accel_ahead, 0.5 * (before.gamma + motion.gamma)
+        gamma_dot = (motion.gamma - before.gamma) * (1.0 / TICK)
+        a_x, a_y = accel[0] + g_x, accel[1] + g_y
+        accel = (a_x - ahead * turning * turning, a_y + ahead * gamma_dot)
     driver, measured = measure_tick(
         params, motion, accel, plant.applied, state.refs, inputs, variant
     )

@@ -3,7 +3,7 @@
 Its columns are the ticks of the step. A block of vehicles has a third axis, their lanes.
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -12,21 +12,16 @@ from ..numerics.jit import inline, jit
 from ..numerics.packed import (
     count_lanes,
     iota,
-    lane_width,
     load_element,
-    load_lanes,
     make_offsets,
     read,
     store_element,
     write,
 )
 from ..numerics.primitives import (
-    Matrix,
     Scalar,
     Vector,
     absolute,
-    any_lane,
-    select,
     to_float,
     to_int,
     to_word,
@@ -153,20 +148,9 @@ def precompute_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
         n: Number of ticks.
         variant: Variant of the ticks.
     """
-    clock, window = read(row.z, Z.clock), row.window
-    key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
-    profile = row.p[P.steering_profile[0] :]
+    first = int(row.z[Z.clock.tick]) + 1
     for j in range(0, n, count_lanes()):
-        ticks = iota(first + j)
-        inertial = draw_normals(key_low, key_high, ticks, CHANNELS.inertial)
-        wheels = draw_normals(key_low, key_high, ticks, CHANNELS.wheels)
-        write(window, inertial, WINDOW.inertial, j)
-        write(window, wheels, WINDOW.wheels, j)
-        if variant.has_errors:
-            vibration = draw_normals(key_low, key_high, ticks, CHANNELS.errors)[0]
-            store_element(window, vibration, WINDOW.vibration, j)
-        if not variant.has_driver:
-            store_element(window, compute_steering(to_float(ticks), profile), WINDOW.steer, j)
+        _write_ticks(row, j, iota(first + j), variant)
     overwrite_steering(row, n)
 
 
@@ -179,20 +163,26 @@ def precompute_lane_window(row: EpisodeArrays, n: int, variant: StepVariant) -> 
         n: Number of ticks.
         variant: Variant of the ticks.
     """
+    tick = load_element(row.z, Z.clock.tick)
+    for j in range(n):
+        _write_ticks(row, j, to_int(tick + (j + 1)), variant)
+
+
+@jit
+def _write_ticks(row: EpisodeArrays, j: int, ticks: Scalar, variant: StepVariant) -> None:
+    """Write noise and steering of a tick, or of as many as lanes, into the window from j on."""
     clock, window = read(row.z, Z.clock), row.window
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
-    profile = row.p[P.steering_profile[0] :]
-    for j in range(n):
-        tick = clock.tick + (j + 1)
-        inertial = draw_normals(key_low, key_high, to_int(tick), CHANNELS.inertial)
-        wheels = draw_normals(key_low, key_high, to_int(tick), CHANNELS.wheels)
-        write(window, inertial, WINDOW.inertial, j)
-        write(window, wheels, WINDOW.wheels, j)
-        if variant.has_errors:
-            vibration = draw_normals(key_low, key_high, to_int(tick), CHANNELS.errors)[0]
-            store_element(window, vibration, WINDOW.vibration, j)
-        if not variant.has_driver:
-            store_element(window, compute_steering(tick, profile), WINDOW.steer, j)
+    inertial = draw_normals(key_low, key_high, ticks, CHANNELS.inertial)
+    wheels = draw_normals(key_low, key_high, ticks, CHANNELS.wheels)
+    write(window, inertial, WINDOW.inertial, j)
+    write(window, wheels, WINDOW.wheels, j)
+    if variant.has_errors:
+        vibration = draw_normals(key_low, key_high, ticks, CHANNELS.errors)[0]
+        store_element(window, vibration, WINDOW.vibration, j)
+    if not variant.has_driver:
+        steer = compute_steering(to_float(ticks), row.p[P.steering_profile[0] :])
+        store_element(window, steer, WINDOW.steer, j)
 
 
 @jit
@@ -244,33 +234,3 @@ def compute_tick_cost(
         (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
         absolute(lateral_deviation) > task.half_width,
     )
-
-
-@jit
-def evaluate_cost(
-    window: Matrix, n: int, cost: Scalar, params: Any, variant: StepVariant
-) -> tuple[Scalar, int, bool]:
-    """Evaluate a step's ticks up to a failure.
-
-    Args:
-        window: The window, where cost and failures overwrite the cost inputs.
-        n: Number of ticks.
-        cost: 0, of one car or a block.
-        params: Parameters of the step.
-        variant: Variant of the ticks.
-
-    Returns:
-        Cost, number of ticks, and whether the last one fails.
-    """
-    for j in range(0, n, lane_width(window)):
-        motion = load_lanes(window, WINDOW.track, j)
-        cost_inputs = load_lanes(window, WINDOW.cost_inputs, j)
-        tick_cost = compute_tick_cost(motion, cost_inputs, params.task, params.path, variant)
-        spun, off = select(tick_cost.spun, 1.0, 0.0), select(tick_cost.off, 1.0, 0.0)
-        write(window, (tick_cost.cost, tick_cost.beta, spun, off), TICK_COST, j)
-    for j in range(n):
-        tick_cost = read(window, TICK_COST, j)
-        cost = cost + tick_cost.cost * TICK
-        if any_lane(tick_cost.spun + tick_cost.off != 0.0):
-            return cost, j + 1, True
-    return cost, n, False

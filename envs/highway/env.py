@@ -10,7 +10,6 @@ import numpy.typing as npt
 from ..engine.layout import P, Z
 from ..engine.window import WINDOW
 from ..numerics.packed import read
-from ..rendering.trace import RenderState
 from ..scenarios.draws import Range
 from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
@@ -102,33 +101,18 @@ class HighwayEnv(StabilityEnv):
             )
         return scenario.replace(curve_start=-1000.0, curve_ramp=1.0)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: Seed of the env's generator; None continues it.
-            options: Options of reset of `StabilityEnv`; state has no s, theta, X and Y.
-
-        Returns:
-            The observation and the info at tick 0.
-
-        Raises:
-            ValueError: If the state has a place along the road.
-        """
-        reset_options = dict(options or {})
-        if "scenario" in reset_options:
-            scenario = make_scenario(reset_options["scenario"])
-            reset_options["scenario"] = self._adapt_scenario(scenario)
-        state = reset_options.get("state", {})
+    def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Adapt the scenario; ValueError for a state with a place along the road."""
+        if "scenario" in options:
+            options["scenario"] = self._adapt_scenario(make_scenario(options["scenario"]))
+        state = options.get("state", {})
         if isinstance(state, Mapping):
             if fixed_names := [name for name in _FIXED_STATE if name in state]:
                 reason = f"{fixed_names[0]} is where the road begins; y may be"
                 raise ValueError(f"reset option state: {reason}")
             if "y" in state:
-                reset_options["state"] = {**state, "Y": state["y"]}
-        return super().reset(seed=seed, options=reset_options)
+                options["state"] = {**state, "Y": state["y"]}
+        return options
 
     def _start_episode(self) -> None:
         """Make the road, its vehicles, and the driver's path around the one that brakes."""
@@ -163,17 +147,6 @@ class HighwayEnv(StabilityEnv):
             report[REPORT.reward] = -report[REPORT.cost]
         return done
 
-    def make_render_state(self, row: int = 0) -> RenderState:
-        """Make the state that a picture shows, its road by highway-env's graphics.
-
-        Args:
-            row: 0, the only car.
-
-        Returns:
-            The state.
-        """
-        return super().make_render_state(row)._replace(world=self._draw_world)
-
     def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> "WorldSurface":
         """Draw the road around our car by highway-env, with others of ours as shadows on it."""
         import pygame
@@ -200,16 +173,8 @@ class HighwayEnv(StabilityEnv):
         """Copy the state, traffic included, from which `set_state` continues bit for bit."""
         return super().get_state() | {"road": self.road, "around": copy.deepcopy(self._traffic)}
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Return value of `get_state`.
-
-        Raises:
-            ValueError: If it is of another road.
-        """
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
         if snapshot.get("road") != self.road:
             raise ValueError(f"the snapshot is of road {snapshot.get('road')!r}, not {self.road!r}")
-        super().set_state(snapshot)
+        super()._restore(snapshot)
         self._traffic = copy.deepcopy(snapshot["around"])

@@ -20,7 +20,7 @@ from ..outside.env import PlantEnv
 from ..outside.plants import OutsideInputs
 from ..record import Array
 from ..scenarios.scenario import Scenario
-from ..sensors.camera import compute_preview_offset
+from ..sensors.camera.analytic import compute_preview_offset
 from ..task import ObservationEntry, make_space
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
@@ -151,25 +151,11 @@ class KeepingEnv(PlantEnv):
         fixed |= {"control_period": control_period, **options}
         super().__init__(sensors, KEEPING, make_keeping_vehicle(), **fixed)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode where highway-env has it start.
-
-        Args:
-            seed: Seed of the env's generator; None continues it.
-            options: None or empty.
-
-        Returns:
-            The observation and the info at tick 0.
-
-        Raises:
-            ValueError: For any option.
-        """
+    def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
         if options:
             raise ValueError(f"lane-keeping-v0 starts as it is, got {', '.join(options)}")
         self.plant.start(0)  # it always starts there
-        return super().reset(seed=seed, options={"state": self.plant.motion._asdict()})
+        return {"state": self.plant.motion._asdict()}
 
     def _start_episode(self) -> None:
         self.plant.start(int(self._row.z[Z.clock.key_low]))
@@ -194,12 +180,7 @@ class KeepingEnv(PlantEnv):
         """Refuse: TypeError, since highway-env makes no snapshots."""
         raise TypeError("highway-env's lane-keeping-v0 makes no snapshots")
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Refuse any snapshot: TypeError, since highway-env makes none.
-
-        Args:
-            snapshot: Ignored.
-        """
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
         self.get_state()
 
 

@@ -181,22 +181,14 @@ class Hazard:
 
     Each field is a number, or a range (low, high) that the seed draws from, of numbers from 0 on.
     Other values raise ValueError.
-
-    Attributes:
-        headway: Time between the bumpers at equal speed (s).
-        onset: Time at which the vehicle brakes (s).
-        braking: Fraction of the road's grip that it brakes with.
-        reaction: Time after which our driver swerves (s).
-        haste: Time of the lane change over the time until the cars would meet: large is slow.
-        stay: Time in the free lane, behind the standing vehicle, before the driver returns (s).
     """
 
-    headway: Range = (0.5, 0.8)
-    onset: Range = (0.3, 0.8)
-    braking: Range = (0.8, 1.0)
-    reaction: Range = (0.7, 1.0)
-    haste: Range = (1.0, 1.9)
-    stay: Range = (0.0, 0.5)
+    headway: Range = (0.5, 0.8)  # s, between the bumpers at equal speed
+    onset: Range = (0.3, 0.8)  # s, when the vehicle brakes
+    braking: Range = (0.8, 1.0)  # fraction of the road's grip that it brakes with
+    reaction: Range = (0.7, 1.0)  # s, after which our driver swerves
+    haste: Range = (1.0, 1.9)  # time of the lane change over that until the cars would meet
+    stay: Range = (0.0, 0.5)  # s in the free lane, behind the standing vehicle, before returning
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

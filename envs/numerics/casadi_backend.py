@@ -1,6 +1,5 @@
 """The equations on CasADi's symbols: `as_python` with CasADi's primitives."""
 
-import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -21,18 +20,13 @@ SYMBOLS: dict[str, Callable[..., Any]] = {
     "select": ca.if_else,
     "to_float": lambda a: a * 1.0,
     "any_lane": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
-}
-"""The primitives for CasADi's SX and MX, by the names that the equations use."""
-
-_ELEMENTARY: dict[str, Callable[..., Any]] = {
+    # its own functions agree with our polynomials to 1e-15 and have shorter derivatives
     "sincos": lambda x: (ca.sin(x), ca.cos(x)),
     "atan": ca.atan,
     "atan2": ca.atan2,
     "compute_sine": ca.sin,
 }
-"""CasADi's own functions, which agree to 1e-15 and have shorter derivatives than polynomials."""
-
-_PACKAGE = __name__.rpartition(".envs")[0]
+"""The primitives for CasADi's SX and MX, by the names that the equations use."""
 
 
 def to_casadi(function: F) -> F:
@@ -44,22 +38,4 @@ def to_casadi(function: F) -> F:
     Returns:
         The rebuilt function.
     """
-    rebuilt = as_python(function, SYMBOLS)
-    _replace(rebuilt, set())
-    return rebuilt
-
-
-def _replace(function: Any, done: set[int]) -> None:
-    """Put `_ELEMENTARY` into a rebuilt function and its callees, which are copies of its own."""
-    done.add(id(function))
-    names = function.__globals__
-    for name in function.__code__.co_names:
-        callee = names.get(name)
-        if name in _ELEMENTARY:
-            names[name] = _ELEMENTARY[name]
-        elif (
-            isinstance(callee, types.FunctionType)
-            and callee.__module__.startswith(_PACKAGE)
-            and id(callee) not in done
-        ):
-            _replace(callee, done)
+    return as_python(function, SYMBOLS)

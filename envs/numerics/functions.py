@@ -267,20 +267,8 @@ CHANNELS = Channels()
 
 
 @jit
-def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> _Four:
-    """Compute four random 32-bit words for a key and a counter (a, b, c, d).
-
-    Args:
-        key_low: Lower 32 bits of the key.
-        key_high: Upper 32 bits.
-        a: First word of the counter.
-        b: Second word.
-        c: Third word.
-        d: Fourth word.
-
-    Returns:
-        The words, non-negative integers.
-    """
+def _philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> _Four:
+    """Compute four random 32-bit words for a key and a counter (a, b, c, d)."""
     k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
     a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
     for _ in range(10):
@@ -343,7 +331,7 @@ def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> _Four:
     Returns:
         The four numbers.
     """
-    a, b, c, d = philox(key_low, key_high, tick, block)
+    a, b, c, d = _philox(key_low, key_high, tick, block)
     n0, n1 = _draw_normal_pair(a, b)
     n2, n3 = _draw_normal_pair(c, d)
     return n0, n1, n2, n3
@@ -363,5 +351,5 @@ def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int
     Returns:
         The four numbers.
     """
-    a, b, c, d = philox(key_low, key_high, tick, block, index)
+    a, b, c, d = _philox(key_low, key_high, tick, block, index)
     return _to_uniform(a), _to_uniform(b), _to_uniform(c), _to_uniform(d)

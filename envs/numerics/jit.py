@@ -14,8 +14,7 @@ import numba
 from numba.extending import is_jitted
 
 from .kernel_cache import LAYERS, find_kernel_folder, report_once
-from .packed import read
-from .primitives import Vector, minimum
+from .primitives import Vector
 
 _STOCK = "SIDESLIP_STOCK_NUMBA"  # environment variable with which plain numba compiles
 _PREFIX = __name__.removesuffix("envs.numerics.jit")
@@ -110,7 +109,7 @@ def copy_into(source: Vector, target: Vector) -> None:
 
 
 _PACKAGE = __name__.rpartition(".envs")[0]
-_PRIMITIVE_MODULES = {read.__module__, minimum.__module__}  # what a table may replace
+_NUMERICS = __name__.rpartition(".")[0]  # whose functions a table may replace
 
 
 def as_python(
@@ -140,7 +139,7 @@ def _rebuild(
 ) -> Any:
     """Rebuild a function and its callees, of which some are rebuilt already."""
     source = function.py_func if is_jitted(function) else function
-    if source.__name__ in table and source.__module__ in _PRIMITIVE_MODULES:
+    if source.__name__ in table and source.__module__.startswith(_NUMERICS):
         return table[source.__name__]
     if source in rebuilt_functions:
         return rebuilt_functions[source]

@@ -1,12 +1,12 @@
 """Environments around a plant that is not ours: our sensors, scenarios, references and cost.
 
-`PlantEnv` takes any plant of `PlantProtocol`, `OutsideEnv` one of CommonRoad's models, after checks
+`PlantEnv` takes any `_Plant`, `OutsideEnv` one of CommonRoad's models, after checks
 that the model can follow scenario and reset options.
 """
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,8 @@ from ..stability import StabilityEnv
 from ..task import RUNNING, select_failure
 from ..ticks import TICK
 from ..validation import check_choice, check_mapping, is_finite, short_repr, warn_once
-from .plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, PlantProtocol, make_outside_vehicle
+from ..vehicle.dynamics import Motion
+from .plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
 
 _MIN_SPEED = 1.0  # m/s, of the multi-body model; below 0.1 it freezes while its wheels spin
 
@@ -101,11 +102,23 @@ _compute_tick_cost = as_python(compute_tick_cost)
 _select_failure = as_python(select_failure)
 
 
+class _Plant(Protocol):
+    """A car that moves in place of our own plant."""
+
+    specific_force: tuple[float, float]  # (a_x, a_y) at the newest step's end, m/s2
+
+    @property
+    def motion(self) -> Motion: ...
+    @property
+    def is_finite(self) -> bool: ...
+    def step(self, inputs: OutsideInputs, h: float) -> None: ...
+
+
 class PlantEnv(StabilityEnv):
     """`StabilityEnv` moved by `plant`, which subclasses set, and start at reset; a Python loop."""
 
     _has_tyre_forces = False
-    plant: PlantProtocol
+    plant: _Plant
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive one control period of the plant: `step_vehicle` with another motion."""
@@ -212,48 +225,30 @@ class OutsideEnv(PlantEnv):
             raise ValueError("world and lead_in are of our own plant; an outside one has neither")
         self.plant = OUTSIDE_PLANTS[model]()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; ValueError for an option that the model cannot follow.
+    def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
+        _check_options(options, self.model)
+        _check_scenario(self.config.apply_options(options).scenario, self.model)
+        if "state" in options:  # s and y are X and Y on the straight road of these plants
+            state = options["state"]
+            options["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
+        return options
 
-        Args:
-            seed: Seed of the env's generator; None continues it.
-            options: Those of `StabilityEnv`, but no vehicle, and no s, y and theta in state.
-
-        Returns:
-            The observation and the info at tick 0.
-        """
-        reset_options = dict(options or {})
-        _check_options(reset_options, self.model)
-        _check_scenario(self.config.apply_options(reset_options).scenario, self.model)
-        if "state" in reset_options:  # s and y are X and Y on the straight road of these plants
-            state = reset_options["state"]
-            reset_options["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
-        result = super().reset(seed=seed, options=reset_options)
+    def _start_episode(self) -> None:
         p, base = self._row.p, self._episode.vehicle
         scale = 0.5 * (p[P.car.C_f] / base.front_stiffness + p[P.car.C_r] / base.rear_stiffness)
         p[P.car.C_f], p[P.car.C_r] = scale * base.front_stiffness, scale * base.rear_stiffness
         self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car.mu]), float(scale))
         self.plant.start(self.motion)
-        return result
+        super()._start_episode()
 
     def get_state(self) -> dict[str, Any]:
         """Copy the state, plant included, from which `set_state` continues bit for bit."""
         plant = (self.plant.p, self.plant.specific_force, self.plant.x.copy())
         return super().get_state() | {"outside": plant, "model": self.model}
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Return value of `get_state`.
-
-        Raises:
-            ValueError: If it is of another model.
-        """
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
         if snapshot.get("model") != self.model:
             raise ValueError(f"the snapshot is of {snapshot.get('model')!r}, not {self.model!r}")
-        super().set_state(snapshot)
+        super()._restore(snapshot)
         self.plant.p, self.plant.specific_force, x = snapshot["outside"]
         self.plant.x = x.copy()

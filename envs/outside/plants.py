@@ -17,7 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -92,28 +92,6 @@ def make_outside_vehicle() -> Vehicle:
         roll_stiffness=1.0 / (1.0 / body + 1.0 / tyres),
         roll_damping=0.5 * (p.T_f**2 * p.K_sdf + p.T_r**2 * p.K_sdr),
     )
-
-
-class PlantProtocol(Protocol):
-    """A car that moves in place of our own plant."""
-
-    specific_force: tuple[float, float]  # (a_x, a_y) at the newest step's end, m/s2
-
-    @property
-    def motion(self) -> Motion:
-        """Velocities, place and road of the car."""
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether the state is made of numbers."""
-
-    def step(self, inputs: OutsideInputs, h: float) -> None:
-        """Step the car.
-
-        Args:
-            inputs: Inputs, constant during the step.
-            h: Length of the step (s).
-        """
 
 
 class OutsidePlant(ABC):

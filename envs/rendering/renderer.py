@@ -12,7 +12,7 @@ from ..engine.views import Episode
 from ..record import Array
 from ..ticks import TICK
 from ..validation import check_choice
-from .trace import EpisodeTrace, RenderState
+from .trace import EpisodeTrace, RenderState, RoadPainter
 
 Frame = npt.NDArray[np.uint8]
 _MODES = ("human", "rgb_array")
@@ -31,6 +31,7 @@ class RenderMixin:
 
     _has_tyre_forces = True  # tyre forces can be drawn
     _has_shown = False  # a picture, in a window
+    _draw_world: RoadPainter | None = None  # draws the road instead of ours
     control_period: int
     render_mode: str | None
     metadata: dict[str, Any] = {"render_modes": list(_MODES), "render_fps": 100}  # noqa: RUF012
@@ -49,14 +50,11 @@ class RenderMixin:
         raise NotImplementedError
 
     def _record_step(self) -> None:
-        """Record what a reset or a step led to, and show it in the window if there is one.
-
-        Called where `_traces` has some. The window is an estimate behind: wrappers estimate later.
-        """
+        """Record a reset or a step where `_traces` has some, and show it in the window."""
         for row, trace in enumerate(self._traces):
             episode = self._get_episode(row)
             trace.add(episode.report, episode.state)
-        if self.render_mode == "human":
+        if self.render_mode == "human":  # an estimate behind: wrappers estimate later
             self._show()
 
     def _show(self) -> None:
@@ -84,7 +82,7 @@ class RenderMixin:
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(getattr(self, "num_envs", 1))]
         episode, trace = self._get_episode(row), self._traces[row]
-        render_state = RenderState(*episode[:5], trace, self._has_tyre_forces)
+        render_state = RenderState(*episode[:5], trace, self._has_tyre_forces, self._draw_world)
         if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
         if trace.is_empty:
@@ -105,7 +103,8 @@ class RenderMixin:
             logger.warn("render() draws nothing: the env was made without a render_mode")
         return None
 
-    def _close_window(self) -> None:
+    def _close_window(self, **kwargs: object) -> None:
+        """Close the window, if there is one."""
         if self.render_mode == "human" and self._has_shown:
             from .canvas import pygame
 
@@ -115,9 +114,7 @@ class RenderMixin:
 class SingleRenderMixin(RenderMixin):
     """A single environment that draws its car."""
 
-    def _init_rendering(self, mode: str | None) -> None:
-        super()._init_rendering(mode)
-        self.annotations: dict[str, tuple[float, float]] = {}
+    annotations: dict[str, tuple[float, float]]  # estimates of the newest step
 
     def annotate(self, label: str, beta: float, std: float) -> None:
         """Annotate the newest step with a wrapper's estimate, to be drawn beside the truth.
@@ -136,9 +133,7 @@ class SingleRenderMixin(RenderMixin):
         frames = self._render_frames()
         return None if frames is None else frames[0]
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._close_window()
+    close = RenderMixin._close_window
 
 
 class VectorRenderMixin(RenderMixin):
@@ -156,14 +151,5 @@ class VectorRenderMixin(RenderMixin):
         for row in np.flatnonzero(rows[: len(self._traces)]):
             self._traces[row].add_estimate(label, beta[row], std[row])
 
-    def render(self) -> tuple[Frame, ...] | None:
-        """Return a frame of each car in the mode "rgb_array", else None."""
-        return self._render_frames()
-
-    def close_extras(self, **kwargs: object) -> None:
-        """Close the window, if there is one.
-
-        Args:
-            kwargs: Arguments of `close`, which change nothing.
-        """
-        self._close_window()
+    render = RenderMixin._render_frames
+    close_extras = RenderMixin._close_window

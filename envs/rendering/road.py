@@ -27,7 +27,7 @@ from ..scenarios.road import (
     make_sections,
     step_nominal_car,
 )
-from ..sensors.camera import compute_lane_quality
+from ..sensors.camera.analytic import compute_lane_quality
 from ..vehicle.actuators import compute_torque_limit
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
 from ..vehicle.parameters import Vehicle

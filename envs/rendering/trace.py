@@ -101,7 +101,7 @@ class EpisodeTrace:
         return np.array([self._rows[k] for k in chosen]), estimates
 
 
-_RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]
+RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]
 """Draws a road around a car, and others at their motions, on a surface of so many pixels."""
 
 
@@ -115,4 +115,4 @@ class RenderState(NamedTuple):
     config: EpisodeConfig
     trace: EpisodeTrace
     has_tyre_forces: bool = True  # its tyres are those of our plant
-    world: _RoadPainter | None = None  # draws the road instead
+    world: RoadPainter | None = None  # draws the road instead

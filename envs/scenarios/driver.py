@@ -33,18 +33,6 @@ class DriverParams(NamedTuple):
 
 
 @jit
-def _compute_lateral_error(
-    motion: Motion, path: TrackPath, road: RoadParams, preview: Scalar
-) -> Scalar:
-    """Compute how far the path lies to the left of the car's course at a preview distance (m)."""
-    sin_r, cos_r = sincos(motion.psi - motion.theta)
-    slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
-    # the double integral of the curvature, exact on a clothoid too
-    bend = 0.5 * preview * preview * compute_curvature(road, motion.s + preview * (1.0 / 3.0))
-    return compute_path_offset(path, motion.s + preview) + bend - motion.y - preview * slope
-
-
-@jit
 def compute_target_angle(
     motion: Motion,
     path: TrackPath,
@@ -68,7 +56,12 @@ def compute_target_angle(
     """
     v = motion.v_x
     preview = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
-    error = _compute_lateral_error(motion, path, road, preview)
+    sin_r, cos_r = sincos(motion.psi - motion.theta)
+    slope = (v * sin_r + motion.v_y * cos_r) / maximum(v, MIN_SPEED)
+    # the double integral of the curvature, exact on a clothoid too
+    bend = 0.5 * preview * preview * compute_curvature(road, motion.s + preview * (1.0 / 3.0))
+    # how far the path lies to the left of the car's course at the preview distance
+    error = compute_path_offset(path, motion.s + preview) + bend - motion.y - preview * slope
     curvature = driver.gain * 2.0 * error / (preview * preview)
     angle = curvature * maximum(1.0 + target.G * v * v, 0.2) / target.per_l  # dakf-stability (23)
     return minimum(maximum(angle, 0.0 - stop), stop)

@@ -47,9 +47,7 @@ def step_nominal_car(
         Turning rate of the road during the tick (rad/s), and the `NominalMotion` at its end.
     """
     V = maximum(speed, _MIN_SPEED)
-    a11, a12, a21, a22, b11, b21, _ = compute_bicycle_coefficients(
-        car.m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
-    )
+    a11, a12, a21, a22, b11, b21, _ = compute_bicycle_coefficients(car, V)
     dbeta = a11 * nominal_motion.beta + a12 * nominal_motion.gamma + b11 * steer
     dgamma = a21 * nominal_motion.beta + a22 * nominal_motion.gamma + b21 * steer
     next_motion = NominalMotion(

@@ -204,11 +204,8 @@ class Scenario:
     def _check_rules(self) -> None:
         """Check what several fields have to fit, or one beyond its type and sign."""
         path, road, steering, trace = self.path, self.road, self.steering, self.trace
-        is_nominal, period, min_speed = (
-            road == "nominal-path",
-            self.gps_period,
-            self.range("speed")[0],
-        )
+        is_nominal, period = road == "nominal-path", self.gps_period
+        min_speed = self.range("speed")[0]
         n_angles = f"2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none"
         has_angles = (len(trace) > 1) == (steering == "trace") and len(trace) <= _MAX_SAMPLES
         max_slope = max(map(abs, (*self.range("bank"), self.grade)))

@@ -1,11 +1,16 @@
 """Steering profiles: the driver's angle at a tick, from numbers drawn at reset; compiled."""
 
+from typing import TYPE_CHECKING
+
 from ..numerics.functions import PI, exp, sincos, smoothstep
 from ..numerics.jit import jit
 from ..numerics.packed import load_element
 from ..numerics.primitives import Scalar, Vector, any_lane, floor, maximum, minimum, select, sqrt
 from ..ticks import FOREVER, TICK, round_to_ticks
 from .draws import Draws
+
+if TYPE_CHECKING:
+    from ..task import ReferenceParams
 
 (
     STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE, SINE_WITH_DWELL, RAMP,
@@ -207,20 +212,25 @@ def write_steering(kind: int, d: Draws, profile: Vector) -> None:
         profile[k], profile[k + 1], profile[k + 2] = decay, noise_gain, round_to_ticks(d.hold)
 
 
+_LEAD_ACCELERATION = 0.5  # m/s2, about, of either sine
 _LEAD_FREQUENCIES = 0.2, 0.35  # Hz, about: whole waves, so that heading and angle come back to zero
 
 
 @jit
-def write_gentle_steering(length: Scalar, amplitude: Scalar, profile: Vector) -> None:
+def write_gentle_steering(
+    length: Scalar, speed: Scalar, target: "ReferenceParams", profile: Vector
+) -> None:
     """Write the gentle steering before a manoeuvre: two sines.
 
     Args:
         length: Its length (ticks), positive.
-        amplitude: Amplitude of each sine (rad).
+        speed: Speed of the car (m/s).
+        target: `ReferenceParams` of the nominal car.
         profile: Array of the profile, at least STEERING_WIDTH long.
     """
-    k, seconds = _LEAD_START, length * TICK
-    profile[k], profile[k + 3] = amplitude, length
+    k, seconds, v = _LEAD_START, length * TICK, maximum(speed, 1.0)
+    gain = maximum(1.0 + target.G * v * v, 0.2) / (target.per_l * v * v)  # dakf-stability (23)
+    profile[k], profile[k + 3] = _LEAD_ACCELERATION * gain, length
     for i in range(2):
         waves = maximum(floor(_LEAD_FREQUENCIES[i] * seconds + 0.5), 1.0)
         profile[k + 1 + i] = 2.0 * PI * waves / length

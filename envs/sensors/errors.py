@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from ..numerics.functions import compute_sine
-from ..numerics.jit import inline, jit
+from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector
 from ..ticks import TICK
 from ..vehicle.actuators import apply_lag
@@ -77,29 +77,6 @@ def advance_errors(
 
 
 @inline
-def compute_shifted_force(
-    accel: Vector, before: Motion, after: Motion, gravity: Vector, errors: SensorErrors
-) -> tuple[Scalar, Scalar]:
-    """Compute the specific force at an accelerometer ahead of the centre of gravity.
-
-    Args:
-        accel: (a_x, a_y) at the centre of gravity without the wave of bank (m/s2).
-        before: `Motion` at the start of the tick.
-        after: `Motion` at its end.
-        gravity: Measured gravity (x, y) of that wave (m/s2).
-        errors: `SensorErrors`.
-
-    Returns:
-        (a_x, a_y) (m/s2).
-    """
-    x = errors.accel_ahead
-    turning = 0.5 * (before.gamma + after.gamma)
-    gamma_dot = (after.gamma - before.gamma) * (1.0 / TICK)
-    a_x, a_y = accel[0] + gravity[0], accel[1] + gravity[1]
-    return a_x - x * turning * turning, a_y + x * gamma_dot
-
-
-@inline
 def apply_sensor_errors(
     row: Vector, motion: Motion, accel: Vector, state: ErrorState, errors: SensorErrors
 ) -> tuple[Scalar, ...]:
@@ -133,43 +110,3 @@ def apply_sensor_errors(
         row[10],
         state.curvature,
     )
-
-
-@jit
-def compute_seen_lane(
-    psi: Scalar, y: Scalar, kappa: Scalar, l_pre: Scalar, errors: SensorErrors
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Compute what a misaligned camera takes for heading, offset and curvature of a lane.
-
-    On flat ground it sees what is X ahead at X', 1 / X' = 1 / X - pitch / height, and times its
-    height's error; lateral distances grow with X' / X, and a lane beside it seems to turn.
-
-    Args:
-        psi: True heading relative to the lane (rad).
-        y: True offset of the centre of gravity (m).
-        kappa: True curvature of the lane (1/m).
-        l_pre: Preview distance (m), at which offset and curvature are those seen.
-        errors: `SensorErrors`.
-
-    Returns:
-        Heading (rad), offset (m) and curvature (1/m).
-    """
-    tilt = errors.camera_pitch * (1.0 / CAMERA_HEIGHT)
-    growth = 1.0 + errors.camera_height
-    return psi + errors.camera_yaw + tilt * y, growth * y, kappa / (growth + tilt * l_pre)
-
-
-@jit
-def compute_course_error(tick: Scalar, speed: Scalar, errors: SensorErrors) -> Scalar:
-    """Compute the receiver's slowly varying error of the course.
-
-    Args:
-        tick: Tick of the sample.
-        speed: Speed over ground (m/s), positive.
-        errors: `SensorErrors`.
-
-    Returns:
-        Error (rad).
-    """
-    wave = compute_sine(errors.course_rate * tick + errors.course_phase)
-    return errors.course_error / speed * wave

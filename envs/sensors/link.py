@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ..numerics.functions import CHANNELS, draw_uniforms
+from ..numerics.functions import draw_uniforms
 from ..numerics.jit import jit
 from ..numerics.primitives import Scalar, any_lane, floor, select, to_int
 from ..ticks import NEVER, TICK, count_ticks
@@ -149,24 +149,6 @@ def compute_arrivals(
     second = first + 1.0 + floor(second_share * link.period)
     first = select(is_lost, NEVER, first)
     return first, select(is_lost | (duplicate_share >= link.duplicate), NEVER, second)
-
-
-@jit
-def draw_clock_phase(link: Link, key_low: int, key_high: int, sensor: int) -> Scalar:
-    """Compute the tick of the first capture: the phase, or a drawn one where that is -1.
-
-    Args:
-        link: `Link` of the sensor.
-        key_low: Lower 32 bits of the episode's key.
-        key_high: Upper 32 bits of the episode's key.
-        sensor: Place of the sensor in `SLOW`.
-
-    Returns:
-        The tick.
-    """
-    u = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)
-    phase = select(link.phase < 0.0, floor(u[0] * link.period), link.phase)
-    return phase + select(phase + link.stamp < 0.0, link.period, 0.0)  # no stamp is before tick 0
 
 
 class PacketValue(NamedTuple):

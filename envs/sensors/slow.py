@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..numerics.functions import CHANNELS, PI, draw_normals, exp, sincos, wrap
+from ..numerics.functions import CHANNELS, PI, compute_sine, draw_normals, exp, sincos, wrap
 from ..numerics.jit import jit
 from ..numerics.primitives import (
     Scalar,
@@ -24,8 +24,8 @@ from ..numerics.primitives import (
 from ..validation import check_mapping, describe_unknown
 from ..vehicle.dynamics import CarParams, Motion, RoadParams, compute_sideslip_angle
 from ..vehicle.tyres import MIN_SPEED
-from .camera import CAMERA_KIND, FieldOfView, compute_lane_quality, sample_camera
-from .errors import SensorErrors, compute_course_error
+from .camera.analytic import CAMERA_KIND, FieldOfView, compute_lane_quality, sample_camera
+from .errors import SensorErrors
 from .inertial import Noise
 from .link import Blocks, Link, PacketValue, SlowKind, SlowSensor
 
@@ -98,50 +98,34 @@ class Sample(NamedTuple):
 
 
 @jit
-def _compute_hdop_deviation(
-    before: Scalar, sky: SatelliteGeometry, link: Link, tick: Scalar, n: Vector
-) -> Scalar:
-    """Compute the deviation of log HDOP from its median at a capture, from that before."""
-    is_after_outage = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
-    is_after_outage = is_after_outage & (tick - link.period < link.outage_end)
-    jump = select(is_after_outage, OUTAGE_JUMP * sky.spread, 0.0)
-    return sky.decay * before + sky.noise_gain * sky.spread * n[0] + jump
-
-
-@jit
 def _count_satellites(hdop: Scalar) -> Scalar:
     """Count the satellites that a receiver sees: 12 at HDOP 1, 4 at HDOP 5, fewer above."""
     return floor(2.0 + minimum(10.0 / hdop, 28.0))
 
 
 @jit
-def _sample_gps(context: "MeasurementContext", hdop: Scalar, n: Vector) -> tuple[Scalar, ...]:
-    """Sample the GPS at its antenna, with noise: six values and the quality."""
-    motion, noise, forward, left = (
-        context.motion,
-        context.noise,
-        context.car.forward,
-        context.car.left,
-    )
+def _sample_gps(context: MeasurementContext, hdop: Scalar, n: Vector) -> tuple[Vector, Scalar]:
+    """Sample the GPS at its antenna, with noise: its values and the quality."""
+    motion, noise, car = context.motion, context.noise, context.car
+    forward, left = car.forward, car.left
     v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * forward
     s, c = sincos(motion.psi)
     noise_scale = 1.0 + context.sky.weight * (hdop - 1.0)
     v = sqrt(v_x * v_x + v_y * v_y)
     # course = psi + beta, dakf-stability (3), with the antenna's beta
     angle = motion.psi + compute_sideslip_angle(v_x, v_y, context.small_angle)
-    angle = angle + compute_course_error(
-        to_float(to_int(context.tick)), maximum(v, MIN_SPEED), context.errors
-    )
-    course = wrap(angle + noise.course * noise_scale / maximum(v, MIN_SPEED) * n[0])
-    return (
-        course,
+    errors, tick = context.errors, to_float(to_int(context.tick))
+    wave = compute_sine(errors.course_rate * tick + errors.course_phase)  # varies slowly
+    angle = angle + errors.course_error / maximum(v, MIN_SPEED) * wave
+    values = (
+        wrap(angle + noise.course * noise_scale / maximum(v, MIN_SPEED) * n[0]),
         v + noise.gps_speed * noise_scale * n[1],
         motion.X + (forward * c - left * s) + noise.gps_position * noise_scale * n[2],
         motion.Y + (forward * s + left * c) + noise.gps_position * noise_scale * n[3],
         hdop,
         _count_satellites(hdop),
-        select(v < COURSE_SPEED, 0.0, 1.0),
     )
+    return values, select(v < COURSE_SPEED, 0.0, 1.0)
 
 
 @jit
@@ -165,12 +149,13 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: S
         quality = compute_lane_quality(context.motion, context.field_of_view)
         return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), quality, drift)
     sky = context.sky
-    drift_noise = draw_normals(context.key_low, context.key_high, tick, blocks.drift)
-    drift = _compute_hdop_deviation(drift, sky, link, context.tick, drift_noise)
-    course, speed, X, Y, hdop, satellites, quality = _sample_gps(
-        context, exp(sky.median + drift), n
-    )
-    return Sample((course, speed, X, Y, hdop, satellites), quality, drift)
+    innovation = draw_normals(context.key_low, context.key_high, tick, blocks.drift)[0]
+    is_after_outage = (link.outage_end > link.outage_start) & (context.tick >= link.outage_end)
+    is_after_outage = is_after_outage & (context.tick - link.period < link.outage_end)
+    jump = select(is_after_outage, OUTAGE_JUMP * sky.spread, 0.0)
+    drift = sky.decay * drift + sky.noise_gain * sky.spread * innovation + jump  # of log HDOP
+    values, quality = _sample_gps(context, exp(sky.median + drift), n)
+    return Sample(values, quality, drift)
 
 
 @jit

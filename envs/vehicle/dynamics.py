@@ -178,16 +178,6 @@ class Velocity(NamedTuple):
 
 
 @inline
-def _compute_roll_acceleration(
-    motion: Motion | Velocity, F_y: Scalar, N_x: Scalar, car: CarParams, per_m: Scalar
-) -> Scalar:
-    """phi'' (rad/s2) of double-layer-gps (1) and (3), in which gravity's pull cancels from F_y."""
-    body_moment = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
-    lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
-    return (lever + body_moment) * (1.0 / (car.I_x - car.S * car.S * per_m))
-
-
-@inline
 def _compute_rates(
     motion: Motion | Velocity, load: TyreLoad, disturbance: DisturbanceForces, car: CarParams,
     gravity: tuple[Scalar, Scalar], variant: Variant,
@@ -203,7 +193,10 @@ def _compute_rates(
     phi_dot, phi_ddot = 0.0, 0.0
     if roll:
         phi_dot = motion.phi_dot
-        phi_ddot = _compute_roll_acceleration(motion, F_y, disturbance.N_x, car, per_m)
+        # double-layer-gps (1) and (3), in which gravity's pull cancels from F_y
+        body_moment = disturbance.N_x - car.C_x * phi_dot - car.K_x * motion.phi
+        lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
+        phi_ddot = (lever + body_moment) * (1.0 / (car.I_x - car.S * car.S * per_m))
         F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
     if not small_angle:
         F_x = F_x - F_yf * load.sin_d

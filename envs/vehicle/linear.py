@@ -4,17 +4,14 @@ The compiled functions write the matrices, here and in the filters.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..numerics.jit import as_python, jit
 from ..numerics.primitives import Matrix, Scalar, Vector
-from .parameters import GRAVITY, Vehicle
-
-if TYPE_CHECKING:
-    from control import StateSpace
+from .parameters import Vehicle
 
 Array = npt.NDArray[np.float64]
 
@@ -31,29 +28,17 @@ class Bicycle(NamedTuple):
 
 
 @jit
-def compute_bicycle_coefficients(
-    m: Scalar,
-    I: Scalar,  # noqa: E741  the papers' letter
-    l_f: Scalar,
-    l_r: Scalar,
-    C_f: Scalar,
-    C_r: Scalar,
-    V: Scalar,
-) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
+def compute_bicycle_coefficients(car: Vector, V: Scalar) -> tuple[Scalar, ...]:
     """Compute the coefficients of the linear bicycle, tie-vision (8).
 
     Args:
-        m: Mass (kg).
-        I: Yaw inertia (kg m2).
-        l_f: Distance from the centre of gravity to the front axle (m).
-        l_r: Distance from the centre of gravity to the rear axle (m).
-        C_f: Cornering stiffness of one front tyre (N/rad).
-        C_r: Cornering stiffness of one rear tyre (N/rad).
+        car: `Bicycle`, or its six numbers.
         V: Speed (m/s).
 
     Returns:
         (a11, a12, a21, a22, b11, b21, b22) of the states beta, gamma and inputs delta_f, N_z.
     """
+    m, I, l_f, l_r, C_f, C_r = car[0], car[1], car[2], car[3], car[4], car[5]  # noqa: E741
     a11 = -2.0 * (C_f + C_r) / (m * V)
     a12 = -1.0 - 2.0 * (C_f * l_f - C_r * l_r) / (m * V * V)
     a21 = -2.0 * (C_f * l_f - C_r * l_r) / I
@@ -78,9 +63,7 @@ def write_lateral(
         inputs: Number of inputs, 2 or 3.
         preview: Preview distance l_pre of the camera (m).
     """
-    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
-        car[0], car[1], car[2], car[3], car[4], car[5], V
-    )
+    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(car, V)
     A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
     B[0, 0], B[1, 0], B[1, 1] = b11, b21, b22
     if states > 2:
@@ -125,7 +108,6 @@ def write_kinematic(A: Matrix, B: Matrix, gamma: Scalar) -> None:
 
 
 _write_lateral, _write_roll = as_python(write_lateral), as_python(write_roll)
-_write_kinematic = as_python(write_kinematic)
 
 
 @dataclass(frozen=True)
@@ -155,14 +137,6 @@ class LinearModel:
         block[:n] = np.hstack([self.A, self.B]) * dt
         exact = expm(block)
         return exact[:n, :n], exact[:n, n:]
-
-    def to_control(self) -> "StateSpace":
-        """Convert to a `control.StateSpace` with names (needs the extra `design`)."""
-        import control
-
-        D = np.zeros((len(self.outputs), len(self.inputs)))
-        names = {name: list(getattr(self, name)) for name in ("states", "inputs", "outputs")}
-        return control.StateSpace(self.A, self.B, self.C, D, **names)
 
 
 def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[Array, Array]:
@@ -228,12 +202,6 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     return LinearModel(A, B, C, ("beta", "gamma", "psi"), ("delta_f", "N_z"), ("gamma", "course"))
 
 
-def _compute_roll_ratios(vehicle: Vehicle) -> tuple[float, float, float]:
-    """Compute roll stiffness (1/s2), damping (1/s) and M_s h_s (1/m) over the roll inertia."""
-    I_x = vehicle.roll_inertia
-    return vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x
-
-
 def make_roll_model(vehicle: Vehicle) -> LinearModel:
     """Make the model of phi and phi_dot from the measured specific force a_y, double-layer-gps (3).
 
@@ -245,28 +213,7 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
     Returns:
         The model.
     """
-    A, B = np.zeros((2, 2)), np.zeros((2, 1))
-    _write_roll(A, B, 0, 0, *_compute_roll_ratios(vehicle))
+    A, B, I_x = np.zeros((2, 2)), np.zeros((2, 1)), vehicle.roll_inertia
+    ratios = vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x
+    _write_roll(A, B, 0, 0, *ratios)
     return LinearModel(A, B, np.array([[0.0, 1.0]]), ("phi", "phi_dot"), ("a_y",), ("phi_dot",))
-
-
-def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
-    """Make the model of v_x, v_y, phi and phi_dot from both specific forces, double-layer-gps (42).
-
-    Outputs are v_x and v_y, which the GPS and the first layer measure, and phi_dot. Without a yaw
-    rate v_y is unobservable from v_x alone.
-
-    Args:
-        vehicle: Vehicle of the model.
-        gamma: Yaw rate (rad/s).
-
-    Returns:
-        The model.
-    """
-    A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
-    _write_kinematic(A, B, gamma)
-    _write_roll(A, B, 2, 1, *_compute_roll_ratios(vehicle))
-    A[1, 2] = -GRAVITY  # double-layer-gps (5)
-    C[0, 0] = C[1, 1] = C[2, 3] = 1.0
-    states, outputs = ("v_x", "v_y", "phi", "phi_dot"), ("v_x", "v_y", "phi_dot")
-    return LinearModel(A, B, C, states, ("a_x", "a_y"), outputs)

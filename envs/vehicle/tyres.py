@@ -95,18 +95,6 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 
 @inline
-def _compute_axle_shift(
-    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: Car
-) -> Scalar:
-    """Load F_x h_x / (2 l) (N) that drive moves from each front wheel to the rear one behind it."""
-    # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
-    # At most nine tenths of an axle's standing load move.
-    F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l) + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
-    shift = F_x * car.h_x * (0.5 / (car.l_f + car.l_r))
-    return minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
-
-
-@inline
 def compute_tyre_load(
     inputs: TyreInputs, car: Car, small_angle: int, load_shift: int = 0
 ) -> TyreLoad:
@@ -131,7 +119,13 @@ def compute_tyre_load(
     command_l, command_r = inputs.T_l * (car.k_l / car.r), inputs.T_r * (car.k_r / car.r)
     F_l, F_r, load_f, load_r = command_l, command_r, 1.0, 1.0
     if not small_angle and any_lane(car.h_x > 0.0):
-        shift = _compute_axle_shift(F_l, F_r, rear_l, rear_r, weight, car)
+        # F_x h_x / (2 l) moves from each front wheel to the rear one behind it. F_x is within the
+        # tyres' standing capacity, so that it does not depend on its own effect. At most nine
+        # tenths of an axle's standing load move.
+        F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
+        F_x = F_x + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
+        shift = F_x * car.h_x * (0.5 / (car.l_f + car.l_r))
+        shift = minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
         front = front - 0.5 * (car.mu + car.mu_r) * shift
         rear_l, rear_r = rear_l + car.mu * shift, rear_r + car.mu_r * shift
         load_f = minimum(1.0 - shift / (weight * car.l_r), _MAX_LOAD)

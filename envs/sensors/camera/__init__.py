@@ -5,9 +5,3 @@
 picture, `pictures` reads files, draws on them, and finds tilt, height and intrinsics from them.
 Only `analytic` is loaded with the package; what works on pictures needs the extra of OpenCV.
 """
-
-from .analytic import CAMERA_KIND as CAMERA_KIND
-from .analytic import FieldOfView as FieldOfView
-from .analytic import compute_lane_quality as compute_lane_quality
-from .analytic import compute_preview_offset as compute_preview_offset
-from .analytic import sample_camera as sample_camera

@@ -15,7 +15,7 @@ from ...numerics.jit import inline, jit
 from ...numerics.primitives import Scalar, Vector, absolute, select
 from ...ticks import TICK
 from ...vehicle.dynamics import Motion, RoadParams, compute_curvature
-from ..errors import SensorErrors, compute_seen_lane
+from ..errors import CAMERA_HEIGHT, SensorErrors
 from ..inertial import Noise
 from ..link import Blocks, PacketValue, SlowKind
 
@@ -82,9 +82,13 @@ def sample_camera(
     Returns:
         psi (rad) and y_l (m).
     """
-    kappa = compute_curvature(road, motion.s)
-    psi, y, kappa = compute_seen_lane(motion.psi - motion.theta, motion.y, kappa, l_pre, errors)
-    y_l = compute_preview_offset(y, psi, kappa, l_pre)
+    # A misaligned camera sees what is X ahead on the flat at X', 1 / X' = 1 / X - pitch / height,
+    # times its height's error; lateral distances grow with X' / X, and a lane beside it seems to
+    # turn. Offset and curvature are those seen at the preview point.
+    tilt, growth = errors.camera_pitch * (1.0 / CAMERA_HEIGHT), 1.0 + errors.camera_height
+    psi = motion.psi - motion.theta + errors.camera_yaw + tilt * motion.y
+    kappa = compute_curvature(road, motion.s) / (growth + tilt * l_pre)
+    y_l = compute_preview_offset(growth * motion.y, psi, kappa, l_pre)
     return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]
 
 

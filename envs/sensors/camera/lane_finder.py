@@ -29,7 +29,7 @@ _WIDTHS = (1.0, 0.88, 1.12)  # factors on the lane's, as for a body that rolls b
 _PITCH_SD, _ROLL_SD = np.radians([1.0, 1.0])  # rad, of the priors
 _SPAN = 4.0  # m, smallest range of X of a triple
 _SIDE = 0.15  # of a score, lost for every lane's width that the car would be off the lane
-_CELL = 0.05  # m across
+_SEARCHED, _CELL = 14.0, 0.05  # m to either side, and across
 _MARKING = 0.07  # m, of the Gaussian: half a marking's width
 _CONTRAST = 6.0  # grey levels, minimum of a ridge
 _MAX_POINTS = 800
@@ -55,13 +55,6 @@ class _LaneFit(NamedTuple):
         """Weight of the points on both markings, dominated by the weaker one's."""
         left, right = (float(np.sum(weight[self.side == side])) for side in (1, -1))
         return min(left, right) + 0.25 * (left + right)
-
-
-class _FitStart(NamedTuple):
-    """Start of a fit, and its score."""
-
-    score: float
-    values: Array  # (5,), psi, y, kappa, pitch and roll
 
 
 class _CameraMount(NamedTuple):
@@ -92,14 +85,11 @@ def _draw_triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -
     return np.stack([a, b, c])[:, np.flatnonzero(is_marking)[:_MAX_TRIPLES]]
 
 
-def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> list[_FitStart]:
-    """Starts of a fit: pairs of markings that hold many of the points, the best first.
-
-    The random draws depend on the number of points alone.
-    """
+def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> list[Array]:
+    """Starts of a fit, (5,) each: pairs of markings that hold many of the points, best first."""
     if len(x) < 6:
         return []
-    rng = np.random.Generator(np.random.SFC64(len(x)))
+    rng = np.random.Generator(np.random.SFC64(len(x)))  # equal for so many points
     a, b, c = _draw_triples(x, y, weight, rng).astype(np.float32)[..., None]
     if not len(a):
         return []
@@ -124,8 +114,8 @@ def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> li
             offset = -middle[i] * cosine
             roll = 0.5 * (width_factor - 1.0) * mount.height * offset / (offset * offset + 0.1)
             values = -np.arctan(slope), offset, a[i, 0] * cosine**3, pitch, roll
-            starts.append(_FitStart(float(score[i]), np.array(values, float)))
-    return sorted(starts, key=lambda start: -start.score)[:_MAX_STARTS]
+            starts.append((float(score[i]), np.array(values, float)))
+    return [start for _, start in sorted(starts, key=lambda item: -item[0])[:_MAX_STARTS]]
 
 
 def _correct_attitude(
@@ -221,7 +211,6 @@ class LaneFinder:
         lane_width: Distance from marking to marking (m).
         near: Distance ahead of the car where the search begins (m).
         far: Distance ahead where it ends (m).
-        side: Distance to either side that is searched (m).
         view: Limits beyond which the lane counts as lost; None for no limits.
 
     Attributes:
@@ -237,20 +226,17 @@ class LaneFinder:
         lane_width: float = 3.5,
         near: float = 3.5,
         far: float = 24.0,
-        side: float = 14.0,
         view: FieldOfView | None = None,
     ) -> None:
-        if not (0.0 < near < far and lane_width > 0.0 and side > lane_width):
-            raise ValueError(
-                "expected 0 < near < far, a lane's width and more than it to either side, got "
-                f"{near}, {far}, {lane_width} and {side} m"
-            )
+        if not (0.0 < near < far and 0.0 < lane_width < _SEARCHED):
+            rule = f"expected 0 < near < far, and a lane's width below {_SEARCHED} m"
+            raise ValueError(f"{rule}, got {near}, {far} and {lane_width} m")
         self.camera, self.view = camera, view
         self._scale = scale = camera.size[0] / WORKING_WIDTH
         self._mount = _CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
         self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
-        self._y = np.arange(side, -side, -_CELL)
+        self._y = np.arange(_SEARCHED, -_SEARCHED, -_CELL)
         pixels = camera.project_points(self.rows_ahead[:, None], self._y)
         self._visible = np.isfinite(pixels[..., 0])
         if not self._visible.any():
@@ -292,7 +278,7 @@ class LaneFinder:
         focal = self.camera.K[0][0] / self._scale
         weight, deviation = np.minimum(strength, 40.0), 0.03 + 2.0 * x / focal
         starts = _search_starts(x, y, weight, self._mount)
-        fits = (_fit_lane(x, y, deviation, start.values, self._mount) for start in starts)
+        fits = (_fit_lane(x, y, deviation, start, self._mount) for start in starts)
         candidates = [fit for fit in fits if fit is not None]
         best = max(candidates, key=lambda fit: fit._compute_support(weight), default=None)
         if best is None or (quality := self._compute_quality(best, x)) == 0.0:

@@ -40,13 +40,13 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
     rng = np.random.default_rng(3)
     keys, ticks = rng.integers(0, 2**32, (2, 500)), rng.integers(0, 10**7, 500)
     told = [torch.as_tensor(each, device=device) for each in (*keys, ticks)]
-    exact, normals = to_torch(torch.float64, noise.philox, noise.draw_normals)
+    exact, normals = to_torch(torch.float64, noise._philox, noise.draw_normals)
     (rough,) = to_torch(torch.float32, noise.draw_normals)
     words = torch.stack(exact(*told, 5)).cpu().numpy()
     found = torch.stack(normals(*told, 5)).cpu().numpy()
     single = torch.stack(rough(*told, 5)).cpu().numpy()
     for i, (low, high, tick) in enumerate(zip(*keys.tolist(), ticks.tolist(), strict=True)):
-        assert tuple(words[:, i].tolist()) == noise.philox(low, high, tick, 5)
+        assert tuple(words[:, i].tolist()) == noise._philox(low, high, tick, 5)
         wanted = noise.draw_normals(low, high, tick, 5)
         assert np.abs(found[:, i] - wanted).max() < 1e-13
         assert np.abs(single[:, i] - wanted).max() < 2e-5

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
-from sideslip.envs.engine.layout import P
+from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.numerics.packed import read
 from sideslip.envs.scenarios.manoeuvres import ROAD_TESTS, SIMULATIONS
 
@@ -97,7 +97,7 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
         assert env.vehicle.replace(**rest) == COMS
         soft = {each: 1.3 * getattr(COMS, each) for each in ROLL} if rolls else {}
         assert env.nominal == COMS.replace(front_stiffness=told, rear_stiffness=told, **soft)
-        assert env.redraws == 0
+        assert env.packed_state[Z.clock.redraws] == 0
 
 
 def test_ou_disturbance_has_the_stated_size_and_time() -> None:

@@ -13,6 +13,7 @@ from scipy import stats
 
 from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, make_scenario
 from sideslip.envs.engine.config import make_car
+from sideslip.envs.engine.layout import Z
 from sideslip.envs.scenarios.draws import DRAWS_WIDTH, KMH, Draws, _is_stable, draw_stable
 from sideslip.envs.scenarios.manoeuvres import TIERS
 
@@ -146,7 +147,7 @@ def test_the_env_tells_its_redraws_and_has_the_drawn_vehicle() -> None:
     seen = []
     for seed in range(60):
         env.reset(seed=seed)
-        seen.append(env.redraws)
+        seen.append(env.packed_state[Z.clock.redraws])
         low, high = 0.6 * 6000.0, 1.4 * 6000.0
         assert low <= env.vehicle.front_stiffness <= high
         assert 0.7 <= env.vehicle.friction <= 1.0

@@ -10,7 +10,7 @@ from scipy import stats
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors.camera import FieldOfView, sample_camera
+from sideslip.envs.sensors.camera.analytic import FieldOfView, sample_camera
 from sideslip.envs.sensors.errors import IDEAL_SENSORS
 from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.sensors.slow import (
@@ -110,7 +110,8 @@ def gps(motion: Motion, noise: Noise = QUIET, n: Any = CALM, **how: Any) -> Any:
     sky = SatelliteGeometry(0.0, 0.0, 0.0, 0.0, how.get("weight", 0.5))
     parts = RoadParams(0.0, 0.0, 1.0), car, noise, sky, FieldOfView(1.0, 1.0), IDEAL_SENSORS
     context = MeasurementContext(motion, *parts, how.get("small_angle", 0), 0, 0, 0)
-    return _sample_gps(context, how.get("hdop", 1.0), n)
+    values, quality = _sample_gps(context, how.get("hdop", 1.0), n)
+    return (*values, quality)
 
 
 @pytest.mark.plain

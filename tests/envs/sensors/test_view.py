@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.camera import (
+from sideslip.envs.sensors.camera.analytic import (
     FieldOfView,
     compute_lane_quality,
     sample_camera,

@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
 from sideslip.envs.engine.config import make_car
-from sideslip.envs.sensors.camera import FieldOfView, sample_camera
+from sideslip.envs.sensors.camera.analytic import FieldOfView, sample_camera
 from sideslip.envs.sensors.errors import IDEAL_SENSORS
 from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.sensors.slow import MeasurementContext, SatelliteGeometry, _sample_gps
@@ -21,7 +21,6 @@ from sideslip.envs.vehicle.linear import (
     make_bicycle_model,
     make_course_model,
     make_roll_model,
-    make_velocity_roll_model,
     make_vision_model,
 )
 from sideslip.envs.vehicle.tyres import LINEAR, PlantVariant, TyreInputs, compute_tyre_load
@@ -67,7 +66,7 @@ def seen(
     sky, view = SatelliteGeometry(0.0, 0.0, 0.0, 0.0, 0.0), FieldOfView(1.0, 1.0)
     parts = state, road, car, SILENT, sky, view, IDEAL_SENSORS
     context = MeasurementContext(*parts, small_angle, 0, 0, 0)
-    course_seen = _sample_gps(context, 1.0, (0.0,) * 4)[0]
+    course_seen = _sample_gps(context, 1.0, (0.0,) * 4)[0][0]
     outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
     names = MODELS[model](vehicle, v).outputs
     return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
@@ -157,20 +156,6 @@ def test_discrete_is_the_exact_zero_order_hold(name: str, dt: float) -> None:
     assert np.abs(G @ H + H - twice_H).max() <= 1e-14 * np.abs(twice_H).max()
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_to_control_keeps_matrices_and_names(name: str) -> None:
-    pytest.importorskip("control")
-    model = MODELS[name](COMS, 25.0 * KMH)
-    system = model.to_control()
-    for letter in "ABC":
-        np.testing.assert_array_equal(getattr(system, letter), getattr(model, letter))
-    assert not system.D.any()
-    assert tuple(system.state_labels) == model.states
-    assert tuple(system.input_labels) == model.inputs
-    assert tuple(system.output_labels) == model.outputs
-    assert system.isctime()
-
-
 @pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
 @pytest.mark.parametrize("v", SPEEDS)
 def test_references_are_the_models_steady_state(vehicle: Vehicle, v: float) -> None:
@@ -197,6 +182,18 @@ def test_a_speed_that_is_not_positive_is_refused(v: float) -> None:
     for build in MODELS.values():
         with pytest.raises(ValueError, match="positive speed, got"):
             build(COMS, v)
+
+
+def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
+    """double-layer-gps (42): v_x, v_y, phi and phi_dot from both specific forces."""
+    body = make_roll_model(vehicle)
+    A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
+    A[0, 1], A[1, 0], A[2:, 2:] = gamma, -gamma, body.A
+    A[1, 2] = -9.81  # double-layer-gps (5)
+    B[0, 0], B[1, 1], B[2:, 1:] = 1.0, 1.0, body.B
+    C[0, 0] = C[1, 1] = C[2, 3] = 1.0
+    states, outputs = ("v_x", "v_y", "phi", "phi_dot"), ("v_x", "v_y", "phi_dot")
+    return LinearModel(A, B, C, states, ("a_x", "a_y"), outputs)
 
 
 def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:

@@ -14,13 +14,13 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.actuators import compute_yaw_moment
 from sideslip.envs.vehicle.linear import (
     make_course_model,
-    make_velocity_roll_model,
     make_vision_model,
 )
 from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
 from sideslip.estimators.design.models import make_signals
+from tests.envs.vehicle.test_linear import make_velocity_roll_model
 from tests.estimators.filters.literal import car
 from tests.estimators.simulation import CAMERA, GPS
 
@@ -139,7 +139,7 @@ def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
 
 @pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])
 def test_the_second_layer_is_the_linear_model_at_every_yaw_rate(turning: float) -> None:
-    """`build_model` writes double-layer-gps (42) for compiled code; `linear` has it for design."""
+    """`build_model` writes double-layer-gps (42), which is the plant's Jacobian."""
     with pytest.warns(UserWarning, match="cannot see"):
         filter_ = make_estimator("double-layer", sensors={"gps": GPS}, speed=7.0)
     f = filter_.filters[1]

@@ -12,8 +12,7 @@ pytest.importorskip("cv2")
 import cv2
 
 from sideslip.envs.numerics.jit import as_python
-from sideslip.envs.sensors.camera import FieldOfView
-from sideslip.envs.sensors.camera.analytic import compute_preview_offset
+from sideslip.envs.sensors.camera.analytic import FieldOfView, compute_preview_offset
 from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _CameraMount, _search_starts
 from sideslip.envs.sensors.camera.pinhole import Pinhole
@@ -112,7 +111,7 @@ def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
     y = np.repeat(side * width * np.array([-0.5, 0.5, 1.5]), 60)
     weight = np.repeat([1.0, 1.2, 1.1], 60)
     best = _search_starts(x, y, weight, _CameraMount(1.2, 1.5, 5.0, width))[0]
-    assert best.values[1] == pytest.approx(0.0, abs=0.05)
+    assert best[1] == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
