@@ -51,7 +51,7 @@ class System:
     Attributes:
         paper: Short name of the paper.
         entry: Its controller on its filter; LQR on the filter of a paper without a controller.
-        ours: What this project recommends instead.
+        recommended: What this project recommends instead.
         task: The paper's simulation, with its sensors and its reference.
         metric: Metric of an episode, or estimate of the filter, whose root mean square counts.
         criterion: The metric in words.
@@ -62,7 +62,7 @@ class System:
 
     paper: str
     entry: Entry
-    ours: Entry
+    recommended: Entry
     task: ControlTask
     metric: str
     criterion: str
@@ -91,17 +91,17 @@ class System:
         Returns:
             Root mean squares, shape (n,) each.
         """
-        entries = (self.entry, self.ours, self.rival)
+        entries = (self.entry, self.recommended, self.rival)
         if self.metric in NUMBERS:
             driven = measure([(self.task, entry) for entry in entries], seeds, jobs=jobs)
-            own, ours, rival = (driven[self.task, entry][self.metric] for entry in entries)
-            return own, ours, rival
+            first, second, rival = (driven[self.task, entry][self.metric] for entry in entries)
+            return first, second, rival
         (drives,) = (x for x in self.simulations if x.name == self.task.scenario)
         paper_filters = [x for x in drives.filters if x.label == self.label]
         filters = (*paper_filters, _RECOMMENDED, _INFORMED)
         numbers = replace(drives, filters=filters).measure(tuple(seeds)).numbers
-        own, ours, rival = (numbers[x.label, self.metric] for x in filters)
-        return own, ours, rival
+        original, recommended, rival = (numbers[x.label, self.metric] for x in filters)
+        return original, recommended, rival
 
 
 def _make_task(sensors: str, scenario: str, reference: str = "", **changes: object) -> ControlTask:
@@ -153,8 +153,8 @@ def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[Resu
     """Drive every system on its own ground and, beside nominal, in the small car's contests."""
     suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, EPISODES)
     for system in SYSTEMS:
-        own, ours, rival = (x**2 for x in system.measure(seeds, jobs))
-        for entry, squares in ((system.entry, own), (system.ours, ours)):
+        original, recommended, rival = (x**2 for x in system.measure(seeds, jobs))
+        for entry, squares in ((system.entry, original), (system.recommended, recommended)):
             suite.add_rows(
                 [{_RATIO: interval(squares, ratio_of_roots, rival)}],
                 system.task.env_id,
@@ -166,7 +166,7 @@ def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[Resu
                 paper=system.paper,
             )
     tasks = [x for x in list_scored_tasks() if (x.tier, x.env_id) == (_TIER, STEERING)]
-    systems = [x for system in SYSTEMS for x in (system.contestant or system.entry, system.ours)]
+    systems = [x for y in SYSTEMS for x in (y.contestant or y.entry, y.recommended)]
     pairs = [(task, entry) for task in tasks for entry in dict.fromkeys((Entry(NOMINAL), *systems))]
     common = measure(pairs, make_task_seeds(salt, EPISODES), jobs=jobs, console=console)
     check_driven(common)
@@ -194,9 +194,9 @@ def make_table(rows: Sequence[ResultRow]) -> str:
 
     lines = []
     for system in SYSTEMS:
-        both = (system.entry, system.ours)
+        both = (system.entry, system.recommended)
         ground = [format_cell(system.scenario, entry, _RATIO) for entry in both]
-        contestants = (system.contestant or system.entry, system.ours)
+        contestants = (system.contestant or system.entry, system.recommended)
         common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in contestants]
         names = [f"`{x.agent}` on `{x.estimator}`" for x in both]
         lines.append([f"{system.paper}, {system.scenario}", *names, *ground, *common])

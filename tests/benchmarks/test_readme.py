@@ -56,11 +56,11 @@ def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -
 def test_a_paper_filter_is_measured_as_its_own_simulation_has_it() -> None:
     """On the paper's ground its error is the ledger's, and the informed filter errs least."""
     system = next(x for x in own_ground.SYSTEMS if x.paper == "dual-rate")
-    own, ours, informed = system.measure(range(2), None)
+    shown, joint, informed = system.measure(range(2), None)
     (drives,) = (x for x in system.simulations if x.name == "dual-rate-fig4")
     numbers = drives.measure((0, 1)).numbers
-    np.testing.assert_array_equal(own, numbers["pseudo measurement", "beta"])
-    assert (informed < np.minimum(own, ours)).all()
+    np.testing.assert_array_equal(shown, numbers["pseudo measurement", "beta"])
+    assert (informed < np.minimum(shown, joint)).all()
 
 
 def test_a_task_has_a_line_with_intervals() -> None:
