@@ -108,11 +108,11 @@ def _make_task(sensors: str, scenario: str, reference: str = "", **changes: obje
     return ControlTask("", f"sideslip/{sensors}-v0", "coms", reference, scenario, changes=changes)
 
 
-_SLIP, _OURS = "error of the sideslip angle", Entry("adaptive-lqr", JOINT)
+_SLIP, _RECOMMENDED_ENTRY = "error of the sideslip angle", Entry("adaptive-lqr", JOINT)
 _FOLLOWING = (
     dakf_stability.PAPER,
     Entry("model-following", dakf_stability.DAKF),
-    _OURS,
+    _RECOMMENDED_ENTRY,
     _make_task("YawGps", dakf_stability.FIG7, steering=True, control_period=1),
 )
 _FIG5, _FIG9, _FIG4 = uneven_delay.FIG5, double_layer.FIG9, dual_rate.FIG4
@@ -126,7 +126,7 @@ SYSTEMS = (
     System(
         "tie-vision",
         Entry("two-dof", "multirate-residual-kf"),
-        _OURS,
+        _RECOMMENDED_ENTRY,
         _make_task("YawVision", tie_vision_control.FIG8, "zero-slip", control_period=1),
         "rms_slip",
         "sideslip angle",
