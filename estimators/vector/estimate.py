@@ -13,7 +13,7 @@ from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
 from ..wrappers.truth import calibrate, choose_vehicle, set_stiffness
-from .make import build_batch
+from .batch import build_batch
 from .records import BatchedEnv, Mask, Observations, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
