@@ -23,7 +23,7 @@ from ...envs.numerics import require_extra
 from ...envs.record import Array
 from .. import zoo
 from ..learned.policy import Card, save_policy
-from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
+from ..rollout import compute_cost_ratios, evaluate_episodes
 from ..vec_env import make_native_env
 from .config import TrainingTask
 from .export import convert_sb3_policy
@@ -147,14 +147,14 @@ class EvalCallback(BaseCallback):
         self.env = warm_start.env if warm_start else task.vector_env(task.n_eval_envs)
         self.evaluations = [Evaluation(*row) for row in (state or {}).get("evaluations", [])]
         self.scaling: StandardisedArguments | None = None
-        uncontrolled = self._average_scenarios(evaluate_costs(self.env, None, self.seeds))
+        uncontrolled = self._average_scenarios(evaluate_episodes(self.env, None, self.seeds)[0])
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
         self.weights = np.ones(1) if self.policy else _compute_scenario_weights(task)
         driver = warm_start.driver if warm_start else None
-        self.initial_costs = evaluate_costs(self.env, driver, self.seeds) if driver else None
+        self.initial_costs = evaluate_episodes(self.env, driver, self.seeds)[0] if driver else None
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 

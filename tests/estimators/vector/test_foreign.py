@@ -138,8 +138,8 @@ def test_a_snapshot_of_a_wrapped_vector_env_continues_bit_for_bit(layer: Any, mo
     env.step(actions(env, 1))
     for _ in range(2):
         env.set_state(snapshot)
-        for step, before in enumerate(once, start=7):
-            same_bits(env.step(actions(env, step)), before)
+        for i, before in enumerate(once, start=7):
+            same_bits(env.step(actions(env, i)), before)
 
 
 def test_a_snapshot_brings_back_the_rows_that_a_mask_leaves_alone() -> None:
