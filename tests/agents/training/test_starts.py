@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.env_info import get_layout
 from sideslip.agents.learned.policy import Card, Policy, load_policy
-from sideslip.agents.rollout import COST_FLOOR
+from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.agents.training.callbacks import (
     BEST,
     CHECKPOINT,

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.rollout import COST_FLOOR
+from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.benchmarks.control.tasks import YAW, ControlTask, make_salt, make_task_seeds
 
 CONTEST = ControlTask("", YAW, "coms", "zero-slip", "coms-random")
