@@ -105,11 +105,9 @@ def _collect_demonstrations(
     noise: float,
     max_cost: float = np.inf,
 ) -> Demonstrations:
-    """Collect each seed's first episode, driven by a policy, or by the teacher with noise.
-
-    `noise` is the largest standard deviation of the noise on the teacher's actions. Episodes that
-    cost more than `max_cost` are weighted as if they cost that: failed ones keep their weight.
-    """
+    """Collect each seed's first episode, driven by a policy, or by the teacher with noise."""
+    # noise: largest standard deviation on the teacher's actions. Episodes that cost more than
+    # `max_cost` are weighted as if they cost that: failed ones keep their weight.
     cars, twins, teacher = task
     student = None if policy is None else PolicyController(cars, policy)
     rng = np.random.default_rng(seeds[0])
@@ -257,11 +255,8 @@ def _fit_model(
     config: DistillConfig,
     epochs: int,
 ) -> float:
-    """Fit a model to drives; FloatingPointError where the loss is not finite.
-
-    Returns what errors of the actions add to an episode's cost, as a fraction of it: the mean over
-    the episodes in the last epoch, without the auxiliary loss.
-    """
+    """Fit a model to drives; return what its errors add to an episode, as a share of its cost."""
+    # the mean over the episodes in the last epoch, without the auxiliary loss
     optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
     batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)

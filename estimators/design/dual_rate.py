@@ -73,11 +73,8 @@ class SampledSystem(NamedTuple):
         return K
 
     def _compute_hold_shares(self, K: Array) -> Array:
-        """Compute Hara's B_i = L for all i, shape (steps, n, q): the innovation is held.
-
-        L gives the error from sample to sample its poles and its very map:
-        F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
-        """
+        """Compute Hara's B_i = L for all i, (steps, n, q), with poles and map of the sampled K."""
+        # the innovation is held: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C)
         power, total = np.eye(len(self.F)), np.zeros_like(self.F)
         for _ in range(self.steps):
             power = self.F @ power

@@ -90,11 +90,9 @@ def _iterate_gains(
     before: Vector,
     gains: GainTables,
 ) -> int:
-    """Run a covariance filter over its schedule until its gains settle; return the cycles used.
-
-    Outputs: `table` (rows, columns), and `before` (total, total), the covariance before the last
-    frame. lags (pattern,): steps from capture to arrival.
-    """
+    """Run a covariance filter over its schedule until its gains settle; return the cycles used."""
+    # filled: table (rows, columns), and before (total, total), the covariance before the last
+    # frame; lags (pattern,): steps from capture to arrival
     f = filters[0]
     reset_filters(filters, 0)
     n, N, cycle, width, s = f.n, f.total, f.cycle, maximum(f.fasts, 1), f.first_slow

@@ -59,7 +59,7 @@ def _design_cached(key: bytes) -> tuple[Array, Array]:
     memory, schedule, speed, config = pickle.loads(key)
     f = np.frombuffer(memory, FILTER).view(np.recarray)[0]
     table, record = design_gains(f, schedule, speed, config)
-    return table, compute_error_map(record, table, schedule)
+    return table, _compute_error_map(record, table, schedule)
 
 
 def design_and_map(
@@ -74,25 +74,15 @@ def design_and_map(
         config: Parsed options of the filter.
 
     Returns:
-        Table, shape (rows, columns), and map, see `compute_error_map`.
+        Table, shape (rows, columns), and map from the error before a cycle to that after it.
     """
     return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
 
 
-def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Array:
-    """Compute the map from the error before one cycle to that after it.
-
-    Behind the error of states and clones stands what else a rule carries on: the estimated error e,
-    the last innovation or stored predictions.
-
-    Args:
-        f: Memory from `periodic.design_gains`, at one speed.
-        table: Table of gains from there, shape (rows, columns).
-        schedule: Schedule of the slow sensor.
-
-    Returns:
-        Map, shape (size, size).
-    """
+def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Array:
+    """Compute the map (size, size) of the error over a cycle, by a table of `design_gains`."""
+    # behind the error of states and clones stands what else a rule carries on: the estimated error
+    # e, the last innovation or stored predictions
     size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
     F[: f.n, : f.n] = transition_matrix(f, f.G[: f.dense, : f.n])

@@ -94,11 +94,9 @@ def make_blocks(count: int) -> Any:
 
 @jit
 def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
-    """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
-
-    Lanes compute models that change by speed alone, of which every tick predicts and corrects.
-    Nothing is done between samples, and nothing of the past is stored but predictions.
-    """
+    """Return whether a filter's ticks are computed in its lane now; the first shapes the block."""
+    # lanes compute models that change by speed alone, of which every tick predicts and corrects
+    # without rules between samples, and store nothing of the past but predictions
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
         is_plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0

@@ -13,7 +13,7 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
 from sideslip.estimators.design.periodic import design_gains
-from sideslip.estimators.design.stability import compute_error_map, spectral_radius
+from sideslip.estimators.design.stability import _compute_error_map, spectral_radius
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
@@ -66,7 +66,7 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
         table, there = design_gains(f, schedule, 7.0, filter_.config)
-        M = compute_error_map(there, table, schedule)
+        M = _compute_error_map(there, table, schedule)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle
         rows = np.zeros((5 * cycle, FAST_WIDTH))
@@ -164,6 +164,6 @@ def test_a_filter_is_checked_with_the_rows_of_the_speed() -> None:
         for each in (anywhere, alone):
             schedule = each._schedules[0]
             table, there = design_gains(each.filters[0], schedule, speed, each.config)
-            maps.append(compute_error_map(there, table, schedule))
+            maps.append(_compute_error_map(there, table, schedule))
         np.testing.assert_allclose(maps[0], maps[1], rtol=1e-9, atol=1e-12)
         assert alone.spectral_radius < 1.0
