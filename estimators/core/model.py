@@ -16,8 +16,8 @@ from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
-LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
-"""Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
+LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES = range(6)
+"""Kinds of models."""
 BETA, GAMMA, PSI, Y_L = range(4)
 """Places of a bicycle's states."""
 CURVATURE = 2
@@ -253,15 +253,14 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     if f.kind == LATERAL and f.model_speed > 0.0:
         f.stretch *= f.model_speed / V
     f.model_speed, f.turning = V, turning
-    if f.kind != LINEAR:
-        _build_continuous(f, V, turning)
-        discretise(f)
-        first = f.dense - f.delayed
-        for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
-            for j in range(f.n):
-                f.G[first + i, j] = 0.0
-            f.G[first + i, PSI + i] = f.relax
-            f.G[first + i, first + i] = 1.0 - f.relax
+    _build_continuous(f, V, turning)
+    discretise(f)
+    first = f.dense - f.delayed
+    for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
+        for j in range(f.n):
+            f.G[first + i, j] = 0.0
+        f.G[first + i, PSI + i] = f.relax
+        f.G[first + i, first + i] = 1.0 - f.relax
     for i in range(f.dense):
         for k in range(f.n):
             store_element(f.GT, load_element(f.G, i, k), k, i)

@@ -13,7 +13,6 @@ from .model import (
     BETA,
     CURVATURE,
     KINEMATIC,
-    LINEAR,
     MIN_SPEED,
     SPEED_TOLERANCE,
     VELOCITY_ROLL,
@@ -239,7 +238,7 @@ def propagate(f: FilterRecord, u: Vector) -> None:
         for k in range(f.inputs):
             total = total + load_element(u, k) * load8(f.HT, k, j)
         store8(f.x, total, j)
-    if f.kind == LINEAR or f.tyres > 0:
+    if f.tyres > 0:
         for j in range(0, f.n, step):
             store8(f.x, load8(f.x, j) + load8(f.drift, j), j)
     if f.periodic == 0:
