@@ -21,8 +21,15 @@ from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
 from .design.models import STATES
 from .design.options import FilterConfig
-from .design.periodic import Schedule, compute_table_shape, count_ticks
-from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
+from .design.periodic import (
+    MARGINAL,
+    Schedule,
+    compute_table_shape,
+    count_ticks,
+    design_and_map,
+    find_unobservable,
+    spectral_radius,
+)
 from .protocol import Estimates, UnobservableWarning
 
 _T = TypeVar("_T")

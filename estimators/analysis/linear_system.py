@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...envs.record import Array
 from ..design.dual_rate import GAINS, RULES, SampledSystem, frame_map
 from ..design.kalman import check_covariance
-from ..design.stability import MARGINAL, find_unobservable, spectral_radius
+from ..design.periodic import MARGINAL, find_unobservable, spectral_radius
 from ..protocol import Estimates, UnobservableWarning
 
 

@@ -338,7 +338,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
-        C = build_measurement_rows(f, 0)
+        C = build_measurement_rows(f)
         zero = np.zeros((len(C), len(C)))
         f.inverse[: len(C), : f.total] = kalman_gain(np.eye(f.total), C, zero).T
     text = (
