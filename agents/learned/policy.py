@@ -65,8 +65,11 @@ class Card:
     the policy and of each controller beside it. Of a class of tasks also its costs by scenario."""
 
     def __post_init__(self) -> None:
-        pairs = self.observation
-        if not isinstance(pairs, list | tuple) or not all(map(_is_entry, pairs)):
+        pairs: Any = self.observation
+        rows = pairs if isinstance(pairs, list | tuple) else [None]
+        if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows) or not all(
+            isinstance(word, str) for row in rows for word in row
+        ):
             raise ValueError(f"observation is a list of (name, unit), got {pairs!r}")
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
@@ -152,11 +155,6 @@ def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap)
             f"estimator is a name, got the entry point {estimator!r}: "
             "sideslip.register_estimator gives it one"
         )
-
-
-def _is_entry(pair: Any) -> bool:
-    is_pair = isinstance(pair, list | tuple) and len(pair) == 2
-    return is_pair and all(isinstance(word, str) for word in pair)
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,11 @@ def _fit_model(
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
     count = sum(len(demo.costs) for demo in drives)
     length = sum(int(demo.is_valid.sum()) for demo in drives) / count  # steps, on average
-    zero_loss = sum(map(_compute_zero_loss, drives)) / count
+    zero_loss = 0.0  # of actions that are zero
+    for demo in drives:
+        losses = np.einsum("nti,ij,ntj->nt", demo.labels, demo.curvature, demo.labels)
+        zero_loss += float((losses * demo.weights).sum())
+    zero_loss /= count
     step, total, state = 0, 0.0, None
     for _ in range(epochs):
         total = 0.0
@@ -289,9 +293,3 @@ def _fit_model(
             step += 1
             total += float(added_cost.detach().sum())
     return total / count
-
-
-def _compute_zero_loss(demo: Demonstrations) -> float:
-    """Compute the loss of a student whose actions are zero, summed over episodes."""
-    losses = np.einsum("nti,ij,ntj->nt", demo.labels, demo.curvature, demo.labels)
-    return float((losses * demo.weights).sum())

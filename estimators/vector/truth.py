@@ -71,17 +71,9 @@ class TruthObservation(VectorObservation):
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
         return self._entries.append(obs, self._values, self._calibration, true_states)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a snapshot for `set_state`; TypeError where the env makes none."""
-        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
-        return super().get_state() | truth
+    def _get_memory(self) -> dict[str, Any]:
+        return {"values": self._values.copy(), "calibration": self._calibration.copy()}
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
-        super().set_state(snapshot)
+    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()
