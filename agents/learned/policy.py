@@ -66,7 +66,7 @@ class Card:
 
     def __post_init__(self) -> None:
         pairs: Any = self.observation
-        rows = pairs if isinstance(pairs, list | tuple) else [None]
+        rows: Any = pairs if isinstance(pairs, list | tuple) else [None]
         if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows) or not all(
             isinstance(word, str) for row in rows for word in row
         ):

@@ -93,14 +93,8 @@ class DualRate:
         self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
         self.shares, self.ratio, self._F, self._C = shares, int(ratio), F, measured
         self._check_stability(F, measured, allow_unstable)
-        table, upper = (
-            np.zeros((1 + (1 + q) * self.ratio, n + n * (n + 1) // 2)),
-            np.triu_indices(n),
-        )
-        system.write_shares(shares, table, 1 + self.ratio, n)
-        P = np.zeros((self.ratio, n, n))
-        P[:, upper[0], upper[1]] = table[1 : 1 + self.ratio, n:]
-        self._std = np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))  # after each step of a cycle
+        P = system.compute_covariances(shares)  # after each step of a cycle
+        self._std = np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
         self._start = np.zeros(n)
         self._start[:m] = _parse_vector("start", 0.0 if start is None else start, m)
         self.reset()

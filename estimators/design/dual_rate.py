@@ -117,18 +117,17 @@ class SampledSystem(NamedTuple):
                 break
         return shares
 
-    def write_shares(self, B: Array, table: Array, first: int, behind: int) -> None:
-        """Write B_i, and the covariances they lead to, into a table of gains.
+    def compute_covariances(self, B: Array) -> Array:
+        """Compute the error's covariances that B_i lead to: the limit of a long recursion.
 
         Args:
             B: B_i, shape (steps, n, q).
-            table: Output, shape (rows, columns).
-            first: Row at which B_i start.
-            behind: Column at which the covariances start.
+
+        Returns:
+            Covariances after each step, shape (steps, n, n).
         """
         steps, n, q = B.shape
-        table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-        upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
+        covariances = np.zeros((steps, n, n))
         P = np.zeros((n + q, n + q))  # of the error and the last innovation
         predict_map = np.eye(n + q)
         predict_map[:n, :n] = self.F
@@ -144,7 +143,8 @@ class SampledSystem(NamedTuple):
                 correct_map = np.eye(n + q)
                 correct_map[:n, n:] = -share
                 P = correct_map @ P @ correct_map.T
-                table[1 + i, behind:] = P[:n, :n][upper]
+                covariances[i] = P[:n, :n]
+        return covariances
 
 
 def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:

@@ -142,20 +142,26 @@ def _copy_gain(source: Vector, target: Vector, size: int) -> Scalar:
     return change
 
 
-def compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
-    """Compute the shape of a table of gains.
+def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
+    """Compute the shape of a table of gains: rows and columns."""
+    p, m = int(f.rows.max()), int(f.fasts)
+    extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
+    rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
+    return rows, int(f.total + f.n * (f.n + 1) // 2)
+
+
+def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
+    """Allocate empty tables of gains, one for each cell of speed.
 
     Args:
         f: Memory of the filter.
         schedule: Schedule of its slow sensor.
 
     Returns:
-        Rows and columns.
+        Zeros, shape (cells, rows, columns); (1, 1, 1) where gains come from P.
     """
-    p, m = int(f.rows.max()), int(f.fasts)
-    extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
-    rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
-    return rows, int(f.total + f.n * (f.n + 1) // 2)
+    cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
+    return np.zeros((cells, *_compute_table_shape(f, schedule)) if f.periodic else (1, 1, 1))
 
 
 def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> FilterRecords:
@@ -181,7 +187,7 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
         if f.pushed[i - f.dense] < 0:
             copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
     s = int(f.first_slow)
-    table = np.zeros(compute_table_shape(f, schedule))
+    table = np.zeros(_compute_table_shape(f, schedule))
     table[0, 0] = 1.0
     if f.between == DUAL_RATE or config.poles:
         reset_filters(filters, 0)
@@ -235,8 +241,10 @@ def _write_shares(
     system = SampledSystem(F, f.Q[:n, :n], C, R, schedule.period)
     poles = np.exp(np.array(config.poles) * float(f.step)) if config.poles else None
     B = system.compute_shares(config.intersample, config.gains, poles)
-    first = 1 + schedule.cycle + q * len(schedule.lags)
-    system.write_shares(B, table, first, total)
+    first, steps = 1 + schedule.cycle + q * len(schedule.lags), len(B)
+    table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
+    covariances, upper = system.compute_covariances(B), np.triu_indices(n)
+    table[1 : 1 + steps, total:] = covariances[:, upper[0], upper[1]]
 
 
 def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
