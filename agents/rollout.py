@@ -96,20 +96,6 @@ def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tu
     return costs, lengths
 
 
-def evaluate_costs(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> Array:
-    """Evaluate the cost J of each seed's first episode, shape (N,).
-
-    Args:
-        env: Vector env of N rows.
-        agent: Agent, as for `iterate_steps`.
-        seeds: N seeds.
-
-    Returns:
-        Costs in the order of the seeds.
-    """
-    return evaluate_episodes(env, agent, seeds)[0]
-
-
 def compute_cost_ratios(costs: Array, others: Array) -> Array:
     """Compute ratios of costs on the same seeds, each with `COST_FLOOR` added.
 
@@ -123,32 +109,30 @@ def compute_cost_ratios(costs: Array, others: Array) -> Array:
     return np.asarray((costs + COST_FLOOR) / (others + COST_FLOOR))
 
 
-_UNITS = {
-    "s": "t",
-    "rad": "beta psi beta_ref steer phi",
-    "rad/s": "gamma gamma_ref",
-    "N m": "yaw_moment",
-    "m/s": "v_x v_y",
-    "m": "y_l X Y",
+_INFO_UNITS = {
+    **{"t": "s", "gamma": "rad/s", "gamma_ref": "rad/s", "yaw_moment": "N m"},
+    **dict.fromkeys(("beta", "psi", "beta_ref", "steer", "phi"), "rad"),
+    **{"v_x": "m/s", "v_y": "m/s", "y_l": "m", "X": "m", "Y": "m"},
 }
-_INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """The true states in a log, named as estimators name them."""
 _DEGREES = 180.0 / np.pi
+_ESTIMATE, _REFERENCE = "estimate, 1 std", "reference"
 _ESTIMATE_COLOUR = "#56B4E9"
-_STYLES: dict[str, dict[str, str | float]] = {
-    "estimate, 1 std": {"color": _ESTIMATE_COLOUR, "lw": 1.0},
-    "reference": {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2},
+_STYLES: dict[str, dict[str, Any]] = {
+    _ESTIMATE: {"color": _ESTIMATE_COLOUR, "lw": 1.0},
+    _REFERENCE: {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2},
 }
-_TRUE_STYLE: dict[str, str | float] = {"color": "#000000", "lw": 1.4, "zorder": 3}
-_SIDESLIP = {"obs_beta_hat": "estimate, 1 std", "beta_ref": "reference", "beta": "true"}
-_PANELS: tuple[tuple[dict[str, str], str, float], ...] = (
-    (_SIDESLIP, "sideslip angle / deg", _DEGREES),
-    ({"gamma_ref": "reference", "gamma": "true"}, "yaw rate / (deg/s)", _DEGREES),
-    ({"yaw_moment": "delivered"}, "yaw moment / (N m)", 1.0),
-    ({"steer": "front wheels"}, "steering angle / deg", _DEGREES),
-)
-"""Panels: labels of the curves by column, label of the axis, and the factor to its unit."""
+_TRUE_STYLE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_PANELS = {  # labels of the curves by column, and the factor to the unit, by the axis's label
+    "sideslip angle / deg": (
+        {"obs_beta_hat": _ESTIMATE, "beta_ref": _REFERENCE, "beta": "true"},
+        _DEGREES,
+    ),
+    "yaw rate / (deg/s)": ({"gamma_ref": _REFERENCE, "gamma": "true"}, _DEGREES),
+    "yaw moment / (N m)": ({"yaw_moment": "delivered"}, 1.0),
+    "steering angle / deg": ({"steer": "front wheels"}, _DEGREES),
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -224,13 +208,12 @@ class Rollout:
         figure = Figure(figsize=(8.0, 7.0), layout="constrained")
         axes = figure.subplots(4, 1, sharex=True)
         t, columns = self.columns["t"], self.columns
-        for axis, (names, label, scale) in zip(axes, _PANELS, strict=True):
+        for axis, (label, (names, scale)) in zip(axes, _PANELS.items(), strict=True):
             for name, text in names.items():
                 # a task that judges the sideslip angle alone has no reference of the yaw rate
                 if name in columns and (name != "gamma_ref" or columns[name].any()):
-                    axis.plot(
-                        t, scale * columns[name], label=text, **_STYLES.get(text, _TRUE_STYLE)
-                    )
+                    style = _STYLES.get(text, _TRUE_STYLE)
+                    axis.plot(t, scale * columns[name], label=text, **style)
             if "obs_beta_hat" in names and {"obs_beta_hat", "obs_beta_std"} <= columns.keys():
                 estimate, std = columns["obs_beta_hat"], columns["obs_beta_std"]
                 low, high = (scale * (estimate + x * std) for x in (-1.0, 1.0))
@@ -275,7 +258,10 @@ def rollout(
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []
     for step in iterate_steps(env, agent, seed, options):
-        info = step.info | _get_motion(base)
+        motion = base.motion
+        info = step.info | {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
+        info["y_l"] = motion.y + base.vehicle.preview * (motion.psi - motion.theta)
+        info |= {"X": motion.X, "Y": motion.Y}  # y_l: tie-vision (4)
         info.pop("is_success", None)
         rows.append([*map(float, (*info.values(), step.reward, *step.action, *step.obs))])
         records.append(base.record)
@@ -283,23 +269,12 @@ def rollout(
     names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
     names += [f"obs_{entry.name}" for entry in layout]
     table = np.array(rows).T
-    units = {name: _find_unit(name) for name in names}
+    # wrappers may put a prefix before beta's estimates in `info`
+    estimates = {name: "rad" for name in names if name.endswith(("beta_hat", "beta_std"))}
+    units = {name: _INFO_UNITS.get(name, "-") for name in names} | estimates
     units |= {f"obs_{entry.name}": entry.unit for entry in layout}
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
     t = record.ticks * record.dt  # the truth between rows is interpolated
     truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}
     return Rollout(columns, units, Log(record, base.slow_sensors, truth, base.scenario.name))
-
-
-def _get_motion(base: Any) -> dict[str, float]:
-    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
-    motion = base.motion
-    y_l = motion.y + base.vehicle.preview * (motion.psi - motion.theta)  # tie-vision (4)
-    moved = {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
-    return moved | {"y_l": y_l, "X": motion.X, "Y": motion.Y}
-
-
-def _find_unit(name: str) -> str:
-    """Find the unit of a number of `info`; wrappers may put a prefix before beta's."""
-    return "rad" if name.endswith(("beta_hat", "beta_std")) else _INFO_UNITS.get(name, "-")

@@ -1,7 +1,7 @@
 """Stable-baselines3's `VecEnv` over the native vector env: one call for all rows."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import gymnasium as gym
 import numpy as np
@@ -96,9 +96,7 @@ class _VecEnvRow:
             )
         self._set[name] = value
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Start a new episode in this row alone; return observation (k,) and info."""
         mask = np.arange(self._env.num_envs) == self._i
         seeds: Any = [seed if is_row else None for is_row in mask]
@@ -134,28 +132,21 @@ EMPTY_INFO = _EmptyInfo()
 class _NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
-    It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
-    for bit, but for `infos`: where no episode ends it holds one empty dict that all rows share
-    (`EMPTY_INFO`, which refuses to be written into). Where one ends, its row has the whole info of
-    the last step, `terminal_observation` and `TimeLimit.truncated`. `reset_infos` are those of each
-    row's newest reset. `set_options` takes the options of a single env's `reset`, for all rows or a
-    list of them.
+    It equals its `DummyVecEnv` around single environments with the same seeds, bit for bit, but for
+    `infos`: where no episode ends it holds one empty dict that all rows share (`EMPTY_INFO`). Where
+    one ends, its row has the whole info of the last step, `terminal_observation` and
+    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset. `set_options` takes
+    the options of a single env's `reset`, for all rows or a list of them.
     """
 
     def __init__(self, vector_env: CarVectorEnv) -> None:
-        base = vector_env.unwrapped
-        if not isinstance(base, StabilityVectorEnv):
-            raise TypeError(
-                f"{type(base).__name__} is no native vector env of this package; for single "
-                "environments there is stable_baselines3.common.env_util.make_vec_env"
-            )
         mode = vector_env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(
                 "stable-baselines3 expects rows to be reset in the step that ends them: build the "
                 f"vector env with autoreset_mode='SameStep', not {mode}"
             )
-        self.vector_env, self._base = vector_env, base
+        self.vector_env, self._base = vector_env, cast("StabilityVectorEnv", vector_env.unwrapped)
         self._rows = [_VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
         self._actions: Any = None
         super().__init__(

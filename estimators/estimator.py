@@ -21,8 +21,15 @@ from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
 from .design.models import STATES
 from .design.options import FilterConfig
-from .design.periodic import Schedule, compute_table_shape, count_ticks
-from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
+from .design.periodic import (
+    MARGINAL,
+    Schedule,
+    allocate_gains,
+    count_ticks,
+    design_and_map,
+    find_unobservable,
+    spectral_radius,
+)
 from .protocol import Estimates, UnobservableWarning
 
 _T = TypeVar("_T")
@@ -102,10 +109,7 @@ class Estimator:
         self.units = tuple(STATES[state].unit for state in self.names)
         self.sensors = dict(config.sensors)
         self.filters, self._schedules = filters, schedules
-        f = self._f
-        cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
-        shape = (cells, *compute_table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
-        self.gains = np.zeros(shape)
+        self.gains = allocate_gains(self._f, schedules[-1])
         self.spectral_radius = 0.0
         self.unobservable: tuple[str, ...] = ()
         self.reset()

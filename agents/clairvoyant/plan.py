@@ -215,10 +215,7 @@ def _simulate_run(
 def _solve_ilqr(
     env: gym.Env[Actions, Actions], seed: int, start: npt.ArrayLike | None = None
 ) -> tuple[PlanRun, str]:
-    """Return the best run that the steps from a start lead to, and how they ended.
-
-    It is "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`).
-    """
+    """Return the best run of the steps from a start: "settled", "stuck" at first, or "stopped"."""
     env.reset(seed=seed)
     forecast = make_forecast(_get_base(env))
     shape = (forecast.fixed.periods, forecast.fixed.width)

@@ -160,6 +160,7 @@ class Lqr(Controller):
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
         rate = get_env_facts(env).moment_rate
+        self._steer_unit = self.authority  # of the added steering that is remembered
         self.remembered = 2 if rate > 0.0 else 0  # numbers at the end of the memory
         self.memory = self.width - 1 + self.remembered
         self.design_spec = DesignSpec(
@@ -172,11 +173,9 @@ class Lqr(Controller):
             check_positive("steer_weight", steer_weight),
             rate,
         )
-        fronts, rears = (
-            tuple((nominal_stiffness * np.geomspace(*span, knots)).tolist()) if stiffness else ()
-            for nominal_stiffness in (car.front_stiffness, car.rear_stiffness)
-        )
-        self._design_gains(car, fronts, rears)
+        factors = np.geomspace(*span, knots) if stiffness else np.zeros(0)
+        nominals = car.front_stiffness, car.rear_stiffness
+        self._design_gains(car, *(tuple((nominal * factors).tolist()) for nominal in nominals))
 
     def _design_gains(
         self, car: Vehicle, fronts: Sequence[float] = (), rears: Sequence[float] = ()
@@ -207,27 +206,25 @@ class Lqr(Controller):
         Returns:
             Gains on the states of the design.
         """
+        return self._interpolate(speed, front, rear)[:, : len(self.design_spec.states)]
+
+    def _interpolate(self, speed: float, front: float, rear: float) -> Array:
+        """Interpolate the table of [K S], shape (m, n + m)."""
         KS = np.empty(self.table.shape[3:])
         interpolate_gains(self.table, self.axes, float(speed), float(front), float(rear), KS)
-        return KS[:, : len(self.design_spec.states)]
+        return KS
 
     def curvature(self, speed: float) -> Array:
-        """Compute S, the weight of an action's error, shape (width, width).
-
-        An action that differs by e from the best one costs e' S e more. This holds while the car is
-        linear and no input is limited.
+        """Compute S, shape (width, width): an action that is off by e costs e' S e more, if linear.
 
         Args:
             speed: Speed (m/s).
 
         Returns:
-            The matrix S.
+            Weight of an action's error.
         """
-        KS = np.empty(self.table.shape[3:])
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
-        interpolate_gains(
-            self.table, self.axes, float(speed), car.front_stiffness, car.rear_stiffness, KS
-        )
+        KS = self._interpolate(speed, car.front_stiffness, car.rear_stiffness)
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
@@ -238,7 +235,7 @@ class Lqr(Controller):
             action: Action that the env gets, shape (N, width).
         """
         if self.width == 2:
-            state[:, 0] = action[:, 1] * self.authority
+            state[:, 0] = action[:, 1] * self._steer_unit
         if self.remembered:
             state[:, -1] = action[:, 0]
 

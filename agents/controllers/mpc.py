@@ -118,7 +118,7 @@ class Mpc(Lqr):
         self._osqp: Any = osqp
         known = osqp.SolverStatus
         self._accepted = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
-        self.horizon, self.iterations = horizon, iterations
+        self.horizon, self.iterations, self._steer_unit = horizon, iterations, 1.0
         period = max(self.control_period, MIN_STEP)
         self.prediction = dataclasses.replace(self.design_spec, period=period)
         self._shift = period == self.control_period
@@ -146,11 +146,6 @@ class Mpc(Lqr):
 
         self.__dict__.update(state | {"_osqp": osqp})
 
-    def _get_program(self, speed: float) -> _QuadraticProgram:
-        """Get the quadratic program of the nearest speed of `SPEEDS`."""
-        car, nearest = self.nominal, _find_nearest_speed(speed)
-        return _condense_program(car, nearest, self.prediction, self.horizon, self.authority)
-
     def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:
         for i in np.flatnonzero(rows):
             self.status[i] = NOT_FINITE
@@ -170,18 +165,6 @@ class Mpc(Lqr):
             self.status.append(status)
             self.solve_time.append(seconds)
 
-    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
-        """Note the added steering as a fraction of the authority, from which its rate counts.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
-        if self.width == 2:
-            state[:, 0] = action[:, 1]
-        if self.remembered:
-            state[:, -1] = action[:, 0]
-
     def _solve(
         self, speed: float, z: Array, memory: Array, row_action: Array, max_moment: float
     ) -> tuple[str, float]:
@@ -193,7 +176,7 @@ class Mpc(Lqr):
             low[count:], high[count:] = -self._change, self._change
             low[count] += memory[0]
             high[count] += memory[0]
-        program, solver = self._get_solver(_find_nearest_speed(speed))
+        program, solver = self._get_solver(float(min(SPEEDS, key=lambda knot: abs(knot - speed))))
         solver.update_settings(rho=_RHO)
         solver.update(q=program.F @ z, l=low, u=high)
         solver.warm_start(x=memory[self._primal], y=memory[self._dual])
@@ -217,7 +200,8 @@ class Mpc(Lqr):
     def _get_solver(self, speed: float) -> tuple[_QuadraticProgram, Any]:
         """Get the program of a speed of `SPEEDS` and its solver, set up at its first use."""
         if speed not in self._ready_for:
-            program, solver = self._get_program(speed), self._osqp.OSQP()
+            design = self.prediction, self.horizon, self.authority
+            program, solver = _condense_program(self.nominal, speed, *design), self._osqp.OSQP()
             solver.setup(
                 csc_matrix(np.triu(program.P)),
                 np.zeros(len(program.P)),
@@ -229,7 +213,3 @@ class Mpc(Lqr):
             )
             self._ready_for[speed] = program, solver
         return self._ready_for[speed]
-
-
-def _find_nearest_speed(speed: float) -> float:
-    return float(min(SPEEDS, key=lambda knot: abs(knot - speed)))

@@ -47,15 +47,6 @@ def _simulate_batch(task: PredictionTask, batch: PlanBatch) -> None:
 
 
 @jit
-def _sum_squares(residuals: Matrix, J: Vector) -> None:
-    """Fill J (count,) with the sums of the squared residuals."""
-    J[:] = 0.0
-    for r in range(len(residuals)):
-        for c in range(len(J)):
-            J[c] += residuals[r, c] * residuals[r, c]
-
-
-@jit
 def _compute_normal_equations(batch: PlanBatch, A: Matrix, g: Vector) -> None:
     """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences.
 
@@ -108,14 +99,6 @@ def _solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vecto
 
 
 @jit
-def _fill_perturbations(plan: Vector, batch: PlanBatch) -> None:
-    """Fill every column with the plan; a column perturbs one variable, the first none."""
-    for i in range(len(plan)):
-        batch.plans[i, :] = plan[i]
-        batch.perturbations[i, i + 1] = _DIFFERENCE
-
-
-@jit
 def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
     """Fill plans with the plan, the regulator's own (zeros), and steps of growing damping."""
     n, damping = len(plan), _MIN_DAMPING
@@ -151,13 +134,18 @@ def update_plan(
     A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):
-        _fill_perturbations(plan, batch)
+        for i in range(n):  # a column perturbs one variable, the first none
+            batch.plans[i, :] = plan[i]
+            batch.perturbations[i, i + 1] = _DIFFERENCE
         _simulate_batch(task, batch)
         _compute_normal_equations(batch, A, g)
         _fill_candidates(plan, A, g, batch.plans)
         batch.perturbations[:] = 0.0
         _simulate_batch(task, batch)
-        _sum_squares(batch.residuals, J)
+        J[:] = 0.0
+        for r in range(len(batch.residuals)):
+            for c in range(len(J)):
+                J[c] += batch.residuals[r, c] * batch.residuals[r, c]
         best, min_cost = 0, math.inf
         for c in range(_N_CANDIDATES):
             if J[c] < min_cost:

@@ -93,7 +93,7 @@ class MovingAverages:
         if self.weight_in.ndim != 2 or self.bias_in.shape != self.weight_in.shape[:1]:
             pair = self.weight_in.shape, self.bias_in.shape
             raise ValueError(f"traces have weights (units, inputs) and biases (units,), got {pair}")
-        if not 0 <= self.n_silu <= len(self.bias_in):
+        if self.n_silu not in range(len(self.bias_in) + 1):
             raise ValueError(f"of {len(self.bias_in)} units {self.n_silu} cannot be bent")
         if not self.times or not all(0.0 < time <= _MAX_TIME for time in self.times):
             raise ValueError(

@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ... import __version__
@@ -22,16 +24,13 @@ from ...estimators.registry import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env
-from .network import (
-    NO_MEMORY,
-    Network,
-    build_network,
-    parse_json_object,
-    read_tensors,
-)
+from .forward import CELL_WEIGHTS, MemoryLayer, MovingAverages, RecurrentCell
 from .network import SUFFIX as SUFFIX
+from .network import Network, Tensors
 
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
+MAX_BYTES = 2**26
+"""A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
 ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
 FOLDER = Path(__file__).resolve().with_name("policies")
 
@@ -66,8 +65,11 @@ class Card:
     the policy and of each controller beside it. Of a class of tasks also its costs by scenario."""
 
     def __post_init__(self) -> None:
-        pairs = self.observation
-        if not isinstance(pairs, list | tuple) or not all(map(_is_entry, pairs)):
+        pairs: Any = self.observation
+        rows: Any = pairs if isinstance(pairs, list | tuple) else [None]
+        if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows) or not all(
+            isinstance(word, str) for row in rows for word in row
+        ):
             raise ValueError(f"observation is a list of (name, unit), got {pairs!r}")
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
@@ -155,11 +157,6 @@ def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap)
         )
 
 
-def _is_entry(pair: Any) -> bool:
-    is_pair = isinstance(pair, list | tuple) and len(pair) == 2
-    return is_pair and all(isinstance(word, str) for word in pair)
-
-
 @dataclass(frozen=True)
 class Policy:
     """A network and its card."""
@@ -222,13 +219,16 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
     target = Path(path)
     if target.suffix != SUFFIX:
         raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
-    if len(card.observation) != network.inputs:
-        raise ValueError(
-            f"the card's observation has {len(card.observation)} entries, "
-            f"the network takes {network.inputs}"
-        )
+    _check_width(card, network)
     metadata = {"format": str(FORMAT), "card": card._to_json(network=network.description)}
     write_atomic(target, save(network.tensors, metadata))
+
+
+def _check_width(card: Card, network: Network) -> None:
+    if (count := len(card.observation)) != network.inputs:
+        raise ValueError(
+            f"the card's observation has {count} entries, the network takes {network.inputs}"
+        )
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -245,16 +245,15 @@ def load_policy(path: str | Path) -> Policy:
         ValueError: The file is no policy of a known format, or card and tensors do not fit.
     """
     file = _find_file(path)
-    tensors, metadata = read_tensors(file, "policy")
+    tensors, metadata = _read_tensors(file)
     try:
         fields = _read_card_fields(metadata)
-        observation = fields.get("observation")
-        if not isinstance(observation, list):
-            raise ValueError(f"the card's observation is a list, got {observation!r}")
-        network = build_network(fields.pop("network", None), len(observation), tensors)
-        return Policy(file.stem, network, from_json(Card, fields, "the card"))
+        network = _build_network(fields.pop("network", None), tensors)
+        card = from_json(Card, fields, "the card")
+        _check_width(card, network)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
+    return Policy(file.stem, network, card)
 
 
 def _find_file(path: str | Path) -> Path:
@@ -269,6 +268,18 @@ def _find_file(path: str | Path) -> Path:
     return file
 
 
+def _read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+    """Read tensors and metadata; ValueError for another file, or one larger than `MAX_BYTES`."""
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise ValueError(f"{path} has {size} bytes, a policy has at most {MAX_BYTES}")
+    try:
+        with safe_open(path, "numpy") as file:
+            metadata = file.metadata() or {}
+            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
+    except (SafetensorError, OSError, TypeError) as error:
+        raise ValueError(f"{path} is no safetensors file, or is cut short: {error}") from None
+
+
 def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     """Read the card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
@@ -279,10 +290,65 @@ def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
             f"the card has format {metadata['format'][:20]}, this sideslip reads "
             f"{' and '.join(known)}: another sideslip made it"
         )
-    fields = parse_json_object(metadata["card"])
+    try:
+        fields = json.loads(metadata["card"])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the card is no JSON: {error}") from None
+    if not isinstance(fields, dict):
+        raise ValueError(f"a card is a JSON object, got {type(fields).__name__}")
     if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
-        fields["network"] |= NO_MEMORY  # it has none
+        fields["network"] |= {"history": 1, "cells": []}  # it has no memory
     return fields
+
+
+_NETWORK = {"hidden", "activation", "output", "clip", "action_width", "history", "cells"}
+
+
+def _build_network(fields: Any, tensors: Tensors) -> Network:
+    """Build the network that a card describes; ValueError where card and tensors do not fit."""
+    if (
+        not isinstance(fields, dict)
+        or set(fields) != _NETWORK
+        or type(fields["history"]) is not int
+    ):
+        raise ValueError(f"the card's network holds {', '.join(sorted(_NETWORK))}, got {fields!r}")
+    for name, tensor in tensors.items():
+        kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
+        if tensor.dtype != kind or not tensor.size:  # an empty one would fit any size in the card
+            text = f"{tensor.size} numbers of {tensor.dtype}"
+            raise ValueError(f"tensor {name} holds {text}, not one or more of {kind}")
+    unused = dict(tensors)
+    try:
+        cells = [
+            _build_cell(f"cell_{i}_", *cell, unused=unused)
+            for i, cell in enumerate(fields["cells"])
+        ]
+        layers = range(len(fields["hidden"]) + 1)
+        network = Network(
+            unused.pop("mean"),
+            unused.pop("scale"),
+            [unused.pop(f"weight_{i}") for i in layers],
+            [unused.pop(f"bias_{i}") for i in layers],
+            **{name: fields[name] for name in ("activation", "output", "clip", "history")},
+            cells=cells,
+        )
+    except KeyError as error:
+        raise ValueError(f"the tensor {error} is missing") from None
+    except (TypeError, IndexError):
+        raise ValueError(f"the card's network has values of another kind: {fields!r}") from None
+    if unused:
+        raise ValueError(f"unexpected tensors: {', '.join(sorted(unused))}")
+    if network.description != fields:
+        raise ValueError(f"the card's network is {fields!r}, the tensors are of another one")
+    return network
+
+
+def _build_cell(prefix: str, kind: str, _: int, *traces: Any, unused: Tensors) -> MemoryLayer:
+    """Build a cell of its tensors, which are taken out of `unused`."""
+    is_average = kind == MovingAverages.kind
+    parts = MovingAverages.parts if is_average else CELL_WEIGHTS
+    arrays: list[Any] = [unused.pop(prefix + part) for part in parts]
+    return MovingAverages(*arrays, *traces) if is_average else RecurrentCell(kind, *arrays)
 
 
 class PolicyController(Controller):

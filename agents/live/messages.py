@@ -1,23 +1,11 @@
-"""The datagrams on a car's wires: their format, a decoder that raises nothing, and ticks of them.
+"""The datagrams on a car's wires: a decoder that raises nothing, and the ticks that they make.
 
-Network byte order: a header of 20 bytes, `count` doubles and, behind the estimates, names.
-
-| bytes | header |
-|---|---|
-| 0-3 | "SLIP" |
-| 4 | VERSION |
-| 5 | kind, of `DatagramKind` |
-| 6-7 | count, the doubles that follow |
-| 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
-| 12-19 | stamp, us of the inertial sender's clock, int64, 0 to 2^53; 0: of another clock |
-
-FIELDS names the doubles of each kind, in SI units but for STATUS, `LoopStatus`. ESTIMATE has the
-states' values, then their standard deviations, then their names as ASCII with commas between. A
+docs/live.md has their format: a HEADER in network byte order, `count` doubles of FIELDS in SI units
+(of ESTIMATE the states, then their standard deviations) and, behind estimates, the states' names. A
 change of any of it is another VERSION, but for STATUS, which no other program gets.
 
-A fast row is the doubles of INERTIAL: what the sensors that speak in every tick measured in one.
-Time is that of its stamps. It ends its tick; packets of slow sensors belong to the next row. They
-were captured their age before their stamp or, where that is 0, their age before that row.
+A fast row, an INERTIAL datagram, ends its tick; packets of slow sensors belong to the next row.
+They were captured their age before their stamp or, where that is 0, their age before that row.
 Lost and late datagrams are counted and bridged by the last row, held. Equal batches give equal
 ticks, so that a session can be replayed.
 """

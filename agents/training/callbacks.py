@@ -1,8 +1,5 @@
 """The callback of a training: evaluations on other seeds, the best policy, a checkpoint.
 
-The checkpoint is one file: tensors as safetensors, the rest as JSON beside them. Reading it runs
-no code, and a save that is stopped leaves the older file as it was.
-
 The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
 weighted by 1 over the uncontrolled car's cost, but at least 5 % of its mean over the scenarios.
 Where a training starts from a policy, each drive is weighted by 1 over that policy's cost in it.
@@ -23,7 +20,7 @@ from ...envs.numerics import require_extra
 from ...envs.record import Array
 from .. import zoo
 from ..learned.policy import Card, save_policy
-from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
+from ..rollout import compute_cost_ratios, evaluate_episodes
 from ..vec_env import make_native_env
 from .config import TrainingTask
 from .export import convert_sb3_policy
@@ -35,6 +32,7 @@ with require_extra("train", "training needs {}"):
     from safetensors import SafetensorError, safe_open
     from safetensors.torch import save
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import KVWriter
     from stable_baselines3.common.utils import get_device
 
 Checkpoint = Mapping[str, Any]
@@ -102,9 +100,8 @@ class RunOptions:
             known = "a device is cpu, cuda or another of torch's, or auto"
             raise ValueError(f"{known}, got {self.device!r}") from None
         if self.device.startswith("cuda") and device.type != "cuda":
-            raise ValueError(
-                f"torch finds no CUDA device, got {self.device!r}; auto takes one if there is"
-            )
+            text = f"got {self.device!r}; auto takes one if there is"
+            raise ValueError(f"torch finds no CUDA device, {text}")
 
 
 @dataclass(frozen=True)
@@ -147,14 +144,15 @@ class EvalCallback(BaseCallback):
         self.env = warm_start.env if warm_start else task.vector_env(task.n_eval_envs)
         self.evaluations = [Evaluation(*row) for row in (state or {}).get("evaluations", [])]
         self.scaling: StandardisedArguments | None = None
-        uncontrolled = self._average_scenarios(evaluate_costs(self.env, None, self.seeds))
+        self.writers: list[KVWriter] = []  # further ones of the log
+        uncontrolled = self._average_scenarios(evaluate_episodes(self.env, None, self.seeds)[0])
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
         self.weights = np.ones(1) if self.policy else _compute_scenario_weights(task)
         driver = warm_start.driver if warm_start else None
-        self.initial_costs = evaluate_costs(self.env, driver, self.seeds) if driver else None
+        self.initial_costs = evaluate_episodes(self.env, driver, self.seeds)[0] if driver else None
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
@@ -168,6 +166,9 @@ class EvalCallback(BaseCallback):
         """Average the costs of an evaluation by scenario, shape (k,)."""
         k = max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
+
+    def _on_training_start(self) -> None:
+        self.logger.output_formats += self.writers
 
     def _on_step(self) -> bool:
         return True

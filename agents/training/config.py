@@ -180,18 +180,17 @@ class TrainingTask:
         object.__setattr__(self, "num_envs", self.num_envs or settings["n_envs"])
         if self.seed < 0:
             raise ValueError(f"seed is at least 0, got {self.seed}")
-        for name in ("num_envs", "n_eval_envs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if self.estimator and self.algorithm.on_tensors:
             raise ValueError(f"{self.algo} reads sensors alone: no estimator runs on tensors")
         if self.estimator_options and not self.estimator:
             raise ValueError("options of an estimator need an estimator")
         for name in ("num_envs", "n_eval_envs"):
-            if getattr(self, name) < len(self.scenarios):
+            if (count := getattr(self, name)) < 1:
+                raise ValueError(f"{name} is at least 1, got {count}")
+            if count < len(self.scenarios):
                 raise ValueError(
                     f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
-                    f"scenarios take as many environments, got {name} {getattr(self, name)}"
+                    f"scenarios take as many environments, got {name} {count}"
                 )
         for i, scenario in enumerate(self.scenarios):
             try:

@@ -105,11 +105,9 @@ def _collect_demonstrations(
     noise: float,
     max_cost: float = np.inf,
 ) -> Demonstrations:
-    """Collect each seed's first episode, driven by a policy, or by the teacher with noise.
-
-    `noise` is the largest standard deviation of the noise on the teacher's actions. Episodes that
-    cost more than `max_cost` are weighted as if they cost that: failed ones keep their weight.
-    """
+    """Collect each seed's first episode, driven by a policy, or by the teacher with noise."""
+    # noise: largest standard deviation on the teacher's actions. Episodes that cost more than
+    # `max_cost` are weighted as if they cost that: failed ones keep their weight.
     cars, twins, teacher = task
     student = None if policy is None else PolicyController(cars, policy)
     rng = np.random.default_rng(seeds[0])
@@ -257,17 +255,18 @@ def _fit_model(
     config: DistillConfig,
     epochs: int,
 ) -> float:
-    """Fit a model to drives; FloatingPointError where the loss is not finite.
-
-    Returns what errors of the actions add to an episode's cost, as a fraction of it: the mean over
-    the episodes in the last epoch, without the auxiliary loss.
-    """
+    """Fit a model to drives; return what its errors add to an episode, as a share of its cost."""
+    # the mean over the episodes in the last epoch, without the auxiliary loss
     optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
     batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
     count = sum(len(demo.costs) for demo in drives)
     length = sum(int(demo.is_valid.sum()) for demo in drives) / count  # steps, on average
-    zero_loss = sum(map(_compute_zero_loss, drives)) / count
+    zero_loss = 0.0  # of actions that are zero
+    for demo in drives:
+        losses = np.einsum("nti,ij,ntj->nt", demo.labels, demo.curvature, demo.labels)
+        zero_loss += float((losses * demo.weights).sum())
+    zero_loss /= count
     step, total, state = 0, 0.0, None
     for _ in range(epochs):
         total = 0.0
@@ -294,9 +293,3 @@ def _fit_model(
             step += 1
             total += float(added_cost.detach().sum())
     return total / count
-
-
-def _compute_zero_loss(demo: Demonstrations) -> float:
-    """Compute the loss of a student whose actions are zero, summed over episodes."""
-    losses = np.einsum("nti,ij,ntj->nt", demo.labels, demo.curvature, demo.labels)
-    return float((losses * demo.weights).sum())

@@ -7,7 +7,7 @@ A zip holds pickles, and unpickling runs the code in them. So nothing is read wi
 import json
 import pickle
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -43,7 +43,7 @@ def convert_sb3_policy(
     """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
 
     Args:
-        model: Model or policy of a class in `_ACTORS`, with at most `Standardised` as extractor.
+        model: Model or policy of a class of `_POLICIES`, `Standardised` its extractor at most.
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
 
@@ -58,7 +58,7 @@ def convert_sb3_policy(
 
         from .normalise import Standardised, read_normalisation
     policy = getattr(model, "policy", model)
-    actor = _find_actor_reader(type(policy))(policy)
+    actor = _find_actor(policy)
     space = policy.action_space
     low, high = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
     if not (np.all(low == -1.0) and np.all(high == 1.0)):
@@ -95,44 +95,40 @@ class _Actor(NamedTuple):
     recurrent: "nn.RNNBase | None" = None
 
 
-def _find_on_policy_actor(policy: Any) -> _Actor:
-    layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
-    squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
-    return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
+_POLICIES = (
+    "stable_baselines3.common.policies.ActorCriticPolicy",
+    "stable_baselines3.sac.policies.SACPolicy",
+    "stable_baselines3.td3.policies.TD3Policy",
+    "sb3_contrib.tqc.policies.TQCPolicy",
+    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy",
+    f"{__package__}.gradient.GruPolicy",
+)
+"""Classes of policies; a subclass may compute anything and is none of them."""
 
 
-def _find_gaussian_actor(policy: Any) -> _Actor:
+def _check_known(kind: type) -> None:
+    """Check that a class of policies is one of `_POLICIES`; else ValueError."""
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    if name not in _POLICIES:
+        known = ", ".join(path.rpartition(".")[2] for path in _POLICIES)
+        raise ValueError(f"the actor of {name} is not known; known: {known}")
+
+
+def _find_actor(policy: Any) -> _Actor:
+    """Find the actor of a policy."""
+    _check_known(type(policy))
+    if hasattr(policy, "mlp_extractor"):  # on-policy
+        layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
+        squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
+        return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
+    if not hasattr(policy, "actor"):  # a `GruPolicy`
+        return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
     actor = policy.actor
+    if not hasattr(actor, "latent_pi"):  # a `TD3Policy`, whose tanh is a layer
+        return _Actor(list(actor.mu), False, actor.features_extractor)
     if actor.use_sde and actor.clip_mean > 0.0:
         raise ValueError("state-dependent exploration (gSDE) clips the mean: not known here")
     return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
-
-
-def _find_sequential_actor(policy: Any) -> _Actor:
-    """Find the actor of a `TD3Policy`, whose tanh is a layer, or of a `GruPolicy`."""
-    if hasattr(policy, "actor"):
-        return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)
-    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
-
-
-_ACTORS: dict[str, Callable[[Any], _Actor]] = {
-    "stable_baselines3.common.policies.ActorCriticPolicy": _find_on_policy_actor,
-    "stable_baselines3.sac.policies.SACPolicy": _find_gaussian_actor,
-    "stable_baselines3.td3.policies.TD3Policy": _find_sequential_actor,
-    "sb3_contrib.tqc.policies.TQCPolicy": _find_gaussian_actor,
-    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_on_policy_actor,
-    f"{__package__}.gradient.GruPolicy": _find_sequential_actor,
-}
-"""Readers of actors by the policy's class; a subclass may compute anything and is none of them."""
-
-
-def _find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
-    """Find the function that reads the actor of a class of policies."""
-    name = f"{kind.__module__}.{kind.__qualname__}"
-    if name not in _ACTORS:
-        known = ", ".join(path.rpartition(".")[2] for path in _ACTORS)
-        raise ValueError(f"the actor of {name} is not known; known: {known}")
-    return _ACTORS[name]
 
 
 def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
@@ -359,7 +355,7 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "Base
     options.pop("device", None)
     if not isinstance(kind, type):
         raise ValueError(f"{file}: its policy is of no class, but {kind!r}")
-    _find_actor_reader(kind)
+    _check_known(kind)
     if issubclass(kind, ActorCriticPolicy):
         options.setdefault("use_sde", bool(content.get("use_sde", False)))
     spaces = content["observation_space"], content["action_space"]

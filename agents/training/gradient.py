@@ -5,6 +5,7 @@ propagated back through all of it to the weights: truncated back-propagation thr
 the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,6 @@ import gymnasium as gym
 import numpy as np
 
 from .normalise import RewardScale, Standardised
-from .student import make_dense_layers
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -56,7 +56,10 @@ class GruPolicy(BasePolicy):
         super().__init__(observation_space, action_space, **options)
         self.features_extractor = self.make_features_extractor()
         self.cell = nn.GRU(self.features_extractor.features_dim, cells)
-        self.layers = make_dense_layers(cells, *net_arch, action_space.shape[0])
+        sizes, layers = (cells, *net_arch, action_space.shape[0]), list[nn.Module]()
+        for inputs, outputs in itertools.pairwise(sizes):
+            layers += [nn.Linear(inputs, outputs), nn.SiLU()]
+        self.layers = nn.Sequential(*layers[:-1])
         with torch.no_grad():
             last_weight = list(self.layers.parameters())[-2]
             last_weight.mul_(0.1)  # small first actions: random ones teach little

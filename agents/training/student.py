@@ -109,25 +109,15 @@ class Scaling(NamedTuple):
         return z if self.mixing is None else z @ self.mixing.astype(np.float32)
 
 
-def compute_scaling(
+def _compute_scaling(
     drives: Sequence[Demonstrations],
     layout: Sequence[ObservationEntry],
     needs: Sequence[str],
 ) -> Scaling:
-    """Compute the scaling of a student's inputs from drives.
-
-    A student that has all of `needs` reads nothing else, which would only be noise to it. One that
-    has less reads all that varies, but for `_UNREAD` and, behind a filter, what that has read. An
-    age is scaled by its variation while packets come.
-
-    Args:
-        drives: Demonstrations.
-        layout: Entries of the observation.
-        needs: Entries that the teacher reads.
-
-    Returns:
-        Mean and factor, shape (k,), and mixing, shape (k, k).
-    """
+    """Compute the scaling of a student's inputs from drives."""
+    # A student that has all of `needs` reads nothing else, which would only be noise to it. One
+    # that has less reads all that varies, but for `_UNREAD` and, behind a filter, what that has
+    # read. An age is scaled by its variation while packets come.
     x = np.concatenate([demo.obs[demo.is_valid] for demo in drives])
     names = [entry.name for entry in layout]
     is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, _UNREAD)
@@ -210,11 +200,8 @@ class _TraceLayer(nn.Module):
     def forward(
         self, z: torch.Tensor, state: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute units and averages (B, T, size) of inputs (B, T, k), and the next state.
-
-        Episodes begin together. The state holds averages and the number of steps, shape (B, times,
-        units + 1).
-        """
+        """Compute units and averages (B, T, size) of inputs (B, T, k); episodes begin together."""
+        # the state, which follows, has averages and the steps so far, (B, times, units + 1)
         u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
         if state is None:
             state = u.new_zeros(len(u), len(self.times), u.shape[-1] + 1)
@@ -249,10 +236,8 @@ class _TraceLayer(nn.Module):
         return MovingAverages(weights, bias, self.unit.out_features, self.times)
 
     def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
-        """Convert the next layer's weights (m, size) and biases (m,) for the output of `cell`.
-
-        That output is in the order of times, inputs before SiLU units, without whitening.
-        """
+        """Convert the next layer's weights (m, size) and biases (m,) for the output of `cell`."""
+        # that output is in the order of times, inputs before SiLU units, without whitening
         size, times = len(self.mean), 1 + len(self.times)
         linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
         bias = bias - linear @ self.mean.numpy()
@@ -264,12 +249,9 @@ class _TraceLayer(nn.Module):
 def _compute_weights(
     times: tuple[float, ...], first: int, steps: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T).
-
-    They solve the recursion m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share
-    a_t = max(1 / steps so far, 1 - exp(-1 / time)): u_s has the weight a_s prod (1 - a_r) over
-    r = s + 1, ..., t.
-    """
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
+    # They solve m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share a_t =
+    # max(1 / steps so far, 1 - exp(-1 / time)): u_s has a_s prod (1 - a_r), r = s + 1, ..., t.
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
     left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
@@ -277,21 +259,6 @@ def _compute_weights(
     new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
     new, old = new.astype(np.float32), np.exp(left).astype(np.float32)
     return torch.from_numpy(new), torch.from_numpy(old)
-
-
-def make_dense_layers(*sizes: int) -> nn.Sequential:
-    """Make dense layers with SiLU units between them.
-
-    Args:
-        sizes: Sizes of the inputs and of each layer.
-
-    Returns:
-        Layers, the last of which is linear.
-    """
-    layers: list[nn.Module] = []
-    for a, b in itertools.pairwise(sizes):
-        layers += [nn.Linear(a, b), nn.SiLU()]
-    return nn.Sequential(*layers[:-1])
 
 
 class Student(nn.Module):
@@ -358,7 +325,7 @@ class Student(nn.Module):
         Returns:
             Scaling of the inputs.
         """
-        scaling = compute_scaling(drives, layout, needs)
+        scaling = _compute_scaling(drives, layout, needs)
         if self.traces is not None:
             self.traces.fit_whitening(drives, scaling)
         return scaling

@@ -1,9 +1,8 @@
-"""Training of a policy: rollouts on the batch engine, evaluations on other seeds, a checkpoint.
+"""Training of a policy in a folder: rollouts on the batch engine, evaluations, a checkpoint.
 
-A training's folder holds `checkpoint.safetensors` (for `resume`), `policy.safetensors` (the
-network of the best evaluation, with its card), `best_model.zip` (the same model in
-stable-baselines3's format), `curve.jsonl` (the evaluations), and `begun_with.safetensors` where it
-started from a policy.
+The folder holds `checkpoint.safetensors` (for `resume`), `policy.safetensors` (the network of the
+best evaluation, with its card), `best_model.zip` (the same model in stable-baselines3's format),
+`curve.jsonl` (the evaluations), and `begun_with.safetensors` where it started from a policy.
 """
 
 import math
@@ -41,7 +40,6 @@ from .warm_start import WarmStart
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
-from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
@@ -169,10 +167,10 @@ class Trainer:
                 check_zip(Path(agent))
         if self.run_options.tensorboard_log is not None and find_spec("tensorboard") is None:
             raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-        self._trackers = list[_WandbCallback]()
-        if project := self.run_options.track:
-            name, config = self._folder.name, asdict(self.task)
-            self._trackers.append(_WandbCallback(project=project, name=name, config=config))
+        try:
+            self._wandb: Any = import_module("wandb") if self.run_options.track else None
+        except ImportError:
+            raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
         self._state: Checkpoint | None = None
         if self.resume:
@@ -195,19 +193,23 @@ class Trainer:
             save_policy(
                 self._folder / WARM_START_FILE, callback.policy.network, callback.policy.card
             )
-        model, callbacks = callback.model, [*self._trackers, callback]
+        model, run = callback.model, None
         done = model.num_timesteps
         if done < self.steps:
             log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=self.task.algo)
+            if self._wandb is not None:
+                project, config = self.run_options.track, asdict(self.task)
+                run = self._wandb.init(project=project, name=self._folder.name, config=config)
+                callback.writers.append(_RunWriter(run))
             try:
-                model.learn(self.steps - done, callback=callbacks, **log)
+                model.learn(self.steps - done, callback=callback, **log)
                 callback.evaluate()
             except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
                 callback.check()
                 raise
             finally:
-                for tracker in self._trackers:
-                    tracker.finish()
+                if run is not None:
+                    run.finish()
         return TrainResult(model, tuple(callback.evaluations))
 
     def build(self) -> EvalCallback:
@@ -268,11 +270,7 @@ def _make_source(
 
 
 def _measure_scaling(task: TrainingTask) -> StandardisedArguments:
-    """Measure the scaling of each entry under random actions.
-
-    An algorithm that follows gradients whitens the entries under actions that are correlated in
-    time.
-    """
+    """Measure each entry's scaling under random actions; for gradients it whitens them, too."""
     kwargs, env = task.settings.get("policy_kwargs", {}), task.vector_env(_SCALING_ENVS)
     spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
     names = [entry.name for entry in get_layout(env)]  # nominal cars may differ
@@ -315,11 +313,8 @@ def _collect_observations(
 
 
 def _measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) -> list[list[float]]:
-    """Measure the factors with which an agent's mean reward is -1, for each drive of each car.
-
-    `seed` is that of car 0, `steps` are those of each car. Behind a car's factors stands their
-    median, for all further drives.
-    """
+    """Measure the factors with which an agent's mean reward is -1, for each drive of each car."""
+    # seed: of car 0; steps: of each car. Their median stands behind a car's factors, for the rest.
     scales: list[list[float]] = [[] for _ in range(env.num_envs)]
     costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
     env.seed(seed)
@@ -338,31 +333,14 @@ def _measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) ->
     return scales
 
 
-class _WandbCallback(BaseCallback, KVWriter):
-    """Write the log of stable-baselines3 to a run of Weights & Biases."""
+class _RunWriter(KVWriter):
+    """Writes the log of stable-baselines3 to a run of Weights & Biases."""
 
-    def __init__(self, **run_arguments: object) -> None:
-        super().__init__()
-        try:
-            self._wandb: Any = import_module("wandb")
-        except ImportError:
-            raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
-        self._run_arguments = run_arguments
-        self._run: Any = None
-
-    def _on_training_start(self) -> None:
-        self._run = self._wandb.init(**self._run_arguments)
-        self.logger.output_formats.append(self)
-
-    def _on_step(self) -> bool:
-        return True
+    def __init__(self, run: Any) -> None:
+        self._run = run
 
     def write(self, key_values: dict[str, object], key_excluded: object, step: int = 0) -> None:
         self._run.log(dict(key_values), step=step)  # the logger empties its own
 
     def close(self) -> None:
         """Do nothing: the last evaluation comes after the training's end."""
-
-    def finish(self) -> None:
-        if self._run is not None:
-            self._run.finish()

@@ -1,9 +1,7 @@
 """The dual-rate estimator for any linear system: dual-rate (1)-(36) as the paper states it.
 
-    x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
-    x_d,k+1 = a_d x_d,k + u_d + w_d,k
-
-It runs on the compiled core of all filters, as its rule "dual-rate" with matrices as arguments.
+x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
+x_d,k+1 = a_d x_d,k + u_d + w_d,k
 """
 
 import warnings
@@ -12,19 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from ..core.filter import advance, process_packet_all, reset_filters
-from ..core.innovation import DUAL_RATE, IGNORE
-from ..core.model import LINEAR
-from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS, FilterRecords
+from ...envs.record import Array
 from ..design.dual_rate import GAINS, RULES, SampledSystem, frame_map
 from ..design.kalman import check_covariance
-from ..design.stability import MARGINAL, find_unobservable, spectral_radius
-from ..estimator import EMPTY, NO_NIS, compile_filter_call
+from ..design.periodic import MARGINAL, find_unobservable, spectral_radius
 from ..protocol import Estimates, UnobservableWarning
-
-_SENSOR = 0  # the place of the slow sensor in a filter's memory
-_NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
 class DualRate:
@@ -57,8 +47,7 @@ class DualRate:
         shares: L_{k+i} G_{k+i} of (14) and (19), shape (r, m + d, q).
 
     Raises:
-        ValueError: A wrong shape, a Q or R that is no covariance, more states, inputs or outputs
-            than a filter can have, poles that cannot be placed, an error that grows.
+        ValueError: A wrong shape, no covariance, poles that cannot be placed, a growing error.
     """
 
     def __init__(
@@ -82,15 +71,17 @@ class DualRate:
     ) -> None:
         a, b, c = (_parse_matrix(name, M) for name, M in zip("ABC", (A, B, C), strict=True))
         m, rows = len(a), _parse_disturbed(disturbed, len(a))
-        _check_sizes(a, b, c, len(rows))
+        if a.shape != (m, m) or len(b) != m or c.shape[1] != m:
+            shapes = f"{a.shape}, {b.shape}, {c.shape}"
+            raise ValueError(f"A, B and C have shapes (m, m), (m, p) and (q, m), got {shapes}")
         if not ratio >= 1 or int(ratio) != ratio:
             raise ValueError(f"ratio is a whole number of steps, at least 1, got {ratio!r}")
         n, d, q = m + len(rows), len(rows), len(c)
-        F, drift = np.zeros((n, n)), np.zeros(n)
-        F[:m, :m] = a
+        F, self._B, self._drift = np.zeros((n, n)), np.zeros((n, b.shape[1])), np.zeros(n)
+        F[:m, :m], self._B[:m] = a, b
         F[rows, range(m, n)] = 1.0  # (5)
         F[m:, m:] = _parse_square("leak", leak, d)  # (11)
-        drift[m:] = _parse_vector("rate", rate, d)
+        self._drift[m:] = _parse_vector("rate", rate, d)
         noise = np.zeros((n, n))
         noise[:m, :m] = _parse_covariance("Q", Q, m)  # (12)
         noise[m:, m:] = _parse_covariance("Q_d", Q_d, d)
@@ -100,14 +91,12 @@ class DualRate:
         with np.errstate(invalid="ignore", over="ignore"):
             shares = system.compute_shares(intersample, gains, placed)
         self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
-        self.shares, self.ratio, self.inputs = shares, int(ratio), b.shape[1]
+        self.shares, self.ratio, self._F, self._C = shares, int(ratio), F, measured
         self._check_stability(F, measured, allow_unstable)
-        self.gains = np.zeros((1, 1 + q + (1 + q) * self.ratio, n + n * (n + 1) // 2))
-        self.gains[0, 0, 0] = 1.0
-        system.write_shares(shares, self.gains[0], 1 + q + self.ratio, n)
+        P = system.compute_covariances(shares)  # after each step of a cycle
+        self._std = np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
         self._start = np.zeros(n)
         self._start[:m] = _parse_vector("start", 0.0 if start is None else start, m)
-        self._filters = _make_record(F, b, drift, measured, self.ratio)
         self.reset()
 
     def _check_stability(self, F: Array, C: Array, allow_unstable: bool) -> None:
@@ -128,16 +117,8 @@ class DualRate:
 
     def reset(self) -> None:
         """Reset to k = 0, before the first sample."""
-        self._filter_anew(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
-
-    def _filter_anew(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
-        reset_filters(self._filters, 0)
-        self._filters[0].x[: len(self.names)] = self._start
-        self._take(fast, packets, X, S)
-
-    def _take(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
-        record = fast, len(fast), packets, len(packets)
-        compile_filter_call(advance)(self._filters, self.gains, *record, 0, X, S, NO_NIS)
+        self.x, self.k = self._start.copy(), 0
+        self._innovation, self._since = np.zeros(len(self._C)), self.ratio  # steps since a sample
 
     def step(self, u: npt.ArrayLike) -> None:
         """Step from k to k+1: dual-rate (17), (19).
@@ -145,9 +126,11 @@ class DualRate:
         Args:
             u: Input of the step, shape (p,).
         """
-        fast = np.zeros((1, FAST_WIDTH))
-        fast[0, : self.inputs] = _parse_vector("u", u, self.inputs)
-        self._take(fast, _NO_PACKETS)
+        u = _parse_vector("u", u, self._B.shape[1])
+        self.x = self._F @ self.x + self._B @ u + self._drift
+        self.k, self._since = self.k + 1, self._since + 1
+        if self._since < self.ratio:
+            self.x = self.x + self.shares[self._since] @ self._innovation
 
     def update(self, y: npt.ArrayLike) -> None:
         """Correct by the sample of this k, a multiple of r: dual-rate (13).
@@ -158,15 +141,13 @@ class DualRate:
         Raises:
             ValueError: Another k, or a second sample.
         """
-        f = self._filters[0]
-        if f.tick % self.ratio:
-            raise ValueError(f"a sample comes every {self.ratio} steps, this is step {f.tick}")
-        if f.since == 0:
-            raise ValueError(f"step {f.tick} has had its sample")
-        packet, q = np.zeros(PACKET_WIDTH), int(f.rows[_SENSOR])
-        packet[: PACKET.value] = _SENSOR, self.k, self.k, 1.0, 0.0
-        packet[PACKET.value : PACKET.value + q] = _parse_vector("y", y, q)
-        compile_filter_call(process_packet_all)(self._filters, self.gains, packet)
+        if self.k % self.ratio:
+            raise ValueError(f"a sample comes every {self.ratio} steps, this is step {self.k}")
+        if self._since == 0:
+            raise ValueError(f"step {self.k} has had its sample")
+        self._innovation = _parse_vector("y", y, len(self._C)) - self._C @ self.x
+        self._since = 0
+        self.x = self.x + self.shares[0] @ self._innovation
 
     def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
         """Reset, then filter inputs and samples of k = 0, r, 2 r, ...
@@ -182,33 +163,24 @@ class DualRate:
             ValueError: Other shapes or an infinite number.
         """
         u, y = np.array(U, np.float64), np.array(Y, np.float64)
-        q = int(self._filters[0].rows[_SENSOR])
+        p, q = self._B.shape[1], len(self._C)
         u = u.reshape(len(u), -1) if u.ndim else u
         y = y.reshape(len(y), -1) if y.ndim else y
-        if u.ndim != 2 or u.shape[1] != self.inputs or not np.isfinite(u).all():
-            raise ValueError(f"U is finite and has shape (K, {self.inputs}), got {np.shape(U)}")
+        if u.ndim != 2 or u.shape[1] != p or not np.isfinite(u).all():
+            raise ValueError(f"U is finite and has shape (K, {p}), got {np.shape(U)}")
         count = len(u) // self.ratio + 1
         if y.shape != (count, q) or np.isinf(y).any():
             raise ValueError(f"Y is finite or NaN and has shape ({count}, {q}), got {np.shape(Y)}")
-        fast, packets = np.zeros((len(u) + 1, FAST_WIDTH)), np.zeros((count, PACKET_WIDTH))
-        fast[1:, : self.inputs] = u
-        packets[:, PACKET.captured] = packets[:, PACKET.arrived] = np.arange(count) * self.ratio
-        packets[:, PACKET.quality] = 1.0
-        packets[:, PACKET.value : PACKET.value + q] = y
-        is_present = ~np.isnan(y).any(axis=1)
-        X, S = (np.empty((len(fast), len(self.names))) for _ in range(2))
-        self._filter_anew(fast, np.ascontiguousarray(packets[is_present]), X, S)
-        return Estimates(np.arange(float(len(fast))), X, S, self.names, np.full(count, np.nan))
-
-    @property
-    def x(self) -> Array:
-        """Present state with x_d, shape (m + d,)."""
-        return np.array(self._filters[0].x[: len(self.names)])
-
-    @property
-    def k(self) -> int:
-        """Present step k."""
-        return int(self._filters[0].tick)
+        self.reset()
+        X = np.empty((len(u) + 1, len(self.names)))
+        for k in range(len(X)):
+            if k % self.ratio == 0 and not np.isnan(y[k // self.ratio]).any():
+                self.update(y[k // self.ratio])
+            X[k] = self.x
+            if k < len(u):
+                self.step(u[k])
+        S = self._std[np.arange(len(X)) % self.ratio]
+        return Estimates(np.arange(float(len(X))), X, S, self.names, np.full(count, np.nan))
 
 
 def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
@@ -217,18 +189,6 @@ def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
     if len(set(chosen)) != len(chosen) or any(not 0 <= row < m for row in chosen):
         raise ValueError(f"disturbed holds different rows from 0 to {m - 1}, got {rows!r}")
     return chosen
-
-
-def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
-    """Check that shapes fit each other and a filter's memory; else ValueError."""
-    m, shapes = len(A), f"{A.shape}, {B.shape}, {C.shape}"
-    if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
-        raise ValueError(f"A, B and C have shapes (m, m), (m, p) and (q, m), got {shapes}")
-    names = "states with their disturbances", "inputs", "outputs"
-    sizes = zip(names, (m + d, B.shape[1], len(C)), (N_CORE, N_INPUTS, N_ROWS), strict=True)
-    for label, count, max_count in sizes:
-        if count > max_count:
-            raise ValueError(f"{count} {label} are more than a filter can have ({max_count})")
 
 
 def _parse_poles(
@@ -248,24 +208,6 @@ def _parse_poles(
     if placed.shape != (n,) or not np.isfinite(placed).all():
         raise ValueError(f"{n} states need {n} finite poles, got {poles!r}")
     return placed
-
-
-def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> FilterRecords:
-    """Make the filter's memory: every state is dense, the slow sensor is the first."""
-    filters = np.zeros(1, FILTER).view(np.recarray)
-    f, n, q, p = filters[0], len(F), len(C), B.shape[1]
-    f.kind, f.n, f.total, f.dense, f.step, f.relax = LINEAR, n, n, n, 1.0, 1.0
-    f.G[:n, :n], f.H[: len(B), :p], f.drift[:n] = F, B, drift
-    f.inputs = p
-    f.u_column[:p, 0] = range(p)
-    f.u_factor[:p, 0] = 1.0
-    f.first_slow = _SENSOR
-    f.rows[_SENSOR], f.C[_SENSOR, :q, :n] = q, C
-    f.period[_SENSOR] = f.cycle = ratio
-    f.stride = f.pace = f.pattern = f.periodic = 1
-    f.late, f.between, f.speed_state = IGNORE, DUAL_RATE, -1
-    f.speed = 1.0  # no vehicle: any
-    return filters
 
 
 def _parse_matrix(name: str, value: npt.ArrayLike) -> Array:

@@ -41,21 +41,14 @@ _SPEED_STEP = 1e-4  # relative, of a difference by speed
 _TOLERANCE = 1e-6  # of a singular value where the largest is about 1, what counts as zero
 
 
-class UnobservableSubspace(NamedTuple):
+class _UnobservableSubspace(NamedTuple):
     """Initial states that no measurement shows."""
 
     names: tuple[str, ...]  # of the n states
     basis: Array  # (n, k), columns, in the states' units
 
     def is_observable(self, name: str) -> bool:
-        """Return whether a state is the same in all that the sensors cannot tell apart.
-
-        Args:
-            name: Name of the state.
-
-        Returns:
-            True for a state that is seen.
-        """
+        """Return whether a state is the same in all that the sensors cannot tell apart."""
         return not np.abs(self.basis[self.names.index(name)]).any()
 
 
@@ -66,27 +59,14 @@ class _DiscreteModel(NamedTuple):
     is_ground: Array  # (m,), 1 for a direction over the ground
 
 
-def find_unobservable_subspace(
+def _find_unobservable_subspace(
     sensors: tuple[str, ...],
     unknowns: tuple[str, ...],
     steer: float = 0.0,
     vehicle: Vehicle = COMS,
     speed: float = 7.0,
-) -> UnobservableSubspace:
-    """Find the unobservable directions of exact-kf's model with some unknown constants.
-
-    Source: Kalman's decomposition, by orthonormal bases.
-
-    Args:
-        sensors: "gyro", and any of "accel_y", "camera", "gps" and `GPS_SPEED`.
-        unknowns: Names of `UNKNOWNS`.
-        steer: Steering angle of the steady turn that is driven (rad).
-        vehicle: Vehicle of the model.
-        speed: Speed (m/s).
-
-    Returns:
-        Names of the states and the directions.
-    """
+) -> _UnobservableSubspace:
+    """Find the unobservable directions of exact-kf's model with unknown constants (Kalman)."""
     names, rows, sd, is_ground = _build_model(sensors, unknowns, vehicle, speed)
     n = len(names)
     A, C = rows[:n, :n], rows[n:, :n]
@@ -112,7 +92,7 @@ def find_unobservable_subspace(
     if _ROAD in names:
         basis = basis @ _find_kernel(basis[-1:])
     basis = np.where(np.abs(basis) > _TOLERANCE, basis, 0.0)
-    return UnobservableSubspace(names, sd[:, None] * basis)
+    return _UnobservableSubspace(names, sd[:, None] * basis)
 
 
 def make_observability_table(vehicle: Vehicle = COMS, speed: float = 7.0) -> list[dict[str, str]]:
@@ -130,9 +110,9 @@ def make_observability_table(vehicle: Vehicle = COMS, speed: float = 7.0) -> lis
     for slow, fast, (drive, steer) in itertools.product(_SLOW, _FAST, _DRIVES.items()):
         sensors, line = fast + slow, dict.fromkeys(UNKNOWNS, "")
         unknowns = tuple(name for name in UNKNOWNS if _NEEDS.get(name, "gyro") in sensors)
-        whole = find_unobservable_subspace(sensors, unknowns, steer, vehicle, speed)
+        whole = _find_unobservable_subspace(sensors, unknowns, steer, vehicle, speed)
         for name in unknowns:
-            single = find_unobservable_subspace(sensors, (name,), steer, vehicle, speed)
+            single = _find_unobservable_subspace(sensors, (name,), steer, vehicle, speed)
             is_alone = "alone" if single.is_observable(name) else "no"
             line[name] = "yes" if whole.is_observable(name) else is_alone
         lines.append({"sensors": ", ".join(sensors), "drive": drive} | line)

@@ -114,11 +114,7 @@ def _filter_forwards(
     nis: Vector,
     block: _FilteredBlock,
 ) -> int:
-    """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `position` on.
-
-    Packets that arrive by the rows' end are taken; returns the packets done. nis (count,): of the
-    packets used. block: filled.
-    """
+    """Filter fast rows, and packets from `position` on that arrive by then; return those done."""
     n, dense = f.n, f.dense
     F, before, x, P = block
     for j in range(len(fast)):

@@ -164,12 +164,9 @@ def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
 def _update_second_layer(
     first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
 ) -> None:
-    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
-
-    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
-    captured tick. The variance of v_x is sigma_V^2 times the squared factor of the HDOP; that of
-    v_y is (V sigma_beta)^2 + (sigma_V sin(beta))^2, in (m/s)^2.
-    """
+    """Correct the second layer by a packet as a velocity: double-layer-gps (8)-(9)."""
+    # v_x = V cos(beta), v_y = V sin(beta), with beta as it was predicted for the captured tick;
+    # their variances: (sigma_V hdop)^2 and (V sigma_beta)^2 + (sigma_V hdop sin(beta))^2, (m/s)^2
     s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
     beta = first.x[BETA]
     if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:

@@ -148,8 +148,7 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
         captured: Captured tick of the sample.
 
     Returns:
-        Index of its first clone, DIRECT for the states, STORED_ONE for what else was stored at its
-        capture, or DROPPED (and counted).
+        Index of its first clone; DIRECT, STORED_ONE, or DROPPED (and counted).
     """
     if is_duplicate(f, s, captured):
         return DROPPED
@@ -294,14 +293,8 @@ def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
 
 
 @jit
-def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
-    """Add a variance to a state, now and in what was captured of it.
-
-    Args:
-        f: Memory of the filter.
-        state: Index of the state.
-        variance: Variance in the state's unit squared.
-    """
+def _inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
+    """Add a variance (the state's unit squared) to a state, now and in what was captured of it."""
     v = f.PC
     for i in range(f.total):
         v[i] = 0.0
@@ -328,7 +321,7 @@ def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
             if f.C[s, i, k] != 0.0:
                 state = k
         if not _is_observed_elsewhere(f, s, state):
-            inflate_covariance(f, state, f.residual[i] * f.residual[i])
+            _inflate_covariance(f, state, f.residual[i] * f.residual[i])
             has_reset = True
     return has_reset
 

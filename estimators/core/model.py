@@ -9,15 +9,15 @@ columns beside them, and the rest is a known push. `design.periodic` has the tab
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, absolute, maximum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
-LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
-"""Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
+LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES = range(6)
+"""Kinds of models."""
 BETA, GAMMA, PSI, Y_L = range(4)
 """Places of a bicycle's states."""
 CURVATURE = 2
@@ -55,16 +55,13 @@ def _build_lateral(f: FilterRecord, V: Scalar) -> None:
 
 @jit
 def is_steering_felt(V: Scalar) -> Scalar:
-    """Return whether the model lets the offset of the steering sensor act.
-
-    A standing car's wheels turn without effect, which would be taken for an offset. The margin is
-    more than the speed may move without a new model.
+    """Return whether the model lets the steering offset act: a standing car's wheels turn in vain.
 
     Args:
         V: Speed of the model (m/s).
 
     Returns:
-        True above walking pace.
+        True above walking pace, by more than the speed moves without a new model.
     """
     return V * (1.0 - 2.0 * SPEED_TOLERANCE) > MIN_SPEED
 
@@ -256,15 +253,14 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     if f.kind == LATERAL and f.model_speed > 0.0:
         f.stretch *= f.model_speed / V
     f.model_speed, f.turning = V, turning
-    if f.kind != LINEAR:
-        _build_continuous(f, V, turning)
-        discretise(f)
-        first = f.dense - f.delayed
-        for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
-            for j in range(f.n):
-                f.G[first + i, j] = 0.0
-            f.G[first + i, PSI + i] = f.relax
-            f.G[first + i, first + i] = 1.0 - f.relax
+    _build_continuous(f, V, turning)
+    discretise(f)
+    first = f.dense - f.delayed
+    for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
+        for j in range(f.n):
+            f.G[first + i, j] = 0.0
+        f.G[first + i, PSI + i] = f.relax
+        f.G[first + i, first + i] = 1.0 - f.relax
     for i in range(f.dense):
         for k in range(f.n):
             store_element(f.GT, load_element(f.G, i, k), k, i)
@@ -273,45 +269,6 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     for s in range(N_SLOW):
         for i in range(f.rows[s]):
             f.r[s, i] = compute_row_variance(f, s, i, V)
-
-
-_MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its stiffness
-
-
-@jit
-def compute_axle_force(
-    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
-) -> tuple[Scalar, ...]:
-    """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
-
-    F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
-    linear. Source: Pacejka, Tire and Vehicle Dynamics, 3.
-
-    Args:
-        stiffness: Nominal cornering stiffness of the axle, C (N/rad).
-        load: Load of the axle, F_z (N).
-        alpha: Slip angle (rad).
-        factor: Factor on the stiffness, s.
-        grip: Reciprocal of friction.
-
-    Returns:
-        (F, dF/dalpha, dF/dfactor, dF/dgrip) in N, N/rad, N and N.
-    """
-    total_stiffness = stiffness * factor
-    slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
-    z = minimum(slip_ratio * grip, 1.0)
-    saturation = 1.0 - z + z * z * (1.0 / 3.0)
-    if z >= 1.0:  # it slides: |F| = F_z / grip
-        force = load / grip if alpha > 0.0 else 0.0 - load / grip
-        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / grip
-    slope = (1.0 - z) * (1.0 - z)
-    grip_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
-    return (
-        total_stiffness * alpha * saturation,
-        maximum(slope, _MIN_SLOPE) * total_stiffness,
-        stiffness * alpha * slope,
-        grip_slope,
-    )
 
 
 MAX_NUMBER = 1e15  # bound of the numbers that a filter takes: whole floats below are exact as int

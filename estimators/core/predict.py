@@ -13,12 +13,10 @@ from .model import (
     BETA,
     CURVATURE,
     KINEMATIC,
-    LINEAR,
     MIN_SPEED,
     SPEED_TOLERANCE,
     VELOCITY_ROLL,
     build_model,
-    compute_axle_force,
     is_finite,
     is_steering_felt,
 )
@@ -27,6 +25,7 @@ from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 _FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
 _MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
+_MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its stiffness
 
 
 @jit
@@ -141,6 +140,30 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
 
 
 @jit
+def _compute_axle_force(
+    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
+) -> tuple[Scalar, ...]:
+    """Compute an axle's force (N) and its slopes by alpha, factor, grip: Fiala, friction 1/grip."""
+    # F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 linear.
+    # stiffness: C (N/rad), load: F_z (N) of the axle. Source: Pacejka, Tire and Vehicle Dynamics, 3
+    total_stiffness = stiffness * factor
+    slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
+    z = minimum(slip_ratio * grip, 1.0)
+    saturation = 1.0 - z + z * z * (1.0 / 3.0)
+    if z >= 1.0:  # it slides: |F| = F_z / grip
+        force = load / grip if alpha > 0.0 else 0.0 - load / grip
+        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / grip
+    slope = (1.0 - z) * (1.0 - z)
+    grip_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
+    return (
+        total_stiffness * alpha * saturation,
+        maximum(slope, _MIN_SLOPE) * total_stiffness,
+        stiffness * alpha * slope,
+        grip_slope,
+    )
+
+
+@jit
 def linearise(f: FilterRecord, steer: Scalar) -> None:
     """Expand both axles' forces at the present state.
 
@@ -171,7 +194,7 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
         factor = x[f.tyres + i]
-        force, slope, per_factor, per_grip = compute_axle_force(
+        force, slope, per_factor, per_grip = _compute_axle_force(
             f.stiffness[i], f.load[i], alpha, factor, grip
         )
         f.car[CAR.front_stiffness + i] = 0.5 * slope
@@ -215,7 +238,7 @@ def propagate(f: FilterRecord, u: Vector) -> None:
         for k in range(f.inputs):
             total = total + load_element(u, k) * load8(f.HT, k, j)
         store8(f.x, total, j)
-    if f.kind == LINEAR or f.tyres > 0:
+    if f.tyres > 0:
         for j in range(0, f.n, step):
             store8(f.x, load8(f.x, j) + load8(f.drift, j), j)
     if f.periodic == 0:

@@ -112,7 +112,7 @@ _FIELDS = [
     ("push", _FLOAT, (N_CORE,)),  # what `rest` adds to dx
     ("G", _FLOAT, (N_CORE, N_CORE)),  # tie-vision (9), rows of the dense states
     ("H", _FLOAT, (N_CORE, N_INPUTS)),
-    ("drift", _FLOAT, (N_CORE,)),  # known part of a step, dual-rate (7) u_d, or of tyres
+    ("drift", _FLOAT, (N_CORE,)),  # known part of a step, of tyres
     ("decay", _FLOAT, (N_CORE,)),  # fraction of a state that is left after a step
     ("GT", _FLOAT, (N_CORE, N_CORE)),  # G and H transposed; zeros beyond the dense states
     ("HT", _FLOAT, (N_INPUTS, N_CORE)),

@@ -47,10 +47,7 @@ def _locate_step_row(f: FilterRecord) -> Scalar:
 
 @jit
 def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Scalar:
-    """Locate the gain of sensor s's first row for a frame.
-
-    Behind the last frame, at `f.pattern`, stand the gains of the rule between samples.
-    """
+    """Locate the gain of sensor s's first row for a frame, or, at f.pattern, between samples."""
     return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]
 
 
@@ -63,10 +60,7 @@ def _add_gain(f: FilterRecord, gains: GainTables, row: int, residual: float) -> 
 
 @jit
 def _correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
-
-    The rows of K^T, then of the inverse's transpose, stand behind those of the steps and frames.
-    """
+    """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals."""
     x, e, N, m = f.x, f.e, f.total, f.fasts
     first_row = _locate_frame_row(f, s, f.pattern)
     for i in range(m):
@@ -98,10 +92,7 @@ def _correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 @jit
 def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """Correct by a sample as `_correct_sample` does, with the covariance's gain of this packet.
-
-    The gain is split evenly over a period. first: what the sample measures, see `find_clone`.
-    """
+    """Correct as `_correct_sample`, with this packet's gain, split evenly over a period."""
     m, N, rows = f.fasts, f.total, f.rows[s]
     steps = f.period[s] // f.stride
     for i in range(rows):
@@ -228,11 +219,9 @@ def update_filter(
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         s: Index of the slow sensor.
-        first: Index in f.x of the clone of the sample's first row; negative without one, see
-            `find_clone`.
+        first: Clone of the sample's first row, or negative, as of `find_clone`.
         packet: Packet, shape (PACKET_WIDTH,).
-        is_gated: Whether the gate judges it and its NIS is taken; not when it is used again in a
-            rewound window.
+        is_gated: Whether the gate judges it and its NIS is taken: not once more when rewound.
 
     Returns:
         False if the gate refuses it.
@@ -294,8 +283,7 @@ def is_healthy(f: FilterRecord) -> Scalar:
         f: Memory of the filter.
 
     Returns:
-        False for a filter that is lost, or whose car reverses, which the model does not know; True
-        for one whose noise is fixed, which keeps no account.
+        False if it is lost or the car reverses; True where noise is fixed, without an account.
     """
     is_known = f.speed > 0.0 - MIN_SPEED or f.r_share == 0.0
     return is_known and compute_excess(f) < 1.0
@@ -307,12 +295,9 @@ FIRST_VARIANCE = 100.0
 
 @jit
 def _find_variance(f: FilterRecord, i: int, residual: float, projected: Scalar) -> None:
-    """Find the variance of fast row i from the mean innovation of blocks.
-
-    Of n rows of white noise of variance r a block's mean has r / n; of noise that is coloured, as
-    vibration is, it has more, and n times that is the variance which a filter has to assume of
-    rows that it takes for independent. `projected` is C P C^T, which is no noise.
-    """
+    """Find the variance of fast row i from blocks' mean innovations; `projected` is C P C^T."""
+    # The mean of n rows of white noise has r / n. Coloured noise, as vibration, has more: n times
+    # that is the variance which a filter assumes of rows that it takes for independent.
     f.block_sum[i] += residual
     if f.block_rows + 1 < f.block:
         return

@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ...envs.record import Array
+from ...envs.record import FAST, PACKET, Array
 from ...envs.sensors.link import SlowSensor
-from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.sensors.slow import SLOW, SLOW_NAMES
 from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import innovation as rule
@@ -16,7 +16,7 @@ from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from . import models
 from .kalman import kalman_gain
-from .models import TYRES, FilterModel, find_packet_column
+from .models import TYRES, FilterModel
 from .options import FilterConfig
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
@@ -237,11 +237,21 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
         f.first[f.grip] = 1.0 / vehicle.friction
 
 
+def _make_signals(vehicle: Vehicle) -> dict[str, tuple[tuple[int, float], tuple[int, float]]]:
+    """Make the sums of two columns of a fast row: two pairs (column, factor) by name."""
+    arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
+    single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer", "curvature")
+    return {name: ((getattr(FAST, name), 1.0), (getattr(FAST, name), 0.0)) for name in single} | {
+        "N_z": ((FAST.torque_right, arm), (FAST.torque_left, -arm)),
+        "wheel": ((FAST.wheel_left, 0.5), (FAST.wheel_right, 0.5)),
+    }
+
+
 def _write_signals(
     f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
 ) -> None:
     """Write inputs and fast measurements; `build_model` writes rows that depend on speed."""
-    table, names = models.make_signals(vehicle), model.names
+    table, names = _make_signals(vehicle), model.names
     f.inputs, f.fasts = len(model.inputs), len(model.fast)
     for i, name in enumerate(model.inputs):
         f.u_column[i], f.u_factor[i] = zip(*table[name], strict=True)
@@ -271,9 +281,9 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
         is_second_layer = model.kind == VELOCITY_ROLL
         rows = sensor.velocities if is_second_layer else sensor.rows
         f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
-        f.hdop_column[s] = find_packet_column(name, "hdop")
-        f.satellites_column[s] = find_packet_column(name, "satellites")
-        f.speed_column[s] = find_packet_column(name, "speed")
+        for place, value in enumerate(SLOW[s].values, PACKET.value):
+            if value.name in ("hdop", "satellites", "speed"):
+                f[f"{value.name}_column"][s] = place
         for i, row in enumerate(rows):
             f.angle[s, i], f.ground[s, i] = row.angle, row.ground
             f.r[s, i] = config.noise[row.noise] ** 2
@@ -328,7 +338,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
-        C = build_measurement_rows(f, 0)
+        C = build_measurement_rows(f)
         zero = np.zeros((len(C), len(C)))
         f.inverse[: len(C), : f.total] = kalman_gain(np.eye(f.total), C, zero).T
     text = (

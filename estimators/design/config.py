@@ -162,7 +162,10 @@ def parse_config(
         chosen |= reader.read("force_sd", "moment_sd", "disturbance_time", "moment_time")
     Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
-    chosen |= reader.read(*_NUMBERS) | _parse_gate(chosen["delay"], reader)
+    count = int(reader.read("wary")["wary"])
+    wary = count if chosen["delay"] in ("clone", "buffer") else 0
+    chosen |= reader.read(*_NUMBERS) | {"wary": wary}
+    chosen |= reader.read("gate", default=_GATE_PROBABILITY if wary else None)
     chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
     prior = _parse_prior(states, first.forces, chosen, reader)
     reader.check_unread()
@@ -281,13 +284,6 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
             key = f"{name}_time"
             times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
     return {"fast": fast, "bias_sds": biases, "bias_times": times}
-
-
-def _parse_gate(delay: str, reader: _Reader) -> _Values:
-    """Parse `gate` and `wary`."""
-    count = int(reader.read("wary")["wary"])
-    wary = count if delay in ("clone", "buffer") else 0
-    return reader.read("gate", default=_GATE_PROBABILITY if wary else None) | {"wary": wary}
 
 
 def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]:

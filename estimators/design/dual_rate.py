@@ -73,11 +73,8 @@ class SampledSystem(NamedTuple):
         return K
 
     def _compute_hold_shares(self, K: Array) -> Array:
-        """Compute Hara's B_i = L for all i, shape (steps, n, q): the innovation is held.
-
-        L gives the error from sample to sample its poles and its very map:
-        F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
-        """
+        """Compute Hara's B_i = L for all i, (steps, n, q), with poles and map of the sampled K."""
+        # the innovation is held: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C)
         power, total = np.eye(len(self.F)), np.zeros_like(self.F)
         for _ in range(self.steps):
             power = self.F @ power
@@ -120,18 +117,17 @@ class SampledSystem(NamedTuple):
                 break
         return shares
 
-    def write_shares(self, B: Array, table: Array, first: int, behind: int) -> None:
-        """Write B_i, and the covariances they lead to, into a table of gains.
+    def compute_covariances(self, B: Array) -> Array:
+        """Compute the error's covariances that B_i lead to: the limit of a long recursion.
 
         Args:
             B: B_i, shape (steps, n, q).
-            table: Output, shape (rows, columns).
-            first: Row at which B_i start.
-            behind: Column at which the covariances start.
+
+        Returns:
+            Covariances after each step, shape (steps, n, n).
         """
         steps, n, q = B.shape
-        table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-        upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
+        covariances = np.zeros((steps, n, n))
         P = np.zeros((n + q, n + q))  # of the error and the last innovation
         predict_map = np.eye(n + q)
         predict_map[:n, :n] = self.F
@@ -147,7 +143,8 @@ class SampledSystem(NamedTuple):
                 correct_map = np.eye(n + q)
                 correct_map[:n, n:] = -share
                 P = correct_map @ P @ correct_map.T
-                table[1 + i, behind:] = P[:n, :n][upper]
+                covariances[i] = P[:n, :n]
+        return covariances
 
 
 def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:

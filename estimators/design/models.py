@@ -11,9 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.record import FAST, PACKET
-from ...envs.sensors.slow import SLOW, SLOW_NAMES
-from ...envs.vehicle.parameters import Vehicle
 from ..core.model import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
 
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
@@ -53,20 +50,6 @@ MEASUREMENTS: dict[str, Measurement] = {
     ),
 }
 """What each slow sensor measures, by its name."""
-
-
-def find_packet_column(sensor: str, value: str) -> int:
-    """Find the column of a sensor's packets that holds a value.
-
-    Args:
-        sensor: Name of the slow sensor.
-        value: Name of the value.
-
-    Returns:
-        Index of the column; 0 where the sensor sends none of that name.
-    """
-    names = [field.name for field in SLOW[SLOW_NAMES.index(sensor)].values]
-    return PACKET.value + names.index(value) if value in names else 0
 
 
 class StateInfo(NamedTuple):
@@ -118,8 +101,8 @@ class FilterModel:
 
     kind: int  # code of `core.model`
     states: tuple[str, ...]  # those that follow the model
-    inputs: tuple[str, ...] = ("steer", "N_z")  # names of `make_signals`
-    fast: tuple[str, ...] = ("gyro",)  # names of `make_signals` that are measured in every row
+    inputs: tuple[str, ...] = ("steer", "N_z")  # columns of a fast row, or sums of two
+    fast: tuple[str, ...] = ("gyro",)  # likewise, measured in every row
     disturbances: tuple[tuple[str, str], ...] = ()  # states behind them, and what each one pushes
     forces: bool = False  # disturbances are an Ornstein-Uhlenbeck force and moment instead
     late: tuple[str, ...] = ()  # states that lag behind the camera's (tie-vision (12))
@@ -173,26 +156,6 @@ MODELS: dict[str, FilterModel] = {
 """Models other than the bicycle's, by name."""
 
 LATE = {"psi": "psi_late", "y_l": "y_l_late"}
-
-Signal = tuple[tuple[int, float], tuple[int, float]]
-
-
-def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
-    """Make the sums of two columns of a fast row.
-
-    Args:
-        vehicle: Vehicle with the wheels' radius and track.
-
-    Returns:
-        Two pairs (column, factor) by name.
-    """
-    arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
-    single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer", "curvature")
-    table: dict[str, Signal] = {
-        name: ((getattr(FAST, name), 1.0), (getattr(FAST, name), 0.0)) for name in single
-    }
-    table["N_z"] = ((FAST.torque_right, arm), (FAST.torque_left, -arm))
-    return table | {"wheel": ((FAST.wheel_left, 0.5), (FAST.wheel_right, 0.5))}
 
 
 def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:

@@ -5,20 +5,35 @@ row; for each step of the cycle a row for every fast measurement (one where ther
 each frame of the pattern a row for every slow row. Pseudo-residuals add K^T and the transposed
 inverse, dual-rate rules a fraction of the innovation for each step. Behind the gains of a step
 stands the upper half of the states' covariance after it.
+
+Without noise the estimation error after a cycle is a matrix times the error before it. Its
+spectral radius decides: above one the filter diverges; at one it has an unobservable direction.
 """
 
+import pickle
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
-from ...envs.record import Array
+from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.covariance import correct_scalar, project_row
-from ..core.filter import reset_filters, run_tick
-from ..core.innovation import CLONE, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
-from ..core.record import FilterRecord, FilterRecords, GainTables
+from ..core.filter import advance, reset_filters, run_tick
+from ..core.innovation import (
+    CLONE,
+    CONSTANT,
+    DROPPED,
+    DUAL_RATE,
+    IGNORE,
+    NONE,
+    PSEUDO,
+    STORED,
+    find_clone,
+)
+from ..core.record import FILTER, WINDOW, FilterRecord, FilterRecords, GainTables
 from .dual_rate import SampledSystem
 from .kalman import compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
@@ -59,24 +74,14 @@ class Schedule:
         """Steps after which everything repeats, the slots of the clones included."""
         return self.period * max(1, len(self.lags))
 
-    def find_arriving(self, step: int) -> list[int]:
-        """Find the frames that arrive in a step of the cycle.
-
-        Args:
-            step: Step within the cycle.
-
-        Returns:
-            Indices of the frames.
-        """
-        arrival_steps = ((i * self.period + lag) % self.cycle for i, lag in enumerate(self.lags))
-        return [i for i, arrival_step in enumerate(arrival_steps) if arrival_step == step]
-
 
 NO_SENSOR = Schedule(1, ())
 
 _GAIN_TOLERANCE = 1e-12  # relative change of a settled gain in a cycle
 _CHECK_TOLERANCE = 1e-6  # the same, of a filter that is only checked: it has gains of its own
 _MAX_RECURSION = 600.0  # s of driving after which the recursion ends in any case
+MARGINAL = 1e-9  # below 1, an eigenvalue's magnitude from which on an error stays
+_SMALL = 2.0**-10  # an error whose angles need no wrapping
 _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
 
 
@@ -90,11 +95,9 @@ def _iterate_gains(
     before: Vector,
     gains: GainTables,
 ) -> int:
-    """Run a covariance filter over its schedule until its gains settle; return the cycles used.
-
-    Outputs: `table` (rows, columns), and `before` (total, total), the covariance before the last
-    frame. lags (pattern,): steps from capture to arrival.
-    """
+    """Run a covariance filter over its schedule until its gains settle; return the cycles used."""
+    # filled: table (rows, columns), and before (total, total), the covariance before the last
+    # frame; lags (pattern,): steps from capture to arrival
     f = filters[0]
     reset_filters(filters, 0)
     n, N, cycle, width, s = f.n, f.total, f.cycle, maximum(f.fasts, 1), f.first_slow
@@ -139,51 +142,52 @@ def _copy_gain(source: Vector, target: Vector, size: int) -> Scalar:
     return change
 
 
-def compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
-    """Compute the shape of a table of gains.
-
-    Args:
-        f: Memory of the filter.
-        schedule: Schedule of its slow sensor.
-
-    Returns:
-        Rows and columns.
-    """
+def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
+    """Compute the shape of a table of gains: rows and columns."""
     p, m = int(f.rows.max()), int(f.fasts)
     extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
     rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
     return rows, int(f.total + f.n * (f.n + 1) // 2)
 
 
-def design_gains(
-    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
-) -> tuple[Array, FilterRecord]:
-    """Design the table of gains at a speed.
+def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
+    """Allocate empty tables of gains, one for each cell of speed.
 
     Args:
-        f: Memory of the filter, left as it is.
+        f: Memory of the filter.
         schedule: Schedule of its slow sensor.
-        speed: Speed (m/s).
-        config: Parsed options of the filter.
 
     Returns:
-        Table, shape (rows, columns), and the memory with the G and the C_fast of this speed.
+        Zeros, shape (cells, rows, columns); (1, 1, 1) where gains come from P.
     """
-    record: FilterRecord = np.array([f]).view(np.recarray)[0]
+    cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
+    return np.zeros((cells, *_compute_table_shape(f, schedule)) if f.periodic else (1, 1, 1))
+
+
+def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> FilterRecords:
+    """Copy a filter (1,) as one that takes steps of a schedule at a held speed, gains from P."""
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
     copy.pace = 1 if f.stride > 1 else f.pace
     copy.stride, copy.speed = 1, speed
     copy.late = CLONE if f.late == CLONE else IGNORE
+    copy.frames[:] = f.frames * (f.late == CLONE)  # other rules have no clones
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
+    return filters
+
+
+def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig) -> Array:
+    """Design the table of gains (rows, columns) of a filter at a speed (m/s)."""
+    filters = _copy_for_schedule(f, schedule, speed)
+    copy = filters.view(np.recarray)[0]
     for i in range(int(f.dense), int(f.n)):  # a bias that never moves has no settled gain
         if f.pushed[i - f.dense] < 0:
             copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
     s = int(f.first_slow)
-    table = np.zeros(compute_table_shape(f, schedule))
+    table = np.zeros(_compute_table_shape(f, schedule))
     table[0, 0] = 1.0
     if f.between == DUAL_RATE or config.poles:
         reset_filters(filters, 0)
@@ -199,23 +203,18 @@ def design_gains(
         tolerance = _GAIN_TOLERANCE if f.periodic else _CHECK_TOLERANCE
         _iterate_gains(filters, lags, cycles, tolerance, table, before, np.zeros((1, 1, 1)))
         if f.between == PSEUDO:
-            C = build_measurement_rows(f, 0)
+            C = build_measurement_rows(f)
             R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
             inverse = compute_inverse(config.inverse, C, before, R)
             _write_pseudo_gains(copy, schedule, table, inverse)
-    record.G[:], record.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
-    return table, record
+    return table
 
 
-def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
-    """Build C over states and clones: the fast rows, then the slow rows of a frame.
-
-    A frame without lag, or where there are no clones, measures the states.
+def build_measurement_rows(f: FilterRecord) -> Array:
+    """Build C over states and clones: the fast rows, then the slow ones, of first clones if any.
 
     Args:
         f: Memory of the filter.
-        frame: Index of the frame in the pattern.
-        lag: Steps from its capture to its arrival.
 
     Returns:
         Measurement matrix, shape (m + p, total).
@@ -224,8 +223,8 @@ def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
     p = int(f.rows[s]) if s >= 0 else 0
     C = np.zeros((m + p, int(f.total)))
     C[:m, : f.n] = f.C_fast[:m, : f.n]
-    if s >= 0 and f.late == CLONE and f.frames[s] > 0 and lag > 0:
-        first = int(f.first_clone[s]) + frame % int(f.frames[s]) * p
+    if s >= 0 and f.late == CLONE and f.frames[s] > 0:
+        first = int(f.first_clone[s])
         C[m:, first : first + p] = np.eye(p)
     elif s >= 0:
         C[m:, : f.n] = f.C[s, :p, : f.n]
@@ -242,8 +241,10 @@ def _write_shares(
     system = SampledSystem(F, f.Q[:n, :n], C, R, schedule.period)
     poles = np.exp(np.array(config.poles) * float(f.step)) if config.poles else None
     B = system.compute_shares(config.intersample, config.gains, poles)
-    first = 1 + schedule.cycle + q * len(schedule.lags)
-    system.write_shares(B, table, first, total)
+    first, steps = 1 + schedule.cycle + q * len(schedule.lags), len(B)
+    table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
+    covariances, upper = system.compute_covariances(B), np.triu_indices(n)
+    table[1 : 1 + steps, total:] = covariances[:, upper[0], upper[1]]
 
 
 def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
@@ -264,7 +265,7 @@ def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inver
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
     first = 1 + cycle * width + p * frames
     frame_gains = table[1 + cycle * width : first, :total].reshape(frames, p, total)
-    C = build_measurement_rows(f, 0)[m:]
+    C = build_measurement_rows(f)[m:]
     slow = np.mean([_combine_gains(gains, C) for gains in frame_gains], axis=0)
     fast = table[1 : 1 + cycle * width, :total].reshape(cycle, width, total)[:, :m]
     # every step corrects by a pseudo-residual, so each takes its even fraction of the slow gain
@@ -280,3 +281,119 @@ def _combine_gains(K: Array, C: Array) -> Array:
         joint[:i] -= np.outer(joint[:i] @ C[i], K[i])
         joint[i] = K[i]
     return joint
+
+
+@lru_cache(maxsize=512)  # the same filter drives in many envs
+def _design_cached(key: bytes) -> tuple[Array, Array]:
+    memory, schedule, speed, config = pickle.loads(key)
+    f = np.frombuffer(memory, FILTER).view(np.recarray)[0]
+    table = _design_gains(f, schedule, speed, config)
+    return table, _compute_error_map(f, table, schedule, speed)
+
+
+def design_and_map(
+    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
+) -> tuple[Array, Array]:
+    """Design the table of gains and the map of the error at a speed; both are read-only.
+
+    Args:
+        f: Memory of the filter, left as it is.
+        schedule: Schedule of its slow sensor.
+        speed: Speed (m/s).
+        config: Parsed options of the filter.
+
+    Returns:
+        Table, shape (rows, columns), and map from the error before a cycle to that after it.
+    """
+    return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
+
+
+def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed: float) -> Array:
+    """Compute the map (size, size) of the error over a cycle by what the compiled filter does.
+
+    Behind the error of the states stands what else a rule carries on: the estimated error e, clones
+    or predictions of the captures under way. A column is what becomes of a small error there, where
+    all that is measured is zero.
+    """
+    cycle, period, lags = schedule.cycle, schedule.period, schedule.lags
+    filters = _copy_for_schedule(f, schedule, speed)
+    g = filters.view(np.recarray)[0]
+    g.late = f.late if f.late in (CLONE, STORED, CONSTANT) else IGNORE
+    g.between, g.periodic, g.joint = f.between, 1, int(f.joint or f.between == PSEUDO)
+    latest, g.heading_fix[:] = max(lags, default=0), 0
+    g.assumed, g.spacing, g.wary, g.speed_state = latest, 0.0, 0, -1
+    reset_filters(filters, 0)
+    start = (latest // cycle + 1) * cycle  # until then the first samples arrive
+    captured = np.arange(0, start + cycle, period) if lags else np.zeros(0)
+    packets = np.zeros((len(captured), PACKET_WIDTH))
+    packets[:, PACKET.sensor], packets[:, PACKET.captured] = f.first_slow, captured
+    packets[:, PACKET.arrived] = captured + np.resize(lags, len(captured))
+    packets[:, PACKET.quality] = 1.0
+    packets = packets[np.argsort(packets[:, PACKET.arrived], kind="stable")]
+
+    def run(first: int, ticks: int) -> None:
+        arrived, empty = packets[:, PACKET.arrived], np.zeros((0, 0))
+        due = packets[(arrived >= first) & (arrived < first + ticks)]
+        record = np.zeros((ticks, FAST_WIDTH)), ticks, due, len(due), 0
+        advance(filters, table[None], *record, empty, empty, np.zeros(0))
+
+    def list_errors(tick: int) -> list[Array]:
+        """List what holds an error before a tick's step, as views of the filter's memory."""
+        spans, vectors = [slice(0, f.n)], (g.x, g.e) if f.between == PSEUDO else (g.x,)
+        if f.late == CLONE and lags:
+            s, p = int(f.first_slow), int(f.rows[f.first_slow])
+            is_carried = (g.stamp[s, : f.frames[s]] >= 0) | (
+                f.between == PSEUDO
+            )  # e's is read later
+            firsts = f.first_clone[s] + p * np.flatnonzero(is_carried)
+            spans += [slice(first, first + p) for first in firsts]
+        late = latest // period if f.late in (STORED, CONSTANT) else 0
+        captures = [(tick - i * period) % WINDOW for i in range(1, late + 1)]
+        parts = [vector[span] for vector in vectors for span in spans]
+        return parts + [g.predicted[row, : f.n] for row in captures]
+
+    run(0, start)
+    memory, columns = filters.copy(), []
+    for part in range(len(list_errors(start))):
+        for i in range(len(list_errors(start)[part])):
+            filters[:] = memory
+            list_errors(start)[part][i] = _SMALL
+            run(start, cycle)
+            columns.append(np.concatenate(list_errors(start + cycle)) / _SMALL)
+    return np.array(columns).T
+
+
+def spectral_radius(M: Array) -> float:
+    """Compute the spectral radius, the largest absolute eigenvalue.
+
+    Args:
+        M: Matrix, shape (n, n).
+
+    Returns:
+        The radius.
+    """
+    return float(np.abs(np.linalg.eigvals(M)).max())
+
+
+def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Find the directions in which an error stays for ever.
+
+    Args:
+        M: Map of the error over a cycle, shape (size, size).
+        names: Names of the states, the first rows of M.
+
+    Returns:
+        Text of each, "beta 1, psi -1, ...".
+    """
+    values, vectors = np.linalg.eig(M)
+    directions = []
+    for i in np.flatnonzero(np.abs(values) > 1.0 - MARGINAL):
+        v = np.real(vectors[: len(names), i])
+        largest = np.abs(v).max()
+        if largest == 0.0:  # of a clone alone
+            continue
+        leading = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
+        parts = zip(names, v / leading, strict=True)
+        terms = (f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
+        directions.append(", ".join(terms))
+    return tuple(directions)

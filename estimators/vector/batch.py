@@ -9,19 +9,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.numerics.simd8 import allocate_aligned
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
-from ...envs.sensors.link import SlowSensor
-from ..core.record import FILTER, SkipCounters
+from ...envs.record import Array
+from ..core.record import FILTER
 from ..estimator import Estimator
-from ..protocol import Estimates
+from ..filters import FILTERS
+from ..make import make_estimator
+from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import Observed, StepRecord, write_outputs
 from .lane_ticks import FilterBank
-from .lanes import compile_observe_batch, make_blocks, make_empty_outputs
-from .records import IntArray
+from .lanes import compile_observe_batch, make_blocks
 
 Build = Callable[..., AnyEstimator]
-Sensors = Mapping[str, SlowSensor]
+_Mask = npt.NDArray[np.bool_]
 
 
 class _GainPool:
@@ -70,7 +70,7 @@ class _GainPool:
 
 
 class BatchEstimator:
-    """N filters of one name in one compiled call; built by `make_batch`.
+    """N filters of one name in one compiled call.
 
     `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. Filters of equal
     specs, but for the phases of clocks, share one table of gains. ValueError says that the filters
@@ -144,76 +144,16 @@ class BatchEstimator:
                 f"{', '.join(self.names)} and row {i} {', '.join(names)}"
             )
 
-    def reset(
-        self,
-        mask: npt.ArrayLike | None = None,
-        sensors: Sensors | Sequence[Sensors] | None = None,
-        first: int = 0,
-    ) -> None:
-        """Reset the filters of a mask, see `Estimator.reset`.
+    def reset(self, mask: _Mask) -> None:
+        """Reset some filters to the clocks of their specs.
 
         Args:
-            mask: Filters to reset, bool, shape (N,); None resets all.
-            sensors: Slow sensors whose clocks have a new phase, of all filters or a list (N,).
-            first: Tick of the next fast row.
+            mask: Filters to reset, bool, shape (N,).
         """
-        for i in _parse_mask(mask, len(self)):
-            row_sensors = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
-            self[i].reset(row_sensors, first)
+        for i in np.flatnonzero(mask).tolist():
+            self[i].reset()
 
-    def step(
-        self,
-        fast: Array,
-        packets: Array,
-        counts: npt.ArrayLike | None = None,
-        rows: npt.ArrayLike | None = None,
-    ) -> None:
-        """Process each filter's fast rows and packets; a filter with none of either stands still.
-
-        ValueError says that an array has another shape or a count is out of range.
-
-        Args:
-            fast: Fast rows, shape (N, k, FAST_WIDTH).
-            packets: Packets, shape (N, capacity, PACKET_WIDTH).
-            counts: Number of packets of each filter, shape (N,); None takes all.
-            rows: Number of fast rows of each filter, shape (N,); None takes all.
-        """
-        N = len(self)
-        fast = np.ascontiguousarray(fast, np.float64)
-        packets = np.ascontiguousarray(packets, np.float64)
-        _check_shape("fast rows", fast, N, FAST_WIDTH)
-        _check_shape("packets", packets, N, PACKET_WIDTH)
-        rows = _parse_counts("rows", rows, N, fast.shape[1])
-        counts = _parse_counts("counts", counts, N, packets.shape[1])
-        self.take(None, StepRecord(fast, rows, packets, counts), self._empty_outputs)
-
-    @property
-    def _bank(self) -> FilterBank:
-        return FilterBank(self.filters, self._designs.pool, self._places)
-
-    @functools.cached_property
-    def _empty_outputs(self) -> Observed:
-        return make_empty_outputs(len(self))
-
-    def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
-        """Run each filter on a record of its own, see `Estimator.run`.
-
-        Args:
-            sources: Records or logs, N of them.
-
-        Returns:
-            Estimates of each filter.
-
-        Raises:
-            ValueError: There are more or fewer records than filters.
-        """
-        if len(sources) != len(self):
-            raise ValueError(f"{self.name}: {len(self)} filters, got {len(sources)} records")
-        return [self[i].run(source) for i, source in enumerate(sources)]
-
-    def take(
-        self, mask: npt.NDArray[np.bool_] | None, record: StepRecord, observed: Observed
-    ) -> None:
+    def take(self, mask: _Mask | None, record: StepRecord, observed: Observed) -> None:
         """Process rows and packets of some filters and write their outputs.
 
         Args:
@@ -222,8 +162,8 @@ class BatchEstimator:
             observed: Observations and outputs of N cars.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, record.rows)
-        arguments = done, self._lanes, record, observed
-        while compile_observe_batch()(self._bank, *arguments) > 0:
+        bank = FilterBank(self.filters, self._designs.pool, self._places)
+        while compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
             missing = np.flatnonzero(done < record.rows)  # without gains; each design is made once
             keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
             for i in dict(zip(keys, missing.tolist(), strict=True)).values():
@@ -241,48 +181,8 @@ class BatchEstimator:
         """
         self.filters[:] = snapshot
 
-    @property
-    def x(self) -> Array:
-        """The present states, shape (N, n)."""
-        return np.array([estimator.x for estimator in self])
-
-    @property
-    def P(self) -> Array:
-        """Their present covariances, shape (N, n, n), as `Estimator.P`."""
-        return np.array([estimator.P for estimator in self])
-
-    @property
-    def counts(self) -> dict[str, IntArray]:
-        """All counters by name, each of shape (N,)."""
-        counts = [row.counts for row in self]
-        return {name: np.array([row[name] for row in counts]) for name in SkipCounters._fields}
-
     def __repr__(self) -> str:
         return f"<{len(self)} x {self.name}: {', '.join(self.names)}>"
-
-
-def _parse_mask(mask: npt.ArrayLike | None, count: int) -> list[int]:
-    if mask is None:
-        return list(range(count))
-    flags = np.asarray(mask)
-    if flags.shape != (count,) or flags.dtype != np.bool_:
-        raise ValueError(
-            f"a mask has shape ({count},) and dtype bool, got {flags.shape} and {flags.dtype}"
-        )
-    return [int(i) for i in np.flatnonzero(flags)]
-
-
-def _check_shape(label: str, array: Array, count: int, width: int) -> None:
-    if array.ndim != 3 or array.shape[::2] != (count, width):
-        raise ValueError(f"{label} have shape ({count}, k, {width}), got {array.shape}")
-
-
-def _parse_counts(label: str, value: npt.ArrayLike | None, N: int, max_count: int) -> IntArray:
-    numbers = np.asarray(max_count if value is None else value, np.int64)
-    numbers = np.ascontiguousarray(np.broadcast_to(numbers, (N,)))
-    if numbers.min() < 0 or numbers.max() > max_count:
-        raise ValueError(f"{label} are 0 to {max_count}, got {numbers.min()} to {numbers.max()}")
-    return numbers
 
 
 class ForeignBatch(BatchEstimator):
@@ -299,11 +199,8 @@ class ForeignBatch(BatchEstimator):
         self, first: AnyEstimator, specs: Sequence[EstimatorSpec], dt: float, build: Build
     ) -> None:
         self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
-        self._build = build
-        self._estimators: list[AnyEstimator] = [
-            first,
-            *(build(**spec._asdict()) for spec in specs[1:]),
-        ]
+        self._build, others = build, [build(**spec._asdict()) for spec in specs[1:]]
+        self._estimators: list[AnyEstimator] = [first, *others]
         self._design_keys = [spec.design for spec in specs]
         self.configure(range(len(specs)), specs)
 
@@ -322,16 +219,12 @@ class ForeignBatch(BatchEstimator):
         """
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._design_keys[i]:
-                self._estimators[i], self._design_keys[i] = (
-                    self._build(**spec._asdict()),
-                    spec.design,
-                )
+                self._estimators[i] = self._build(**spec._asdict())
+                self._design_keys[i] = spec.design
             self._check_states(i, self[i].names)
             self[i].sensors = dict(spec.sensors)
 
-    def take(
-        self, mask: npt.NDArray[np.bool_] | None, record: StepRecord, observed: Observed
-    ) -> None:
+    def take(self, mask: _Mask | None, record: StepRecord, observed: Observed) -> None:
         """Process rows and packets as `BatchEstimator.take` does.
 
         Args:
@@ -364,3 +257,31 @@ class ForeignBatch(BatchEstimator):
         """
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)
+
+
+def build_batch(
+    source: str | EstimatorFactory,
+    specs: Sequence[EstimatorSpec],
+    dt: float,
+    options: Mapping[str, Any],
+) -> BatchEstimator:
+    """Build an estimator for each spec, compiled together where all are ours and none is late.
+
+    Args:
+        source: Name or factory.
+        specs: Vehicle, sensors and speed of each estimator.
+        dt: Tick (s).
+        options: Options of `make_estimator`, whose errors it raises.
+
+    Returns:
+        The batch.
+    """
+    build_one = functools.partial(make_estimator, source, dt=dt, **options)
+    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
+        first = build_one(**specs[0]._asdict())
+        if isinstance(first, ForeignEstimator):
+            batch_class = getattr(first.inner, "batch", ForeignBatch)
+            return batch_class(first, specs, dt, build_one)
+        if not first.compiled:
+            return ForeignBatch(first, specs, dt, build_one)
+    return BatchEstimator(get_label(source), specs, dt, build_one)

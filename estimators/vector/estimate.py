@@ -13,7 +13,7 @@ from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
 from ..wrappers.truth import calibrate, choose_vehicle, set_stiffness
-from .make import build_batch
+from .batch import build_batch
 from .records import BatchedEnv, Mask, Observations, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
@@ -150,18 +150,10 @@ class EstimateObservation(VectorObservation):
         if isinstance(self._records, _BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a snapshot of env and estimators; TypeError where the vector env makes none."""
-        memory = {"estimator": self.estimator.get_state(), "out": self._out.copy()}
-        return super().get_state() | memory
+    def _get_memory(self) -> dict[str, Any]:
+        return {"estimator": self.estimator.get_state(), "out": self._out.copy()}
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
-        super().set_state(snapshot)
+    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
         self._update_cars(range(self.num_envs))
         self.estimator.set_state(snapshot["estimator"])
         self._out[:] = snapshot["out"]

@@ -154,15 +154,6 @@ def _store_lane_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 
 @jit
-def _store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements."""
-    slot = b.tick[lane] % WINDOW
-    f.past_road_turn[slot] = b.road_turn[lane]
-    for i in range(b.n):
-        f.predicted[slot, i] = b.x[i, lane]
-
-
-@jit
 def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Matrix, j: int, rows: int) -> None:
     """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
     last = minimum(first + count_lanes(), len(filters))
@@ -280,7 +271,10 @@ def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> No
     if b.store_predictions == 1:
         for lane in range(count_lanes()):
             if b.here[lane] == 1.0 and b.apart[lane] == 0.0:
-                _store_prediction(b, lane, bank.filters[first + lane, 0])
+                f, slot = bank.filters[first + lane, 0], b.tick[lane] % WINDOW
+                f.past_road_turn[slot] = b.road_turn[lane]
+                for i in range(b.n):
+                    f.predicted[slot, i] = b.x[i, lane]
     if b.periodic == 1:
         _gather_gains(b, first, bank)
     _correct(b, first, bank.filters)

@@ -94,11 +94,9 @@ def make_blocks(count: int) -> Any:
 
 @jit
 def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
-    """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
-
-    Lanes compute models that change by speed alone, of which every tick predicts and corrects.
-    Nothing is done between samples, and nothing of the past is stored but predictions.
-    """
+    """Return whether a filter's ticks are computed in its lane now; the first shapes the block."""
+    # lanes compute models that change by speed alone, of which every tick predicts and corrects
+    # without rules between samples, and store nothing of the past but predictions
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
         is_plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0
@@ -215,28 +213,12 @@ def _observe_batch(
     return n_waiting
 
 
-def make_empty_outputs(count: int) -> Observed:
-    """Make the last argument of `observe` for N filters whose outputs are not read.
-
-    Args:
-        count: Number of filters N.
-
-    Returns:
-        Outputs without entries.
-    """
-    empty, truth = np.zeros((count, 0), np.float32), np.zeros(count)
-    table = OutputTable(0, np.zeros((0, 3), np.int64), np.zeros(0))
-    return Observed(empty, table, truth, truth, empty, np.zeros((count, 4)))
-
-
-_INTEGERS, _CUBE = np.zeros(1, np.int64), np.zeros((1, 1, 1))
-EXAMPLE_BANK = FilterBank(np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64))
-EXAMPLE_RECORD = StepRecord(_CUBE, _INTEGERS, _CUBE, _INTEGERS)
-"""For `compile_call`: all banks and records have these types."""
-
-
 @cache
 def compile_observe_batch() -> Callable[..., int]:
-    """Return `_observe_batch` as a plain call."""
-    memory = EXAMPLE_BANK, _INTEGERS, make_blocks(1)
-    return compile_call(_observe_batch, *memory, EXAMPLE_RECORD, make_empty_outputs(1))
+    """Return `_observe_batch` as a plain call, for the types that all banks and records have."""
+    counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
+    bank = FilterBank(np.zeros((1, 1), FILTER), numbers, np.zeros((1, 4), np.int64))
+    record, obs = StepRecord(cube, counts, cube, counts), np.zeros((1, 0), np.float32)
+    table = OutputTable(0, np.zeros((0, 3), np.int64), numbers)
+    observed = Observed(obs, table, numbers, numbers, obs, np.zeros((1, 4)))
+    return compile_call(_observe_batch, bank, counts, make_blocks(1), record, observed)

@@ -188,7 +188,7 @@ class VectorObservation(
                 "without a vectorization_mode does"
             )
         ended = None if self._ended is None else self._ended.copy()
-        return {"env": env.get_state(), "ended": ended}
+        return {"env": env.get_state(), "ended": ended} | self._get_memory()
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -199,6 +199,15 @@ class VectorObservation(
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
+        self._set_memory(snapshot)
+
+    def _get_memory(self) -> dict[str, Any]:
+        """Return a snapshot of what the wrapper has beside the env."""
+        raise NotImplementedError
+
+    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
+        """Restore what `_get_memory` returned."""
+        raise NotImplementedError
 
     def _get_truths(self, rows: Sequence[int]) -> list[CarTruth]:
         """Return what is told of some rows' episodes; TypeError where it is out of reach."""

@@ -6,15 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from ..wrappers.truth import (
-    STIFFNESSES,
-    calibrate,
-    find_readings,
-    follow_friction,
-    make_truth_entries,
-    read_parameters,
-    read_states,
-)
+from ..wrappers.truth import STIFFNESSES, TruthEntries
 from ..wrappers.truth import TruthObservation as Single
 from .records import Mask, Observations, VectorObservation
 
@@ -48,31 +40,28 @@ class TruthObservation(VectorObservation):
                 f"{type(env).__name__} has no layout; wrap it in "
                 "sideslip.estimators.vector.EstimateObservation first"
             )
-        self._parameters, self._states = tuple(parameters), tuple(states)
-        self._set_layout(make_truth_entries(self._parameters, self._states, env.layout))
+        self._entries = TruthEntries(parameters, states, env.layout)
+        self._set_layout(self._entries.layout)
         if self._same_step and states:
             raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
-        self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
-        self._places, self._columns = find_readings(env.layout)
-        shape = env.num_envs, 2, len(self._columns)
+        self._values = np.zeros((env.num_envs, len(parameters)), np.float32)
+        shape = env.num_envs, 2, len(self._entries.columns)
         self._calibration: Observations = np.ones(shape, np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
 
     def _begin(self, mask: Mask) -> None:
         rows = np.flatnonzero(mask)
         for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
-            self._values[i] = read_parameters(truth, self._parameters)
-            self._calibration[i] = truth.calibration[:, self._columns]
+            self._values[i], self._calibration[i] = self._entries.read(truth)
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
         for i in np.flatnonzero(ended):
-            final = np.concatenate([infos["final_obs"][i], self._values[i]])
-            final[self._places] = calibrate(final[self._places], self._calibration[i])
-            infos["final_obs"][i] = final
+            car = self._values[i], self._calibration[i]
+            infos["final_obs"][i] = self._entries.append(infos["final_obs"][i], *car, None)
 
     def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
-        parts = [obs, self._values]
-        if self._states:
+        true_states: Any = None
+        if self._entries.states:
             base: Any = self.unwrapped
             if isinstance(base, SyncVectorEnv):
                 true_states = np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
@@ -80,23 +69,11 @@ class TruthObservation(VectorObservation):
                 true_states = np.asarray(base.true_state)
             else:
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
-            parts = [obs, follow_friction(self._values, self._parameters, true_states)]
-            parts.append(read_states(true_states, self._states))
-        appended: Observations = np.hstack(parts)
-        appended[:, self._places] = calibrate(appended[:, self._places], self._calibration)
-        return appended
+        return self._entries.append(obs, self._values, self._calibration, true_states)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a snapshot for `set_state`; TypeError where the env makes none."""
-        truth = {"values": self._values.copy(), "calibration": self._calibration.copy()}
-        return super().get_state() | truth
+    def _get_memory(self) -> dict[str, Any]:
+        return {"values": self._values.copy(), "calibration": self._calibration.copy()}
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
-        super().set_state(snapshot)
+    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()

@@ -105,10 +105,7 @@ def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
 def _compute_nees(
     f: FilterRecord, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
 ) -> Scalar:
-    """Compute e' P_e^-1 e / len(e), the NEES per state; 0 without states or for a singular P_e.
-
-    e is the error of the states i and j, estimates of the true beta and gamma; -1: there is none.
-    """
+    """Compute e' P_e^-1 e / len(e) of the states i (beta) and j (gamma; -1: none), or 0."""
     if i >= 0 and j >= 0:
         a, b = f.x[i] - beta, f.x[j] - gamma
         p, q = read_covariance(f, gains, i, i), read_covariance(f, gains, j, j)

@@ -35,70 +35,6 @@ _STATES = {
 }
 
 
-def make_truth_entries(
-    parameters: Sequence[str], states: Sequence[str], inner: Sequence[ObservationEntry]
-) -> tuple[ObservationEntry, ...]:
-    """Make the entries of true parameters and states behind those of an observation.
-
-    Args:
-        parameters: Parameters of a `Vehicle` or motors of `CarTruth`, each as `true_<parameter>`.
-        states: States of a `TrueState`, each as `<state>_hat`.
-        inner: Entries of the observation.
-
-    Returns:
-        All entries.
-
-    Raises:
-        ValueError: A parameter or state is unknown, or a name would stand twice.
-    """
-    fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
-    fields |= _MOTORS
-    entries = []
-    for name in parameters:
-        unit = fields.get(name)
-        if unit is None:
-            known = ", ".join(key for key, value in fields.items() if value is not None)
-            raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
-        entries.append(ObservationEntry(f"true_{name}", unit, -_MAX_PARAMETER, _MAX_PARAMETER))
-    for name in states:
-        if name not in _STATES:
-            raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
-        unit, limit = _STATES[name]
-        entries.append(ObservationEntry(f"{name}_hat", unit, -limit, limit))
-    names = [entry.name for entry in (*inner, *entries)]
-    duplicates = sorted({name for name in names if names.count(name) > 1})
-    if duplicates:
-        raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
-    return (*inner, *entries)
-
-
-def read_parameters(truth: CarTruth, parameters: Sequence[str]) -> list[float]:
-    """Read parameters of the true car.
-
-    Args:
-        truth: What is told of the episode.
-        parameters: Names of a `Vehicle`'s parameters or of `CarTruth`'s motors.
-
-    Returns:
-        Values in SI units.
-    """
-    return [getattr(truth if name in _MOTORS else truth.vehicle, name) for name in parameters]
-
-
-def find_readings(layout: Sequence[ObservationEntry]) -> tuple[list[int], list[int]]:
-    """Find the entries of an observation that are readings of fast sensors.
-
-    Args:
-        layout: Entries of the observation.
-
-    Returns:
-        Places of these entries, and the fast column of each.
-    """
-    stems = [re.sub(r"_(mean|\d+)$", "", entry.name) for entry in layout]
-    places = [i for i, stem in enumerate(stems) if stem in FAST._fields]
-    return places, [FAST._fields.index(stems[i]) for i in places]
-
-
 def calibrate(readings: Readings, calibration: Readings) -> Readings:
     """Correct readings by what is told of their sensors.
 
@@ -112,38 +48,94 @@ def calibrate(readings: Readings, calibration: Readings) -> Readings:
     return (readings - calibration[..., 0, :]) / calibration[..., 1, :]
 
 
-def read_states(true_state: Array, states: Sequence[str]) -> _Floats:
-    """Read true states, clipped to their bounds.
+class TruthEntries:
+    """Entries of true parameters and states behind those of an observation, of one car or several.
 
     Args:
-        true_state: States, shape (..., len(TrueState)).
-        states: Names of states.
+        parameters: Parameters of a `Vehicle` or motors of `CarTruth`, each as `true_<parameter>`.
+        states: States of a `TrueState`, each as `<state>_hat`.
+        inner: Entries of the observation.
 
-    Returns:
-        Values in SI units, shape (..., len(states)).
+    Attributes:
+        layout: All entries.
+        columns: Fast columns of the k readings in the observation.
+
+    Raises:
+        ValueError: A parameter or state is unknown, or a name would stand twice.
     """
-    limits = np.array([_STATES[name][1] for name in states])
-    columns = [getattr(TRUE_STATE, name) for name in states]
-    values: Array = true_state[..., columns].clip(-limits, limits)
-    return values.astype(np.float32)
 
+    def __init__(
+        self,
+        parameters: Sequence[str],
+        states: Sequence[str],
+        inner: Sequence[ObservationEntry],
+    ) -> None:
+        self.parameters, self.states = tuple(parameters), tuple(states)
+        fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
+        units = {name: unit for name, unit in fields.items() if unit is not None} | _MOTORS
+        entries = list(inner)
+        for name in parameters:
+            if name not in units:
+                known = ", ".join(units)
+                raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
+            limits = -_MAX_PARAMETER, _MAX_PARAMETER
+            entries.append(ObservationEntry(f"true_{name}", units[name], *limits))
+        for name in states:
+            if name not in _STATES:
+                raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
+            unit, limit = _STATES[name]
+            entries.append(ObservationEntry(f"{name}_hat", unit, -limit, limit))
+        names = [entry.name for entry in entries]
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
+        self.layout = tuple(entries)
+        stems = [re.sub(r"_(mean|\d+)$", "", entry.name) for entry in inner]
+        # of the readings of fast sensors
+        self._places = [i for i, stem in enumerate(stems) if stem in FAST._fields]
+        self.columns = [FAST._fields.index(stems[i]) for i in self._places]
+        self._limits = np.array([_STATES[name][1] for name in states])
+        self._state_columns = [getattr(TRUE_STATE, name) for name in states]
 
-def follow_friction(values: _Floats, parameters: Sequence[str], true_state: Array) -> _Floats:
-    """Multiply `friction` by what has changed since the reset, which belongs to the state.
+    def read(self, truth: CarTruth) -> tuple[_Floats, _Floats]:
+        """Read parameters of a car (SI units), and offset and scale of its readings, shape (2, k).
 
-    Args:
-        values: Parameters at the reset, shape (..., len(parameters)).
-        parameters: Their names.
-        true_state: States, shape (..., len(TrueState)).
+        Args:
+            truth: What is told of the episode.
 
-    Returns:
-        Parameters now, of the same shape.
-    """
-    present = values.copy()
-    if "friction" in parameters:
-        factor = true_state[..., TRUE_STATE.friction_factor]
-        present[..., parameters.index("friction")] *= factor.astype(np.float32)
-    return present
+        Returns:
+            Values and calibration.
+        """
+        sources = [truth if name in _MOTORS else truth.vehicle for name in self.parameters]
+        values = [getattr(x, name) for x, name in zip(sources, self.parameters, strict=True)]
+        calibration = truth.calibration[:, self.columns].astype(np.float32)
+        return np.array(values, np.float32), calibration
+
+    def append(
+        self, obs: _Floats, values: _Floats, calibration: _Floats, true_state: Array | None
+    ) -> _Floats:
+        """Append parameters and states to an observation, and calibrate its readings.
+
+        Args:
+            obs: Observation, shape (..., inner).
+            values: Parameters at the reset, shape (..., len(parameters)).
+            calibration: Offset and scale of the readings, shape (..., 2, k).
+            true_state: States, shape (..., len(TrueState)); None without entries of states.
+
+        Returns:
+            Observation of all entries, float32, shape (..., len(layout)).
+        """
+        parts = [obs, values]
+        if true_state is not None:
+            if "friction" in self.parameters:  # what has changed since the reset is of the state
+                parts[1] = values.copy()
+                factor = true_state[..., TRUE_STATE.friction_factor].astype(np.float32)
+                parts[1][..., self.parameters.index("friction")] *= factor
+            states = true_state[..., self._state_columns].clip(-self._limits, self._limits)
+            parts.append(states.astype(np.float32))
+        appended = np.concatenate(parts, axis=-1)
+        appended[..., self._places] = calibrate(appended[..., self._places], calibration)
+        return appended
 
 
 def choose_vehicle(
@@ -205,12 +197,10 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     ) -> None:
         RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         gym.Wrapper.__init__(self, env)
-        self._parameters, self._states = tuple(parameters), tuple(states)
-        inner = env.get_wrapper_attr("layout")
-        self.layout = make_truth_entries(self._parameters, self._states, inner)
+        self._entries = TruthEntries(parameters, states, env.get_wrapper_attr("layout"))
+        self.layout = self._entries.layout
         self.observation_space = make_space(self.layout)
-        self._values = np.zeros(len(self._parameters), np.float32)
-        self._places, self._columns = find_readings(inner)
+        self._values = np.zeros(len(parameters), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -226,9 +216,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        truth = base.car_truth
-        self._values[:] = read_parameters(truth, self._parameters)
-        self._calibration = truth.calibration[:, self._columns].astype(np.float32)
+        self._values, self._calibration = self._entries.read(base.car_truth)
         return self.observation(obs), info
 
     def observation(self, observation: _Floats) -> _Floats:
@@ -241,14 +229,8 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
             Observation of the wrapper, float32, shape (len(layout),).
         """
         base: Any = self.unwrapped
-        values, states = self._values, list[_Floats]()
-        if self._states:
-            true_state = base.true_state
-            values = follow_friction(values, self._parameters, true_state)
-            states.append(read_states(true_state, self._states))
-        appended = np.concatenate([observation, values, *states])
-        appended[self._places] = calibrate(appended[self._places], self._calibration)
-        return appended
+        true_state = base.true_state if self._entries.states else None
+        return self._entries.append(observation, self._values, self._calibration, true_state)
 
     def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the parameters for `set_state`."""

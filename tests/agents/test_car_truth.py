@@ -11,7 +11,7 @@ from sideslip.agents.baselines import make_oracle
 from sideslip.agents.controllers.lqr import TRUE_PARAMETERS, Lqr
 from sideslip.agents.controllers.nmpc import Nmpc
 from sideslip.agents.design.sampled_model import SPEEDS, make_design_model
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs.engine import views
 from sideslip.envs.vehicle.tyres import fit_fiala
 from sideslip.estimators.vector import estimate
@@ -59,10 +59,10 @@ def test_calibrated_readings_are_those_of_sensors_that_do_not_err() -> None:
 def test_what_is_constant_of_a_sensor_costs_an_oracle_nothing() -> None:
     errors = {"camera_yaw": 0.005, "gyro_scale": 0.99, "accel_roll": 0.02, "map_lag": 0.2}
     costs = [
-        evaluate_costs(
+        evaluate_episodes(
             *make_oracle("oracle-parameters-lqr", FUSION, 4, world=world, **SLALOM),
             range(4),
-        )
+        )[0]
         for world in (errors, "ideal")
     ]
     assert bits(costs[0]) == bits(costs[1])
@@ -76,7 +76,7 @@ def drive_uneven(world: dict[str, Any]) -> np.ndarray:
     driver = make_oracle(
         "oracle-state-lqr", FUSION, CARS, world={"moment_rate": 1e-9} | world, **SLALOM
     )
-    return evaluate_costs(*driver, range(CARS))
+    return evaluate_episodes(*driver, range(CARS))[0]
 
 
 def test_motors_that_pull_unevenly_are_commanded_accordingly(
@@ -131,7 +131,7 @@ def test_who_knows_more_pays_less_in_the_world(env_id: str) -> None:
     names = ("nominal", "oracle-parameters-lqr", "oracle-state-lqr")
     seeds = range(2**29, 2**29 + CARS)
     costs = [
-        evaluate_costs(*make_oracle(name, env_id, CARS, world="v1", **SLALOM), seeds)
+        evaluate_episodes(*make_oracle(name, env_id, CARS, world="v1", **SLALOM), seeds)[0]
         for name in names
     ]
     for lower, upper in itertools.pairwise(costs):

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sideslip.agents import AGENTS, Agent, Controller, make_agent, register_agent
-from sideslip.agents.rollout import evaluate_costs, rollout
+from sideslip.agents.rollout import evaluate_episodes, rollout
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.tasks import ControlTask
@@ -60,10 +60,10 @@ def test_a_registered_controller_drives_single_and_vector_alike(factory: Any) ->
     seeds = [4, 5, 6]
     options: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 1.5}}
     single, rows = gym.make(VISION, **options), gym.make_vec(VISION, num_envs=3, **options)
-    costs = evaluate_costs(rows, make_agent("yaw-damper", rows, gain=2.0), seeds)
+    costs = evaluate_episodes(rows, make_agent("yaw-damper", rows, gain=2.0), seeds)[0]
     alone = [rollout(single, make_agent("yaw-damper", single, gain=2.0), s).cost for s in seeds]
     assert costs == pytest.approx(alone, rel=1e-12)
-    assert (costs != evaluate_costs(rows, make_agent("none", rows), seeds)).all()
+    assert (costs != evaluate_episodes(rows, make_agent("none", rows), seeds)[0]).all()
 
 
 def test_whatever_predicts_is_an_agent() -> None:

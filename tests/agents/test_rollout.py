@@ -10,7 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.rollout import evaluate_costs, iterate_steps
+from sideslip.agents.rollout import evaluate_episodes, iterate_steps
 
 
 @pytest.mark.smoke
@@ -49,7 +49,7 @@ def test_steps_of_a_batch_are_each_rows_first_episode() -> None:
     lengths = np.sum([step.running for step in steps], axis=0)
     assert lengths.tolist() == [len(drive["t"]) - 1 for drive in drives]
     assert len(set(lengths)) > 1 and len(steps) == max(lengths)
-    costs = evaluate_costs(envs, Idle(), [1, 2, 3])
+    costs = evaluate_episodes(envs, Idle(), [1, 2, 3])[0]
     assert costs == pytest.approx([drive.cost for drive in drives], rel=1e-12)
     starts = np.array(seen[: len(steps)])
     assert starts[0].all()

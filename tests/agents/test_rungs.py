@@ -12,7 +12,7 @@ from sideslip.agents.baselines import ORACLES, make_noise_options, make_oracle
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
 from sideslip.agents.design.sampled_model import make_design_model
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs import COMS
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS, TIERS
@@ -153,7 +153,7 @@ def test_knowing_pays_on_the_linear_car() -> None:
     """Where the LQG is the optimum each rung costs less than the one below: three errors."""
     plain = LINEAR | {"small_angle": True, "roll": False}
     pairs = [make_oracle(rung, FUSION, 64, scenario=plain) for rung in ORACLES[:3]]
-    found = [np.log(evaluate_costs(*pair, range(64))) for pair in pairs]
+    found = [np.log(evaluate_episodes(*pair, range(64))[0]) for pair in pairs]
     for lower, upper in itertools.pairwise(found):
         gap = lower - upper
         assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5

@@ -11,10 +11,10 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.bound import VehicleChange, compute_error_bound
 from sideslip.estimators.delayed_channels import LateEstimator
-from sideslip.estimators.vector.make import make_batch
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
+from tests.estimators.vector.fleets import make_batch, step
 
 LATE = {"gyro": 0.06}
 
@@ -85,8 +85,9 @@ def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any
         arrived = log.record.packets[:, PACKET.arrived]
         new = log.record.packets[(arrived >= first) & (arrived < first + 500)]
         fast = log.record.fast[first : first + 500]
-        batch.step(np.stack([fast, fast]), np.stack([new, new]))
-    assert (batch.x == filter_.x).all() and (batch.P == filter_.P).all()
+        step(batch, np.stack([fast, fast]), np.stack([new, new]))
+    for each in batch:
+        assert (each.x == filter_.x).all() and (each.P == filter_.P).all()
 
 
 def test_a_snapshot_goes_on() -> None:

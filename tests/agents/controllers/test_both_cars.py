@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.estimators.vector import EstimateObservation
 
 CARS = 6
@@ -39,7 +39,7 @@ def costs(env_id: str, name: str, contest: tuple[str, str, str], **options: Any)
     )
     if name != "none":
         env = EstimateObservation(env, "exact-kf", outputs=["beta", "gamma"], std=False)
-    return evaluate_costs(env, make_agent(name, env, **options), range(CARS))
+    return evaluate_episodes(env, make_agent(name, env, **options), range(CARS))[0]
 
 
 @cache

@@ -10,7 +10,7 @@ import pytest
 
 from sideslip.agents import Lqr, Mpc, make_agent
 from sideslip.agents.design.sampled_model import SPEEDS, DesignSpec, make_design_model
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs import COMS
 from sideslip.envs.task import MODEL, compute_reference, make_reference_params
 from sideslip.estimators.vector.truth import TruthObservation as VectorTruth
@@ -109,5 +109,5 @@ def test_who_designs_it_pays_less(name: str) -> None:
         env: Any = gym.make_vec(YAW, num_envs=8, scenario=scenario, world=world, reference="model")
         other = gym.make(YAW, scenario=scenario, world=told, reference="model")
         agent = make_agent(name, TruthObservation(other, ["friction"], STATES))
-        costs.append(evaluate_costs(VectorTruth(env, ["friction"], STATES), agent, range(8)))
+        costs.append(evaluate_episodes(VectorTruth(env, ["friction"], STATES), agent, range(8))[0])
     assert (costs[0] < 0.95 * costs[1]).all()

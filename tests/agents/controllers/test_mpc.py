@@ -43,7 +43,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     agent = agent_of(env, horizon=horizon)
     lqr = Lqr(env)
     obs = observe(env, V, **told)
-    program = agent._get_program(V)
+    program, _ = agent._get_solver(V)
     K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
     x = np.zeros(len(agent.design_spec.states))
     for name, value in told.items():

@@ -21,7 +21,7 @@ from sideslip.agents.design.gauss_newton import (
     update_plan,
 )
 from sideslip.agents.design.prediction import PlanBatch, simulate_plans
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.agents.helpers import observe
@@ -165,7 +165,7 @@ def test_at_the_limit_it_is_better_than_lqr() -> None:
     """Paired episodes at low friction, both knowing state and car: three standard errors."""
     told: dict[str, Any] = {"scenario": "limit-slalom", "options": QUICK, **CAR}
     pairs = [make_oracle(f"oracle-state-{who}", YAW, 24, **told) for who in ("lqr", "nmpc")]
-    found = [evaluate_costs(*pair, range(24)) for pair in pairs]
+    found = [evaluate_episodes(*pair, range(24))[0] for pair in pairs]
     gap = np.log(found[0] / found[1])
     assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5 > 0.0
 

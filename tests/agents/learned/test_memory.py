@@ -356,7 +356,7 @@ def test_a_file_of_no_units_cannot_ask_for_any_memory(tmp_path: Path) -> None:
     """Tensors of nothing would fit a card of any number of frames."""
     none = traces(weight_in=np.zeros((0, WIDE)), bias_in=np.zeros(0), n_silu=0)
     save_policy(tmp_path / "mine.safetensors", network(none), CARD)
-    with pytest.raises(ValueError, match=r"traces with units.*\['traces', 0, 0, "):
+    with pytest.raises(ValueError, match="holds 0 numbers of float32, not one or more"):
         load_policy(tmp_path / "mine.safetensors")
 
 

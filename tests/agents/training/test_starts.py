@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.env_info import get_layout
 from sideslip.agents.learned.policy import Card, Policy, load_policy
-from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
+from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.agents.training.callbacks import (
     BEST,
     CHECKPOINT,
@@ -203,7 +203,8 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     )
     env, seeds = task.vector_env(4), _make_evaluation_seeds(4)
     start, now = (
-        evaluate_costs(env, each, seeds) for each in (_NetworkAgent(POLICY.network), found.model)
+        evaluate_episodes(env, each, seeds)[0]
+        for each in (_NetworkAgent(POLICY.network), found.model)
     )
     ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
@@ -407,10 +408,10 @@ def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
     last = begun.merge_network(convert_sb3_policy(found.model))
     seeds = _make_evaluation_seeds(4)
     begins, ours, best = (
-        evaluate_costs(task.vector_env(4), _NetworkAgent(each), seeds)
+        evaluate_episodes(task.vector_env(4), _NetworkAgent(each), seeds)[0]
         for each in (policy.network, last, kept)
     )
-    theirs = evaluate_costs(begun.wrap_env(task.vector_env(4)), found.model, seeds)
+    theirs = evaluate_episodes(begun.wrap_env(task.vector_env(4)), found.model, seeds)[0]
     assert ours == pytest.approx(theirs, rel=1e-5) and ours != pytest.approx(begins, rel=1e-4)
     first = found.best is found.evaluations[0]
     assert best == pytest.approx(begins if first else ours, rel=1e-5)

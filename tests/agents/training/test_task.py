@@ -12,7 +12,7 @@ import torch
 
 from sideslip.agents.controllers.base import NoControl
 from sideslip.agents.learned.policy import PolicyController, load_policy
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.agents.training import callbacks, trainer
 from sideslip.agents.training.callbacks import (
     POLICY,
@@ -64,7 +64,7 @@ def test_the_scenarios_of_a_mixture_weigh_alike(tmp_path: Path) -> None:
     scenarios = ["coms-brake-in-turn", {"base": "coms-slalom", "duration": 3.0}]
     task = dataclasses.replace(TINY, scenarios=scenarios, n_eval_envs=7)
     env, seeds = task.vector_env(7), callbacks._make_evaluation_seeds(7)
-    none = evaluate_costs(env, NoControl(env), seeds)
+    none = evaluate_episodes(env, NoControl(env), seeds)[0]
     assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
     wide = dataclasses.replace(task, num_envs=64)
     cars: Any = trainer.Trainer(wide, 1, tmp_path).build().model.get_env()
@@ -78,7 +78,7 @@ def test_the_scenarios_of_a_mixture_weigh_alike(tmp_path: Path) -> None:
     rates = [returns[i::2].sum() / driven[i::2].sum() for i in range(2)]
     assert rates[0] == pytest.approx(rates[1], rel=0.01)
     best = trainer.Trainer(task, ROLLOUT, tmp_path).train().best
-    costs = evaluate_costs(env, PolicyController(env, tmp_path / POLICY), seeds)
+    costs = evaluate_episodes(env, PolicyController(env, tmp_path / POLICY), seeds)[0]
     shares = [costs[i::2].mean() / none[i::2].mean() for i in range(2)]
     means = [none[i::2].mean() for i in range(2)]
     assert best.of_none == pytest.approx(np.mean(shares), rel=1e-4)

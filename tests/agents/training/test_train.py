@@ -18,7 +18,7 @@ from sideslip import __version__
 from sideslip.agents import make_agent
 from sideslip.agents.baselines import make_oracle
 from sideslip.agents.learned.policy import PolicyController
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs.vector import StabilityVectorEnv
 
 pytest.importorskip("stable_baselines3")
@@ -67,15 +67,15 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     env = TINY.vector_env(4)
     seeds = callbacks._make_evaluation_seeds(4)
     best = min(line["cost"] for line in lines)
-    assert evaluate_costs(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
+    assert evaluate_episodes(env, model, seeds)[0].mean() == pytest.approx(best, rel=1e-6)
     policy = PolicyController(env, folder / POLICY)
-    assert evaluate_costs(env, policy, seeds).mean() == pytest.approx(best, rel=1e-4)
+    assert evaluate_episodes(env, policy, seeds)[0].mean() == pytest.approx(best, rel=1e-4)
     card, kept = policy.policy.card, min(lines, key=lambda line: line["cost"])
     assert (card.steps, card.cpu_seconds) == (kept["steps"], kept["cpu_seconds"])
     assert card.env_id == TINY.env_id and card.env_options == TINY.env_options
     assert not policy.policy.network.reads[-1]  # gamma_ref: with zero slip it never varies
     still: Any = type("Still", (), {"predict": lambda *_, **__: (np.zeros((4, 1)), None)})()
-    none = evaluate_costs(env, still, seeds).mean()
+    none = evaluate_episodes(env, still, seeds)[0].mean()
     assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)
     assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE, POLICY])
 
@@ -279,5 +279,8 @@ def test_ppo_without_options_costs_at_most_a_fifth_more_than_nominal(tmp_path: P
     nominal, agent = make_oracle("nominal", task.env_id, 64, {"autoreset_mode": "SameStep"})
     env, seeds = task.vector_env(64), range(64)
     policy = make_agent(str(tmp_path / POLICY), env)
-    found, known = evaluate_costs(env, policy, seeds), evaluate_costs(nominal, agent, seeds)
+    found, known = (
+        evaluate_episodes(env, policy, seeds)[0],
+        evaluate_episodes(nominal, agent, seeds)[0],
+    )
     assert found.mean() < 1.2 * known.mean()

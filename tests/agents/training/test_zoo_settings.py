@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 from sideslip.agents.learned.policy import load_policy
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.agents.training.callbacks import POLICY, RunOptions
 from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
 from sideslip.agents.training.trainer import Trainer
@@ -56,6 +56,6 @@ def test_the_zoo_finds_and_drives_what_we_left(algo: str, tmp_path: Path) -> Non
     _describe_for_zoo(task, folder, 64, 64)
     Trainer(task, 64, folder, run_options=RunOptions(eval_freq=64)).train()
     agent = _NetworkAgent(load_policy(folder / POLICY).network)
-    cost = evaluate_costs(task.vector_env(1), agent, [0])[0]
+    cost = evaluate_episodes(task.vector_env(1), agent, [0])[0][0]
     out = run_zoo("enjoy", algo, tmp_path, "--no-render", "-n", "1001", "--load-best")
     assert f"Episode Reward: {-cost:.2f}" in out

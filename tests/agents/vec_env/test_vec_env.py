@@ -300,8 +300,6 @@ def test_what_cannot_be_bridged_says_why() -> None:
         make_vec_env(VISION, 0)
     with pytest.raises(ValueError, match="has no native vector env"):
         make_vec_env("Pendulum-v1", 2)
-    with pytest.raises(TypeError, match="SyncVectorEnv is no native vector env"):
-        _NativeVecEnv(gym.make_vec(VISION, num_envs=2, vectorization_mode="sync"))
     with pytest.raises(ValueError, match=r"autoreset_mode='SameStep', not .*NEXT_STEP"):
         _NativeVecEnv(StabilityVectorEnv(2))
     with pytest.raises(gym.error.NameNotFound):

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 from sideslip.agents import zoo
-from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.rollout import evaluate_episodes
 from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
 from sideslip.agents.training.config import TrainingTask
@@ -90,7 +90,7 @@ def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model
         obs, rewards, dones, _ = env.step(action)
         cost, done = cost - float(rewards[0]), bool(dones[0])
     assert cost == pytest.approx(
-        evaluate_costs(TASK.vector_env(4), loaded, _make_evaluation_seeds(4))[0]
+        evaluate_episodes(TASK.vector_env(4), loaded, _make_evaluation_seeds(4))[0][0]
     )
     if model != "best_model.zip":
         with np.load(folder / zoo.EVALUATIONS) as found:

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
+from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.benchmarks.control.tasks import YAW, ControlTask, make_salt, make_task_seeds
 
 CONTEST = ControlTask("", YAW, "coms", "zero-slip", "coms-random")
@@ -66,7 +66,7 @@ def plan_for(seed: int, env: Any, steps: int) -> Any:
     for _ in range(TURNS):
         tries = np.clip(rng.normal(middle, spread, (TRIES, KNOTS)), -1.0, 1.0)
         tries[0] = middle
-        costs = evaluate_costs(env, OpenLoop(tries, steps), [seed] * TRIES)
+        costs = evaluate_episodes(env, OpenLoop(tries, steps), [seed] * TRIES)[0]
         best = tries[np.argsort(costs)[:BEST]]
         middle, spread = best.mean(axis=0), best.std(axis=0) + 0.01
     return middle
@@ -74,7 +74,7 @@ def plan_for(seed: int, env: Any, steps: int) -> Any:
 
 def gained(env: Any, agent: Any, seeds: Any) -> Any:
     """(N,) paired log ratios of no control's cost to an agent's."""
-    none, own = (evaluate_costs(env, each, seeds) for each in (None, agent))
+    none, own = (evaluate_episodes(env, each, seeds)[0] for each in (None, agent))
     return np.log((none + COST_FLOOR) / (own + COST_FLOOR))
 
 

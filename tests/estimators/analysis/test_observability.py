@@ -12,7 +12,7 @@ from sideslip.estimators.analysis.observability import (
     GPS_SPEED,
     UNKNOWNS,
     WHEELS,
-    find_unobservable_subspace,
+    _find_unobservable_subspace,
     make_observability_table,
 )
 from sideslip.estimators.design.kalman import transition_matrix
@@ -26,7 +26,7 @@ ASKEW = ("camera_yaw", "steer_offset", "bank")  # which together hide behind eac
 
 def is_together(sensors: Any, *unknowns: str) -> bool:
     """Whether a set of sensors sees all of some unknowns at once, straight on."""
-    return not find_unobservable_subspace(sensors, unknowns).basis.size
+    return not _find_unobservable_subspace(sensors, unknowns).basis.size
 
 
 def test_every_pair_but_one_is_seen_straight_on() -> None:
@@ -46,7 +46,7 @@ def test_camera_s_yaw_steering_s_offset_and_bank_hide_behind_each_other() -> Non
     """A car that is held askew by the bank and the wheels goes straight: beta = -psi, yaw = -psi.
     The accelerometer feels the bank's force, unless it has a bias of its own."""
     for slow in (("camera",), BOTH):
-        names, basis = find_unobservable_subspace((*GYRO, *slow), ASKEW)
+        names, basis = _find_unobservable_subspace((*GYRO, *slow), ASKEW)
         v = dict(zip(names, basis[:, 0] / basis[names.index("beta"), 0], strict=True))
         assert basis.shape[1] == 1
         assert v["camera_yaw"] == pytest.approx(1.0) and v["psi"] == pytest.approx(-1.0)
@@ -90,7 +90,7 @@ def test_the_filter_learns_nothing_of_what_is_unobservable(fast: Any) -> None:
         "exact-kf", sensors=log.slow, slow=list(BOTH), fast=list(fast), speed=7.0,
         **{f"{name}_sd": UNKNOWNS[name] for name in unknowns},
     )  # fmt: skip
-    names, basis = find_unobservable_subspace((*fast, *BOTH), tuple(unknowns))
+    names, basis = _find_unobservable_subspace((*fast, *BOTH), tuple(unknowns))
     (v,), f, n = basis.T, filter_.filters[0], len(filter_.names)
     assert names == filter_.names
     F, C = transition_matrix(f, f.G[: f.dense, :n]), [f.C_fast[: f.fasts, :n], *f.C[:, :, :n]]

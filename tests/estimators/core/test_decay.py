@@ -17,7 +17,7 @@ from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
 from sideslip.estimators.design.dual_rate import RULES
 from sideslip.estimators.design.kalman import INVERSES
-from sideslip.estimators.design.stability import MARGINAL
+from sideslip.estimators.design.periodic import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS
 
 quietly = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -13,7 +13,7 @@ from sideslip.envs import Log
 from sideslip.envs.vehicle.tyres import FIALA, Tyre, compute_lateral_forces
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.bound import compute_error_bound
-from sideslip.estimators.core.model import compute_axle_force
+from sideslip.estimators.core.predict import _compute_axle_force
 from tests.estimators.dense import WITH_TYRES
 
 assert sideslip.__version__
@@ -63,7 +63,7 @@ def test_the_law_is_the_plants_and_its_slopes_are_differences(
     C, F_z = 24000.0, 4000.0
     for alpha in (-0.3, -0.02, -0.001, 0.004, 0.05, 0.2):
         at = (alpha, factor, 1.0 / friction)
-        force, *slopes = compute_axle_force(C, F_z, *at)
+        force, *slopes = _compute_axle_force(C, F_z, *at)
         tyre = Tyre(alpha, friction * F_z / 2, C * factor / 2 / (3.0 * friction * F_z / 2))
         pair = compute_lateral_forces(tyre, tyre, tyre, tyre, FIALA, 0)
         assert force == pytest.approx(pair[0] + pair[1], rel=1e-12)
@@ -71,11 +71,11 @@ def test_the_law_is_the_plants_and_its_slopes_are_differences(
         for i, slope in enumerate(slopes):
             step = 1e-6 * (np.arange(3) == i)
             ahead, back = (
-                compute_axle_force(C, F_z, *(np.array(at) + s))[0] for s in (step, -step)
+                _compute_axle_force(C, F_z, *(np.array(at) + s))[0] for s in (step, -step)
             )
             if whole < 0.85 or i == 2:  # where it slides the slope by slip is kept above zero
                 assert slope == pytest.approx((ahead - back) / 2e-6, rel=1e-5, abs=1e-3)
-    assert compute_axle_force(C, F_z, 0.1, factor, 0.0)[0] == pytest.approx(C * factor * 0.1)
+    assert _compute_axle_force(C, F_z, 0.1, factor, 0.0)[0] == pytest.approx(C * factor * 0.1)
 
 
 def test_with_known_tyres_it_is_the_linear_filter() -> None:

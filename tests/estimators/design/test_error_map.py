@@ -12,8 +12,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
-from sideslip.estimators.design.periodic import design_gains
-from sideslip.estimators.design.stability import compute_error_map, spectral_radius
+from sideslip.estimators.design.periodic import design_and_map, spectral_radius
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
@@ -65,8 +64,7 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
-        table, there = design_gains(f, schedule, 7.0, filter_.config)
-        M = compute_error_map(there, table, schedule)
+        _, M = design_and_map(f, schedule, 7.0, filter_.config)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle
         rows = np.zeros((5 * cycle, FAST_WIDTH))
@@ -83,7 +81,7 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
             filter_.set_state(state)
             later = (packets[:, 2] >= 2 * cycle) & (packets[:, 2] < 3 * cycle)
             filter_.step(rows[2 * cycle : 3 * cycle], packets[later])
-            np.testing.assert_allclose(-filter_.filters[0].x[:N], M[:N, column], atol=1e-12)
+            np.testing.assert_allclose(-filter_.x, M[:n, column], atol=1e-12)
 
 
 def test_a_filter_whose_error_grows_is_refused_with_the_number() -> None:
@@ -163,7 +161,6 @@ def test_a_filter_is_checked_with_the_rows_of_the_speed() -> None:
         maps = []
         for each in (anywhere, alone):
             schedule = each._schedules[0]
-            table, there = design_gains(each.filters[0], schedule, speed, each.config)
-            maps.append(compute_error_map(there, table, schedule))
+            maps.append(design_and_map(each.filters[0], schedule, speed, each.config)[1])
         np.testing.assert_allclose(maps[0], maps[1], rtol=1e-9, atol=1e-12)
         assert alone.spectral_radius < 1.0

@@ -9,17 +9,18 @@ from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import CAMERA, GPS, SLOW, SLOW_NAMES
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design import models
+from sideslip.estimators.design import assemble
 from sideslip.estimators.design.models import (
     MEASUREMENTS,
     Measurement,
     MeasurementRow,
-    find_packet_column,
     select_states,
 )
 from tests.estimators.simulation import Drive, simulate
 
 LATE = SlowSensor(0.1, (0.050,))
+
+HDOP, SATELLITES = PACKET.value + 4, PACKET.value + 5
 
 
 @pytest.fixture
@@ -28,8 +29,8 @@ def log() -> Any:
     log = simulate(Drive(duration=3.0), {"gps": LATE}, 2)
     packets, rng = log.record.packets, np.random.default_rng(0)
     packets[:, PACKET.value] += 2.0
-    packets[:, find_packet_column("gps", "hdop")] = rng.uniform(0.5, 6.0, len(packets))
-    packets[:, find_packet_column("gps", "satellites")] = rng.integers(2, 12, len(packets))
+    packets[:, HDOP] = rng.uniform(0.5, 6.0, len(packets))
+    packets[:, SATELLITES] = rng.integers(2, 12, len(packets))
     wheels = [FAST.wheel_left, FAST.wheel_right]
     log.record.fast[:, wheels] *= np.linspace(0.5, 2.0, len(log.record.fast))[:, None]
     return log
@@ -47,7 +48,7 @@ def test_a_gps_in_the_cameras_place_gives_the_same_bits(
     expected = ours.run(log.record)
     assert expected["psi"][-1] > 1.5 and ours.counts["poor"] > 0
     monkeypatch.setitem(MEASUREMENTS, "camera", MEASUREMENTS["gps"])
-    monkeypatch.setattr(models, "SLOW", SLOW[::-1])
+    monkeypatch.setattr(assemble, "SLOW", SLOW[::-1])
     log.record.packets[:, PACKET.sensor] = CAMERA
     moved = make_estimator("exact-kf", sensors={"camera": LATE}, **options)
     found = moved.run(log.record)
@@ -68,7 +69,7 @@ def test_a_sensor_is_what_its_entry_says(log: Any, monkeypatch: Any) -> None:
     assert not f.heading_fix[GPS] and not f.angle[GPS].any() and not f.noise_over_speed[GPS].any()
     packets, quiet = log.record.packets, [FAST.gyro, FAST.steer]
     packets[:, PACKET.value], log.record.fast[:, quiet] = 3.0, 0.0
-    packets[:, find_packet_column("gps", "satellites")] = 12.0
+    packets[:, SATELLITES] = 12.0
     assert filter_.run(log)["y_l"][-1] == pytest.approx(3.0, abs=0.3)
 
 
@@ -79,5 +80,8 @@ def test_every_slow_sensor_has_an_entry() -> None:
         rows = MEASUREMENTS[kind.name].rows
         assert len(rows) <= len(kind.values)
         assert select_states((kind.name,))[:2] == ("beta", "gamma")
-    assert find_packet_column("gps", "hdop") == PACKET.value + 4
-    assert find_packet_column("camera", "hdop") == 0
+    f = make_estimator(
+        "joint", sensors={"camera": SlowSensor(0.04), "gps": SlowSensor(0.2)}
+    ).filters[0]
+    assert (f.hdop_column[GPS], f.satellites_column[GPS]) == (HDOP, SATELLITES)
+    assert f.hdop_column[CAMERA] == f.satellites_column[CAMERA] == f.speed_column[CAMERA] == 0

@@ -19,7 +19,7 @@ from sideslip.envs.vehicle.linear import (
 from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
-from sideslip.estimators.design.models import make_signals
+from sideslip.estimators.design.assemble import _make_signals
 from tests.envs.vehicle.test_linear import make_velocity_roll_model
 from tests.estimators.filters.literal import car
 from tests.estimators.simulation import CAMERA, GPS
@@ -130,7 +130,7 @@ def test_process_noise_means_the_same_at_every_tick() -> None:
 @pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
 def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
     row = np.random.default_rng(0).normal(size=len(FAST))
-    found = sum(factor * row[column] for column, factor in make_signals(vehicle)["N_z"])
+    found = sum(factor * row[column] for column, factor in _make_signals(vehicle)["N_z"])
     torques = row[FAST.torque_left], row[FAST.torque_right]
     assert found == pytest.approx(
         as_python(compute_yaw_moment)(*torques, make_car(vehicle)), rel=1e-12

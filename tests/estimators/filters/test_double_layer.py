@@ -9,7 +9,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS, GRAVITY
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design.periodic import NO_SENSOR, design_gains
+from sideslip.estimators.design.periodic import NO_SENSOR, design_and_map
 from tests.estimators.simulation import FIG6, GPS, simulate
 
 from .literal import (
@@ -257,7 +257,7 @@ def test_the_two_state_observer() -> None:
     reached = np.linalg.eigvals((np.eye(2) - K @ C) @ G)
     np.testing.assert_allclose(np.sort(reached), np.sort(poles), rtol=1e-9)
     filter_ = make_estimator("lob-2", speed=V)
-    table, _ = design_gains(filter_.filters[0], NO_SENSOR, V, filter_.config)
+    table, _ = design_and_map(filter_.filters[0], NO_SENSOR, V, filter_.config)
     np.testing.assert_allclose(table[1, :2], K[:, 0], rtol=1e-9)
     wanted = observer(log, G, H, C, K, inputs, [FAST.gyro])
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)

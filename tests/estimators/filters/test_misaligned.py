@@ -11,8 +11,8 @@ from sideslip.envs import COMS, Log
 from sideslip.envs.record import FAST, PACKET, Record
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.core.model import build_model, compute_axle_force
-from sideslip.estimators.core.predict import linearise
+from sideslip.estimators.core.model import build_model
+from sideslip.estimators.core.predict import _compute_axle_force, linearise
 from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.core.test_consistency import within
 from tests.estimators.core.test_wary import CAMERA as CAMERA_PLACE
@@ -39,7 +39,7 @@ def test_an_estimated_tyre_s_model_is_the_force_at_the_angle_less_the_offset() -
         turn = 0.3 / 7.0
         slips = (steer - offset - 0.02 - COMS.front_arm * turn, COMS.rear_arm * turn - 0.02)
         front, rear = (
-            compute_axle_force(f.stiffness[i], f.load[i], slips[i], 1.0, f.x[f.grip])[0]
+            _compute_axle_force(f.stiffness[i], f.load[i], slips[i], 1.0, f.x[f.grip])[0]
             for i in range(2)
         )
         moment = COMS.front_arm * front - COMS.rear_arm * rear

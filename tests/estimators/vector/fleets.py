@@ -9,10 +9,15 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import sideslip  # noqa: F401  registers the environments
+from sideslip.envs import COMS
 from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
+from sideslip.envs.ticks import TICK
 from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.vector.batch import build_batch
 from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
+from sideslip.estimators.wrappers.estimate import EstimatorSpec
+from sideslip.estimators.wrappers.outputs import Observed, OutputTable, StepRecord
 from tests.envs import batches
 from tests.envs.helpers import bits
 
@@ -26,6 +31,42 @@ def home(name: str) -> tuple[str, str]:
     """An id whose sensors a filter can use, and the sensor's name."""
     slow = FILTERS[name].slow
     return (GPS, "gps") if slow and "camera" not in slow else (VISION, "camera")
+
+
+def make_batch(
+    name: Any,
+    count: int,
+    vehicle: Any = COMS,
+    sensors: Any = None,
+    speed: Any = None,
+    dt: float = TICK,
+    **options: Any,
+) -> Any:
+    """Filters side by side, reset to tick 0; a list has what each one is told."""
+    told = vehicle, sensors or {}, speed
+    lists = [each if isinstance(each, list) else [each] * count for each in told]
+    batch = build_batch(name, list(map(EstimatorSpec, *lists)), dt, options)
+    batch.reset(np.ones(count, np.bool_))
+    return batch
+
+
+def step(batch: Any, fast: Any, packets: Any, counts: Any = None, rows: Any = None) -> None:
+    """Give each filter its rows and packets, all of them or so many."""
+    N, obs = len(batch), np.zeros((len(batch), 0), np.float32)
+    record = [np.ascontiguousarray(each, np.float64) for each in (fast, packets)]
+    told = zip((rows, counts), record, strict=True)
+    numbers = [np.full(N, x.shape[1]) if each is None else np.array(each) for each, x in told]
+    table = OutputTable(0, np.zeros((0, 3), np.int64), np.zeros(0))
+    observed = Observed(obs, table, np.zeros(N), np.zeros(N), obs, np.zeros((N, 4)))
+    batch.take(None, StepRecord(record[0], numbers[0], record[1], numbers[1]), observed)
+
+
+def states(batch: Any) -> Any:
+    return np.array([each.x for each in batch])
+
+
+def covariances(batch: Any) -> Any:
+    return np.array([each.P for each in batch])
 
 
 def outputs(name: str) -> list[str]:

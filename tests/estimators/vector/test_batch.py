@@ -12,9 +12,9 @@ from sideslip.envs import COMS, Log, SlowSensor
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector.batch import BatchEstimator
-from sideslip.estimators.vector.make import make_batch
 from sideslip.estimators.wrappers.estimate import EstimatorSpec
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
+from tests.estimators.vector.fleets import covariances, make_batch, states, step
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -45,7 +45,7 @@ def feed(batch: BatchEstimator, logs: list[Log], n: int, first: int = 0, last: i
         packets = np.full((len(logs), max(map(len, came)), PACKET_WIDTH), np.nan)
         for i, each in enumerate(came):
             packets[i, : len(each)] = each
-        batch.step(np.array(rows), packets, [len(each) for each in came])
+        step(batch, np.array(rows), packets, [len(each) for each in came])
 
 
 def home(name: str) -> tuple[str, SlowSensor]:
@@ -55,10 +55,9 @@ def home(name: str) -> tuple[str, SlowSensor]:
 
 
 def same_bits(batch: BatchEstimator, singles: list[Any]) -> None:
-    np.testing.assert_array_equal(batch.x, [each.x for each in singles], strict=True)
-    np.testing.assert_array_equal(batch.P, [each.P for each in singles], strict=True)
-    for name, counts in batch.counts.items():
-        assert counts.tolist() == [each.counts[name] for each in singles]
+    np.testing.assert_array_equal(states(batch), [each.x for each in singles], strict=True)
+    np.testing.assert_array_equal(covariances(batch), [each.P for each in singles], strict=True)
+    assert [each.counts for each in batch] == [each.counts for each in singles]
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -76,8 +75,9 @@ def test_every_row_is_the_filter_alone(name: Any, speed: Any) -> None:
     feed(batch, logs, 33)
     found = [single.run(log) for single, log in zip(singles, logs, strict=True)]
     same_bits(batch, singles)
-    assert len(np.unique(batch.x[:, 0])) == 3
-    for one, other in zip(batch.run(logs), found, strict=True):
+    assert len(np.unique(states(batch)[:, 0])) == 3
+    for i, other in enumerate(found):
+        one = batch[i].run(logs[i])
         np.testing.assert_array_equal(one.x, other.x)
         np.testing.assert_array_equal(one.std, other.std)
 
@@ -93,18 +93,19 @@ def test_covariances_are_each_rows_own(n: Any) -> None:
     for single, log in zip(singles, logs, strict=True):
         single.run(log)
     same_bits(batch, singles)
-    assert len({P.tobytes() for P in batch.P}) > 4
+    assert len({each.P.tobytes() for each in batch}) > 4
 
 
 def test_a_masked_reset_starts_some_rows_anew() -> None:
     logs = drives(3, *home("multirate-kf"), seconds=0.08)
     batch = make_batch("multirate-kf", 3, sensors=[log.slow for log in logs], speed=SPEED)
     feed(batch, logs, 10)
-    before = batch.x
-    phases = [{"camera": dataclasses.replace(CAMERA, phase=0.007 + 0.001 * i)} for i in range(3)]
-    batch.reset([False, True, False], phases)
-    np.testing.assert_array_equal(batch.x[[0, 2]], before[[0, 2]])
-    assert batch.x[1].tolist() == [0.0] * len(batch.names)
+    before = states(batch)
+    other = EstimatorSpec(COMS, {"camera": dataclasses.replace(CAMERA, phase=0.008)}, SPEED)
+    batch.configure([1], [other])
+    batch.reset(np.array([False, True, False]))
+    np.testing.assert_array_equal(states(batch)[[0, 2]], before[[0, 2]])
+    assert batch[1].x.tolist() == [0.0] * len(batch.names)
     assert [each.filters[0].phase[0] for each in batch] == [0, 8, 6]
     assert [each.tick for each in batch] == [80, -1, 80]
 
@@ -114,7 +115,7 @@ def test_a_row_without_ticks_and_packets_stands_still() -> None:
     logs = drives(2, *home("bicycle-kf"), seconds=0.05)
     batch = make_batch("bicycle-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
     fast = np.array([log.record.fast[:20] for log in logs])
-    batch.step(fast, np.zeros((2, 0, PACKET_WIDTH)), rows=[20, 0])
+    step(batch, fast, np.zeros((2, 0, PACKET_WIDTH)), rows=[20, 0])
     assert [each.tick for each in batch] == [19, -1]
     alone = make_estimator("bicycle-kf", sensors=logs[0].slow, speed=SPEED)
     alone.step(fast[0], np.zeros((0, PACKET_WIDTH)))
@@ -137,13 +138,13 @@ def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
     batch = make_batch("multirate-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
     feed(batch, logs, 10, 0, 150)
     batch.configure([1], [EstimatorSpec(COMS, later.slow, SPEED)])
-    batch.reset([False, True])
+    batch.reset(np.array([False, True]))
     fast, packets = later.record.fast[:100], later.record.packets
     for k in range(0, 100, 10):
         came = packets[(packets[:, PACKET.arrived] >= k) & (packets[:, PACKET.arrived] < k + 10)]
         empty = np.zeros((2, len(came), PACKET_WIDTH))
         empty[1] = came
-        batch.step(np.array([fast[k : k + 10]] * 2), empty, [0, len(came)], [0, 10])
+        step(batch, np.array([fast[k : k + 10]] * 2), empty, [0, len(came)], [0, 10])
     alone = make_estimator("multirate-kf", sensors=later.slow, speed=SPEED)
     alone.step(fast, packets[packets[:, PACKET.arrived] < 100])
     kept = make_estimator("multirate-kf", sensors=logs[0].slow, speed=SPEED)
@@ -159,9 +160,9 @@ def test_snapshots_and_copies_continue_bit_for_bit() -> None:
     snapshot, twin = batch.get_state(), copy.deepcopy(batch)
     thawed = pickle.loads(pickle.dumps(batch))
     feed(batch, logs, 10, 200)
-    once = batch.x, batch.P
+    once = states(batch), covariances(batch)
     batch.set_state(snapshot)
     for each in (batch, twin, thawed):
         feed(each, logs, 10, 200)
-        np.testing.assert_array_equal(each.x, once[0])
-        np.testing.assert_array_equal(each.P, once[1])
+        np.testing.assert_array_equal(states(each), once[0])
+        np.testing.assert_array_equal(covariances(each), once[1])

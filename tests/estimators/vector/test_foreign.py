@@ -10,7 +10,6 @@ from sideslip.envs import COMS
 from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
-from sideslip.estimators.vector.make import make_batch
 from sideslip.estimators.vector.truth import TruthObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs import batches
@@ -20,9 +19,11 @@ from tests.estimators.vector.fleets import (
     VISION,
     actions,
     drive_both,
+    make_batch,
     native,
     pair,
     same_bits,
+    step,
 )
 from tests.estimators.wrappers.constant import Constant
 
@@ -96,12 +97,11 @@ def test_a_nan_of_one_row_ends_its_episode_alone() -> None:
 
 
 def test_a_batch_by_itself() -> None:
-    """`make_batch` of a user's own: shapes and runs."""
-    batch: Any = make_batch(Constant, 2, sensors={}, speed=[7.0, 8.0])
-    assert batch.x.shape == (2, 3) and batch.P.shape == (2, 3, 3)
+    """Of a user's own: each row has its speed, rows and packets."""
+    batch = make_batch(Constant, 2, speed=[7.0, 8.0])
     assert [each.inner.arguments["speed"] for each in batch] == [7.0, 8.0]
     fast, packets = np.zeros((2, 4, FAST_WIDTH)), np.zeros((2, 1, PACKET_WIDTH))
-    batch.step(fast, packets, rows=[4, 2], counts=[0, 1])
+    step(batch, fast, packets, rows=[4, 2], counts=[0, 1])
     assert [len(each) for each in batch[1].inner.calls[-1]] == [2, 1]
 
 
@@ -127,8 +127,8 @@ def test_a_snapshot_of_a_wrapped_vector_env_continues_bit_for_bit(layer: Any, mo
     else:
         env = EstimateObservation(native(mode, **PHASE), layer)
     env.reset(seed=2)
-    for step in range(7):  # the last action ends a row
-        env.step(actions(env, step))
+    for i in range(7):  # the last action ends a row
+        env.step(actions(env, i))
     snapshot = env.get_state()
     steps = 10 if layer == UKF else 30
     once = [env.step(actions(env, step)) for step in range(7, 7 + steps)]
@@ -138,8 +138,8 @@ def test_a_snapshot_of_a_wrapped_vector_env_continues_bit_for_bit(layer: Any, mo
     env.step(actions(env, 1))
     for _ in range(2):
         env.set_state(snapshot)
-        for step, before in enumerate(once, start=7):
-            same_bits(env.step(actions(env, step)), before)
+        for i, before in enumerate(once, start=7):
+            same_bits(env.step(actions(env, i)), before)
 
 
 def test_a_snapshot_brings_back_the_rows_that_a_mask_leaves_alone() -> None:

@@ -16,9 +16,9 @@ from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
 from sideslip.estimators.vector.lanes import _MIN_LANES, BLOCK, make_blocks
-from sideslip.estimators.vector.make import make_batch
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
+from tests.estimators.vector.fleets import make_batch, states, step
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
 
 pytestmark = [
@@ -110,11 +110,11 @@ def test_rows_that_stand_still_or_begin_anew_leave_their_block_alone() -> None:
     for k in range(0, 100, 10):
         rows = [(i + k // 10) % 3 * 5 for i in range(COUNT)]  # 0, 5 or 10 of them
         fast = np.array([log.record.fast[k : k + 10] for log in logs])
-        batch.step(fast, np.zeros((COUNT, 0, PACKET_WIDTH)), rows=rows)
+        step(batch, fast, np.zeros((COUNT, 0, PACKET_WIDTH)), rows=rows)
         for i, each in enumerate(other):
             each.step(fast[i, : rows[i]], none)
         if k == 50:
-            batch.reset([i == 7 for i in range(COUNT)])
+            batch.reset(np.arange(COUNT) == 7)
             other[7].reset()
     same_bits(batch, other)
 
@@ -130,10 +130,10 @@ def test_a_snapshot_of_another_speed_brings_its_model_along() -> None:
     feed(batch, logs, 10, last=60)
     snapshot = batch.get_state()
     feed(batch, logs, 10, first=60)
-    once = batch.x
+    once = states(batch)
     batch.set_state(snapshot)
     feed(batch, logs, 10, first=60)
-    np.testing.assert_array_equal(batch.x, once)
+    np.testing.assert_array_equal(states(batch), once)
 
 
 def test_which_filters_are_in_lanes() -> None:

@@ -49,7 +49,7 @@ def test_own_covariance_where_arrivals_differ(count: Any, mode: Any) -> None:
     layer = {"estimator": "exact-kf", "outputs": ["y_l", "gamma"], "replace": True}
     alone, together = pair(UNEVEN, count, mode, [layer], camera={"phase": None})
     assert drive_both(alone, together, 40, seed=3) > 0
-    assert count == 1 or len({P.tobytes() for P in together.estimator.P}) > 4
+    assert count == 1 or len({each.P.tobytes() for each in together.estimator}) > 4
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -11,19 +11,14 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import SyncVectorEnv
 
-from sideslip.envs import COMS
-from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
-from sideslip.estimators.vector.make import make_batch
 from tests.estimators.simulation import CAMERA, GPS
-from tests.estimators.vector.fleets import BAD, VISION, actions, fleet, native
-from tests.estimators.vector.test_batch import SPEED, drives
+from tests.estimators.vector.fleets import BAD, VISION, actions, fleet, make_batch, native
 from tests.estimators.wrappers.constant import Constant
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 STILL = np.zeros((2, 1), np.float32)
-FAST, PACKETS = np.zeros((2, 5, FAST_WIDTH)), np.zeros((2, 3, PACKET_WIDTH))
 FIG7: Any = {"scenario": "tie-vision-fig7"}
 
 
@@ -41,14 +36,6 @@ def reset(estimator: Any, told: Any = None, **arguments: Any) -> Any:
 def batch(**changes: Any) -> Any:
     told: dict[str, Any] = {"count": 2, "sensors": {"camera": CAMERA}} | changes
     return make_batch("multirate-kf", **told)
-
-
-def step(*arguments: Any) -> None:
-    made = batch(speed=SPEED)
-    try:
-        made.step(*arguments)
-    finally:  # nothing was stepped
-        assert [each.tick for each in made] == [-1, -1]
 
 
 def changing(speed: float | None, **_: Any) -> Constant:
@@ -83,18 +70,8 @@ REFUSALS: dict[type[Exception], dict[str, Callable[[], Any]]] = {
         "no state 'psi'": lambda: wrap(estimator="bicycle-kf", outputs=["psi"]),
         r"x has shape \(3,\)": lambda: reset(Constant, options={"value": (1.0, 2.0)}),
         "filters of a batch have the same states, row 0 has": lambda: reset(changing, FIG7),
-        "at least one filter, got 0": lambda: batch(count=0),
-        "vehicle: one or a list of 2, got 1": lambda: batch(vehicle=[COMS]),
-        "sensors: one or a list of 2, got 3": lambda: batch(sensors=[{"camera": CAMERA}] * 3),
-        "speed: one or a list of 2, got 1": lambda: batch(speed=[1.0]),
         "needs the slow sensor camera": lambda: batch(sensors={"gps": GPS}, slow="camera"),
         "same states, row 0 .*row 1": lambda: batch(sensors=[{"camera": CAMERA}, {"gps": GPS}]),
-        r"fast rows have shape \(2, k, \d+\), got \(5, \d+\)": lambda: step(FAST[0], PACKETS),
-        r"packets have shape \(2, k, \d+\), got \(1, 3, \d+\)": lambda: step(FAST, PACKETS[:1]),
-        "counts are 0 to 3, got 0 to 4": lambda: step(FAST, PACKETS, [0, 4]),
-        "rows are 0 to 5, got -1 to 5": lambda: step(FAST, PACKETS, [0, 0], [-1, 5]),
-        r"mask has shape \(2,\) and dtype bool, got \(3,\)": lambda: batch().reset([True] * 3),
-        "2 filters, got 1 records": lambda: batch().run(drives(1, "camera", CAMERA, 0.05)),
     },
 }
 
