@@ -9,12 +9,14 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from ..envs.scenarios.world import GROUPS, make_world
 from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .control.run import Results, measure
 from .control.score import rank_entries
@@ -24,6 +26,8 @@ from .control.tasks import (
     STATE,
     STEERING,
     TITLES,
+    WORLD,
+    ControlTask,
     list_scored_tasks,
     make_salt,
     make_task_seeds,
@@ -54,7 +58,8 @@ _TRANSFER = {
 }
 """Columns of transfer: scenario, metric, factor and format."""
 _RIVAL = (REFERENCE_CONTROLLER, "ratio")  # against whom costs are paired there
-EPISODES = 32  # a contest
+EPISODES, _DOUBLED_EPISODES = 32, 16  # a contest
+_DOUBLED = ", ranges doubled"
 
 
 def _measure_entries(
@@ -64,24 +69,40 @@ def _measure_entries(
     keep: Path | None = None,
 ) -> list[ResultRow]:
     """Drive the entries and nominal in every scored contest with steering; return their rows."""
-    tasks = [item for item in list_scored_tasks() if item.env_id == STEERING]
     policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
     pairs = [(NOMINAL, ""), *(pair for pairs in ENTRIES.values() for pair in pairs)]
-    cases = [
-        (task, Entry(*pair))
-        for task in tasks
-        for pair in pairs
-        if policies.get(pair[0], task.kind) == task.kind
-    ]
-    salt = salt or make_salt()
-    seeds = make_task_seeds(salt, EPISODES)
-    results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
-    check_driven(results)
-    suite = Suite("control", "", "")
-    for tier in TITLES:
-        for standing in rank_entries(results, tier):
-            standing.add_rows(suite, salt)
-    return [row for row in suite.rows if row.metric in METRICS]
+    salt, rows = salt or make_salt(), list[ResultRow]()
+    for changes, episodes in (({}, EPISODES), ({"world": _double_ranges()}, _DOUBLED_EPISODES)):
+        cases = [
+            (replace(task, changes=changes), Entry(*pair))
+            for task in _list_tasks()
+            for pair in pairs
+            if policies.get(pair[0], task.kind) == task.kind
+        ]
+        seeds = make_task_seeds(salt, episodes)
+        results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
+        check_driven(results)
+        suite = Suite("control", "", "")
+        for tier in TITLES:
+            for standing in rank_entries(results, tier):
+                standing.add_rows(suite, salt)
+        suffix = _DOUBLED if changes else ""
+        rows += [
+            replace(x, scenario=x.scenario + suffix) for x in suite.rows if x.metric in METRICS
+        ]
+    return rows
+
+
+def _list_tasks() -> list[ControlTask]:
+    return [task for task in list_scored_tasks() if task.env_id == STEERING]
+
+
+def _double_ranges() -> dict[str, Any]:
+    """Make the world with all ranges doubled, which designs are told as they are told their own."""
+    world = make_world(WORLD)
+    for group in GROUPS:
+        world = world.scale(group, 2.0)
+    return world.to_dict()
 
 
 def check_driven(results: Results) -> None:
@@ -156,12 +177,25 @@ def make_task_table(rows: Sequence[ResultRow]) -> str:
         Markdown.
     """
     cells = _Cells(rows)
-    tasks = [task for task in list_scored_tasks() if task.env_id == STEERING]
     lines = [
         [task.scenario, *(cells.format(task.name, pairs, True) for pairs in ENTRIES.values())]
-        for task in tasks
+        for task in _list_tasks()
     ]
     return format_table(lines, list(ENTRIES))
+
+
+def make_doubled_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table of the world whose ranges are doubled: a line an entry, a column a tier.
+
+    Args:
+        rows: Rows of the entries by tier.
+
+    Returns:
+        Markdown.
+    """
+    cells, heads = _Cells(rows), [f"tier {tier}{_DOUBLED}" for tier in TITLES]
+    lines = [[name, *(cells.format(x, ENTRIES[name], True) for x in heads)] for name in ENTRIES]
+    return format_table(lines, heads)
 
 
 def format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
@@ -229,11 +263,12 @@ def write_tables(rows: Sequence[ResultRow]) -> None:
         rows: Rows of the entries.
     """
     transfer = read_json(TRANSFER) if TRANSFER.is_file() else []
-    pages = {README: make_table(rows, transfer), PAGE: make_task_table(rows)}
-    texts = {path: replace_table(path.read_text(encoding="utf-8"), x) for path, x in pages.items()}
+    readme = replace_table(README.read_text(encoding="utf-8"), make_table(rows, transfer))
+    page = replace_table(PAGE.read_text(encoding="utf-8"), make_task_table(rows))
+    page = replace_table(page, make_doubled_table(rows))
     write_json(ROWS, rows)
-    for path, text in texts.items():
-        write_text(path, text)
+    write_text(README, readme)
+    write_text(PAGE, page)
 
 
 def _main(

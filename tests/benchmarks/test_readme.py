@@ -18,11 +18,13 @@ ROOT = Path(readme.__file__ or "").resolve().parents[1]
 def test_the_tables_are_made_from_their_files() -> None:
     rows, transfer = (read_json(ROOT / path) for path in (readme.ROWS, readme.TRANSFER))
     pages = {readme.README: readme.make_table(rows, transfer)}
+    doubled = readme.make_doubled_table(rows)
     pages[readme.PAGE] = readme.make_task_table(rows)
     pages[own_ground.PAGE] = own_ground.make_table(read_json(ROOT / own_ground.ROWS))
     for path, made in pages.items():
         text = (ROOT / path).read_text()
         assert readme.replace_table(text, made) == text
+        assert path != readme.PAGE or readme.replace_table(text, doubled) == text
         assert re.search(rf"\b{readme.EPISODES} (drives|seeds)\b", text)
 
 
