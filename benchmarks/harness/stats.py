@@ -257,29 +257,6 @@ def compute_tail_mean(costs: Array) -> Estimate:
     return Estimate(value, value / reach, value * reach)
 
 
-def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
-    """Compute the sum over strata of the mean top over that of the mean bottom.
-
-    The interval is that of the mean residual top - ratio x bottom of each episode.
-
-    Args:
-        tops: Numerators of each stratum, shape (n_i,).
-        bottoms: Denominators of the same episodes, shape (n_i,).
-
-    Returns:
-        Ratio and interval; NaN without strata, or where the sum of bottoms is not positive.
-    """
-    if not tops or min(map(len, tops)) == 0:
-        return Estimate(math.nan)
-    above, below = (sum(float(np.mean(stratum)) for stratum in side) for side in (tops, bottoms))
-    if not below > 0.0:
-        return Estimate(math.nan)
-    ratio = above / below
-    pairs = zip(tops, bottoms, strict=True)
-    reach = margin_of_error(*((top - ratio * bottom) / below for top, bottom in pairs))
-    return Estimate(ratio, ratio - reach, ratio + reach)
-
-
 def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
     """Check whether a share is surely larger than another of the same drives: McNemar's exact test.
 

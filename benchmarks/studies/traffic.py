@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from ...agents import make_agent
-from ...agents.baselines import make_oracle
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.task import FAILURES
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..control.entries import REFERENCE_FILTER, ControlCase, Entry
+from ..control.entries import REFERENCE_FILTER, Entry
 from ..control.tasks import ORACLES, STATE, ControlTask
-from ..harness.drives import call_quietly, make_env
+from ..harness.drives import call_quietly
 from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
 from ..harness.verdict import format_percent, format_verdict
@@ -41,16 +40,7 @@ READERS = ("multirate-residual-kf", "exact-kf", _RETURNED, _NEWEST)
 def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
     """Run a controller on some seeds: cost, failure and largest slip (rad) of each."""
     controller, seeds = case
-    entry = Entry(controller, _READS.get(controller, REFERENCE_FILTER))
-    contest = ControlCase(_TASK, entry)
-    if entry.is_oracle:
-        env, agent = make_oracle(contest.driver, ID, options=contest.options, **contest.env_options)
-    else:
-        name, options = "", dict[str, Any]()
-        if entry.estimator:
-            name, options = "exact-kf", contest.estimate_options
-        env = make_env(ID, name, options, **contest.env_options)
-        agent = make_agent(controller, env, **contest.agent_options)
+    env, agent = Entry(controller, _READS.get(controller, REFERENCE_FILTER)).make(_TASK)
     rows = []
     for seed in seeds:
         steps = list(iterate_steps(env, agent, FIRST_SEED + seed))
