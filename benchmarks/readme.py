@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 
 from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
-from .control.run import Results, measure
+from .control.run import measure
 from .control.score import rank_entries
 from .control.tasks import (
     LIMIT,
@@ -76,19 +76,14 @@ def _measure_entries(
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, EPISODES)
     results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
-    _check_driven(results)
+    for (task, entry), result in results.items():
+        if result.error:
+            raise ValueError(f"{entry.label} in {task.name}: {result.error}")
     suite = Suite("control", "", "")
     for tier in TITLES:
         for standing in rank_entries(results, tier):
             standing.add_rows(suite, salt)
     return [row for row in suite.rows if row.metric in METRICS]
-
-
-def _check_driven(results: Results) -> None:
-    """Raise ValueError for an entry that could not drive."""
-    for (task, entry), result in results.items():
-        if result.error:
-            raise ValueError(f"{entry.label} in {task.name}: {result.error}")
 
 
 class _Cells:
@@ -118,16 +113,8 @@ class _Cells:
         return f"{number}{ends} ({100.0 * lost.value:.0f})"
 
 
-def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
-    """Make README's table: a line an entry, a column a tier, and columns of transfer.
-
-    Args:
-        rows: Rows of the entries by tier.
-        transfer: Rows of the suite of procedures.
-
-    Returns:
-        Markdown.
-    """
+def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
+    """Make README's table: a line an entry, a column a tier, and columns of transfer."""
     cells, lines = _Cells(rows), []
     far = {(row.scenario, row.controller, row.metric): row for row in transfer}
     for name, pairs in ENTRIES.items():
@@ -142,15 +129,8 @@ def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
     return _format_table(lines, [*tiers, *_TRANSFER])
 
 
-def make_task_table(rows: Sequence[ResultRow]) -> str:
-    """Make the table by task: a line a task, a column an entry, with 95 % intervals.
-
-    Args:
-        rows: Rows of the entries by task.
-
-    Returns:
-        Markdown.
-    """
+def _make_task_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table by task: a line a task, a column an entry, with 95 % intervals."""
     cells = _Cells(rows)
     tasks = [task for task in list_scored_tasks() if task.env_id == STEERING]
     lines = [
@@ -189,19 +169,8 @@ def _make_headlines(root: Path) -> list[str]:
     ]
 
 
-def replace_table(text: str, new_table: str) -> str:
-    """Replace a page's table with the same first column head.
-
-    Args:
-        text: Page.
-        new_table: Markdown.
-
-    Returns:
-        Page with the new table.
-
-    Raises:
-        ValueError: The page has no such table, or several.
-    """
+def _replace_table(text: str, new_table: str) -> str:
+    """Replace a page's table with the same first column head; ValueError without exactly one."""
     first = re.escape(new_table.split(" | ")[1].split(",")[0])
     pattern = re.compile(rf"^\| \| {first}[^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
@@ -209,15 +178,11 @@ def replace_table(text: str, new_table: str) -> str:
     return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def write_tables(rows: Sequence[ResultRow]) -> None:
-    """Write rows and the tables made of them, in the repository's root.
-
-    Args:
-        rows: Rows of the entries.
-    """
+def _write_tables(rows: Sequence[ResultRow]) -> None:
+    """Write rows and the tables made of them, in the repository's root."""
     transfer = read_json(TRANSFER) if TRANSFER.is_file() else []
-    pages = {README: make_table(rows, transfer), PAGE: make_task_table(rows)}
-    texts = {path: replace_table(path.read_text(encoding="utf-8"), x) for path, x in pages.items()}
+    pages = {README: _make_table(rows, transfer), PAGE: _make_task_table(rows)}
+    texts = {path: _replace_table(path.read_text(encoding="utf-8"), x) for path, x in pages.items()}
     write_json(ROWS, rows)
     for path, text in texts.items():
         write_text(path, text)
@@ -231,7 +196,7 @@ def _main(
 ) -> None:
     """Drive README's entries and write their rows and tables."""
     console = Console(stderr=True)
-    write_tables(read_json(ROWS) if driven else _measure_entries(jobs, console, salt, keep))
+    _write_tables(read_json(ROWS) if driven else _measure_entries(jobs, console, salt, keep))
 
 
 if __name__ == "__main__":

@@ -147,24 +147,20 @@ def run_chunk(chunk: Chunk) -> DriveResult:
     Returns:
         Episodes; why an entry cannot be built or driven is its `error`.
     """
+    start_time = time.process_time()
     try:
-        return _run_chunk(chunk)
+        env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
+        steps = iterate_steps(env, agent, list(chunk.seeds))
+        reset = next(steps)
+        tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
+        for step in steps:
+            if chunk.keep and step.running[0]:
+                series.append(_read_signals(env, step))
+            tally.add(step)
+        env.close()
     except Exception as error:
         empty = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
         return DriveResult(empty, np.nan, error=describe_error(error))
-
-
-def _run_chunk(chunk: Chunk) -> DriveResult:
-    start_time = time.process_time()
-    env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
-    steps = iterate_steps(env, agent, list(chunk.seeds))
-    reset = next(steps)
-    tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
-    for step in steps:
-        if chunk.keep and step.running[0]:
-            series.append(_read_signals(env, step))
-        tally.add(step)
-    env.close()
     spent = time.process_time() - start_time
     return DriveResult(tally.numbers(), spent, np.array(series) if chunk.keep else None)
 
@@ -260,20 +256,19 @@ def measure(
         if first < len(case_seeds)
     ]
     request = Request(jobs=jobs, console=console, keep=keep)
-    results = request.run_cases(runner or run_chunk, chunks, title, make_storage(runner))
+    results = request.run_cases(runner or run_chunk, chunks, title, _make_storage(runner))
     parts: dict[ControlCase, list[DriveResult]] = {}
     for chunk, item in zip(chunks, results, strict=True):
         parts.setdefault(chunk.case, []).append(item)
-    return {case: _join_results(item) for case, item in parts.items()}
-
-
-def _join_results(parts: list[DriveResult]) -> DriveResult:
-    return DriveResult(
-        np.concatenate([part.numbers for part in parts]),
-        sum(part.seconds for part in parts),
-        parts[0].series,
-        next((part.error for part in parts if part.error), ""),
-    )
+    return {
+        case: DriveResult(
+            np.concatenate([part.numbers for part in items]),
+            sum(part.seconds for part in items),
+            items[0].series,
+            next((part.error for part in items if part.error), ""),
+        )
+        for case, items in parts.items()
+    }
 
 
 @cache
@@ -285,20 +280,10 @@ def hash_sources() -> str:
     return digest.hexdigest()
 
 
-def make_storage(
+def _make_storage(
     runner: Callable[[Chunk], DriveResult] | None = None,
 ) -> CaseStorage[Chunk, DriveResult]:
-    """Make the storage of finished chunks.
-
-    A result is taken only where sources (those of the plant and the benchmark too) and a policy's
-    weights are the same.
-
-    Args:
-        runner: Function that drives a chunk instead of `run_chunk`, some of whose numbers are NaN.
-
-    Returns:
-        Storage.
-    """
+    """Make the storage of finished chunks; some numbers of another runner's may be NaN."""
     describe = partial(_describe_chunk, runner=runner)
     return CaseStorage(describe, _pack_result, partial(_unpack_result, is_whole=runner is None))
 

@@ -182,19 +182,8 @@ def list_candidates() -> list[ControlTask]:
     ]
 
 
-def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
-    """Read all candidates of a file.
-
-    Args:
-        path: File.
-
-    Returns:
-        Candidates.
-
-    Raises:
-        FileNotFoundError: There is no file.
-        ValueError: It was measured in another world, is cut short, or names what there is not.
-    """
+def _read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
+    """Read all candidates of a file; ValueError for another world, or names that there are not."""
     measurements = []
     for i, item in enumerate(read_objects(path), 1):
         where = f"{path}: entry {i}"
@@ -216,13 +205,13 @@ def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
 
 @cache
 def list_scored_tasks() -> tuple[ControlTask, ...]:
-    """List the scored tasks, tier by tier; raises as `read_tasks`."""
-    return tuple(entry.task for entry in read_tasks() if entry.verdict == "scored")
+    """List the scored tasks, tier by tier; raises as `_read_tasks`."""
+    return tuple(entry.task for entry in _read_tasks() if entry.verdict == "scored")
 
 
 @cache
 def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
-    return {measurement.task: measurement for measurement in read_tasks()} if FILE.is_file() else {}
+    return {item.task: item for item in _read_tasks()} if FILE.is_file() else {}
 
 
 def find_oracle(task: ControlTask, name: str = STATE) -> str:

@@ -110,12 +110,9 @@ def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts,
 
 
 def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
-    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant.
-
-    The filter's input is the moment that the PI commands: opened behind both, a filter with the
-    right model would not show in the loop at all. It has its steady gain and the PI reads the
-    estimate after the correction.
-    """
+    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
+    # The filter's input is the moment that the PI commands: opened behind both, a filter with the
+    # right model would not show in the loop at all.
     import control
 
     plant, asks = _split_loop(vehicle, design, dt)
@@ -153,10 +150,7 @@ class _LoopMatch:
 
 
 def _search(vehicle: Vehicle) -> list[_LoopMatch]:
-    """Search the designs of the grid whose margins both lie within some dB of Table II, best first.
-
-    Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
-    """
+    """Search the grid's designs with both margins near Table II's, as stable, best first."""
     import control
 
     hits = []
@@ -171,7 +165,7 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
             loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = _compute_gain_margin(loop)
             is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
-            if abs(omega * dt - math.pi) > 1e-9 or not is_stable:
+            if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper
                 break
             margins.append(decibels)
         if len(margins) == len(PRINTED):
@@ -184,15 +178,10 @@ _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling ra
 
 
 def _find_crossings(loop: "Loop") -> Array:
-    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
-
-    L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
-    python-control's `stability_margins` finds crossings by a change of sign, and there is none at
-    the end of the axis. The others are bracketed on a grid (4000 points over six decades) and
-    refined: a pair of crossings closer than that is missed.
-
-    Raises ValueError for a loop in continuous time or with several inputs or outputs.
-    """
+    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2)."""
+    # L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
+    # python-control's `stability_margins` finds crossings by a change of sign, and there is none at
+    # the end of the axis. The others are bracketed on a grid and refined.
     if not loop.isdtime(strict=True) or loop.dt is True:
         raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
     if not loop.issiso():

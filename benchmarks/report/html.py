@@ -17,7 +17,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -174,20 +174,11 @@ def _encode_figure(figure: "Figure") -> str:
     for trace, plain in zip(figure.data, content["data"], strict=True):
         for axis, levels in _LEVELS.items():
             values = getattr(trace, axis, None)
-            if _is_line(values):
+            is_line = isinstance(values, np.ndarray) and values.dtype.kind == "f"
+            if is_line and values.ndim == 1 and len(values) > _MIN_PACKED:
                 plain[axis] = _encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
-
-
-def _is_line(values: object) -> TypeGuard[Array]:
-    """Check whether values are many enough, in a row, to be worth their steps."""
-    return (
-        isinstance(values, np.ndarray)
-        and values.dtype.kind == "f"
-        and values.ndim == 1
-        and len(values) > _MIN_PACKED
-    )
 
 
 POINTS = 250  # samples of a cell in a figure with menus

@@ -50,11 +50,7 @@ def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
 
 
 def _keep_lane(case: tuple[str, int]) -> Array:
-    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,).
-
-    Errors of slip, yaw rate, heading (rad, rad/s) and the preview point's offset (m); the car's
-    offset from the lane's centre (m).
-    """
+    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,)."""
     from ...envs.highway.lane_keeping_adapter import STATES, KeepingEnv, NativeObservation
 
     reader, seed = case
@@ -67,7 +63,7 @@ def _keep_lane(case: tuple[str, int]) -> Array:
     agent = make_agent("lane-keeping", env, moment=False)
     names = [entry.name for entry in env.get_wrapper_attr("layout")]
     columns = [names.index(f"{name}_hat") for name in STATES]
-    rows = []
+    rows = []  # errors of slip, yaw rate, heading, preview offset (rad, rad/s, m); offset (m)
     for step in iterate_steps(env, agent, seed):
         rows.append([*(step.obs[columns] - base.truth), base.motion.y])
     return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)

@@ -12,7 +12,7 @@ import pytest
 from sideslip.agents.learned.network import SUFFIX
 from sideslip.benchmarks.control import run
 from sideslip.benchmarks.control.entries import Entry
-from sideslip.benchmarks.control.run import Chunk, DriveResult, make_storage
+from sideslip.benchmarks.control.run import Chunk, DriveResult, _make_storage
 from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.envs.numerics import kernel_cache
@@ -76,7 +76,7 @@ def test_a_damaged_case_is_driven_again(damage: str, tmp_path: Path) -> None:
         driven.append(chunk)
         return DriveResult(numbers, 1.0, series)
 
-    cached = StoredFunction(drive_it, tmp_path, make_storage())
+    cached = StoredFunction(drive_it, tmp_path, _make_storage())
     chunk = Chunk(ControlTask(scenario="gust"), Entry("none"), SEEDS, keep=True)
     cached(chunk)
     (path,) = tmp_path.iterdir()
@@ -112,7 +112,7 @@ def test_other_tuned_options_are_another_case(monkeypatch: pytest.MonkeyPatch) -
     for salt in ("one", "another", "one"):
         monkeypatch.setattr(run, "make_salt", lambda salt=salt: salt)
         run.hash_sources.cache_clear()
-        names.append(make_storage().describe(chunk))
+        names.append(_make_storage().describe(chunk))
     run.hash_sources.cache_clear()
     assert names[0] == names[2] != names[1]
 
@@ -124,5 +124,5 @@ def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None
     for weights in (b"one", b"another", b"one"):
         file.write_bytes(weights)
         chunk = Chunk(ControlTask(scenario="gust"), Entry(str(file)), SEEDS)
-        names.append(make_storage().describe(chunk))
+        names.append(_make_storage().describe(chunk))
     assert names[0] == names[2] != names[1]

@@ -201,7 +201,7 @@ def test_standing_car_and_diverging_plant_end_finite() -> None:
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk = Chunk(GUST, Entry("none"), SEEDS, keep=True)
-    cached = StoredFunction(drive.run_chunk, tmp_path, drive.make_storage())
+    cached = StoredFunction(drive.run_chunk, tmp_path, drive._make_storage())
     first = cached(chunk)
     cached = replace(cached, function=lambda _: pytest.fail("it is driven again"))
     again = cached(chunk)

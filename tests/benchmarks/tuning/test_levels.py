@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.tuning.levels import (
-    convert_levels,
+    _convert_levels,
     draw_drive,
     get_levels,
     run_filter,
@@ -28,7 +28,7 @@ def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
     assert [x.log.record.dt for x in drives] == [0.001] * 3 + [0.01] * 2
     assert all(x.facts["vehicle"] != drives[0].facts["vehicle"] for x in drives[1:])
     for drive in drives:  # the levels in use are the defaults
-        error, deviation = run_filter(drive, convert_levels(get_levels(), drive.log))
+        error, deviation = run_filter(drive, _convert_levels(get_levels(), drive.log))
         assert np.isfinite(error).all() and (deviation > 0.0).all()
 
 
