@@ -18,9 +18,8 @@ from sideslip.benchmarks.control.entries import (
     ControlCase,
     Entry,
 )
-from sideslip.benchmarks.control.run import Chunk, _make_storage, run_chunk
+from sideslip.benchmarks.control.run import Chunk, _StoredDrives
 from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
-from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation
 from tests.benchmarks.conftest import Run
 from tests.policies import VISION
@@ -138,7 +137,7 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     path = a_file(tmp_path)
     task = ControlTask(scenario="gust", changes={"scenario": SHORT})
     chunk = Chunk(task, Entry(str(path)), (1, 2))
-    cached = StoredFunction(run_chunk, tmp_path / "cached", _make_storage())
+    cached = _StoredDrives(tmp_path / "cached")
     first = cached(chunk)
     assert np.array_equal(cached(chunk).numbers, first.numbers)
     policy = load_policy(path)
