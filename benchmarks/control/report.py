@@ -25,7 +25,7 @@ from .baseline_gaps import DELAY_TASK, DELAYS
 from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, Entry
 from .run import SIGNALS
 from .score import PairedDrives, Standing, check_losses
-from .tables import Matrix, is_resolved, subtract
+from .tables import Matrix, compute_gaps, subtract
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask
 
 if TYPE_CHECKING:
@@ -161,7 +161,11 @@ def _describe_resolution(matrix: Matrix) -> str:
     """Describe where nominal and oracle-state lie too close, if that is in half of the tasks."""
     state = next((item for item in matrix.overall if item.entry == Entry(STATE)), None)
     pairs = state.pairs if state else {}
-    close = sum(not is_resolved(pair, task) for task, pair in pairs.items())
+    close = 0
+    for task, pair in pairs.items():
+        slip, yaw = compute_gaps(pair, task)
+        lost = float(np.diff(1.0 - pair.finished.mean(axis=1))[0])
+        close += not (slip > 0.2 or yaw > 1.0 or lost > 0.1)  # deg, deg/s, of the cars
     if 2 * close <= len(pairs):
         return ""
     return (

@@ -319,21 +319,6 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
     return gaps[0], gaps[1]
 
 
-def is_resolved(pair: PairedDrives, task: ControlTask) -> bool:
-    """Check whether nominal and oracle-state lie further apart than instruments resolve.
-
-    Args:
-        pair: Drives of oracle-state and of nominal.
-        task: Their task.
-
-    Returns:
-        Whether a gap exceeds 0.2 deg of slip, 1 deg/s of yaw rate or 10 % of the cars.
-    """
-    slip, yaw = compute_gaps(pair, task)
-    lost = float(np.diff(1.0 - pair.finished.mean(axis=1))[0])
-    return slip > 0.2 or yaw > 1.0 or lost > 0.1
-
-
 def _describe_order(scores: Sequence[Array], foresight: Array | None) -> str:
     """Describe whether a baseline surely scores less than the one before it, which knows less."""
     if foresight is not None and foresight.mean() <= 0.0:

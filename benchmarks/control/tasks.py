@@ -23,7 +23,6 @@ from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.ticks import TICK
 from ...envs.validation import check_choice
-from ...envs.vehicle.parameters import VEHICLES
 from ..harness.results import read_objects
 
 YAW = "sideslip/YawFusion-v0"
@@ -108,28 +107,6 @@ class ControlTask:
         scenario = make_scenario(self.changes.get("scenario", self.scenario))
         rate = SLIP_COST_FLOOR if self.reference == "zero-slip" else COST_FLOOR
         return rate * scenario.duration
-
-
-def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
-    """Make a task's scenario, over its name, with some fields changed.
-
-    Noise comes to the scenario's own; "mass" is a factor on the true car's, of which controllers
-    and filters know nothing.
-
-    Args:
-        task: Task whose scenario is varied.
-        change: Fields of `Scenario`.
-
-    Returns:
-        Scenario as a mapping.
-    """
-    fields, base = dict(change), make_scenario(task.scenario)
-    if "noise" in fields:
-        fields["noise"] = dict(base.noise) | fields["noise"]
-    if "mass" in fields:
-        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
-        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
-    return {"base": task.scenario} | fields
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,17 @@ _RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
 
 @dataclass(frozen=True)
 class Bound:
-    """A relation and a number, such as "<= 0.75"."""
+    """A relation and a number, such as "<= 0.75"; ValueError for an unknown or infinite one."""
 
     relation: str
     value: float
+
+    def __post_init__(self) -> None:
+        if self.relation not in _RELATIONS or not math.isfinite(self.value):
+            raise ValueError(
+                f"expected one of {', '.join(_RELATIONS)} and a finite number, "
+                f"got {self.relation!r} {self.value!r}"
+            )
 
     def __str__(self) -> str:
         return f"{self.relation} {self.value:g}"
@@ -171,6 +178,9 @@ class Claim:
         text: What is claimed.
         *parts: Numbers that show it.
         note: What was found, for the report.
+
+    Raises:
+        ValueError: There is no part.
     """
 
     def __init__(
@@ -178,6 +188,8 @@ class Claim:
     ) -> None:
         self.paper, self.source, self.text = paper, source, text
         self.parts, self.note = parts, note
+        if not parts:
+            raise ValueError(f"{paper} {source}: a claim needs at least one part")
 
     def measure(self, results: Results) -> "MeasuredClaim":
         """Measure every part; ValueError for one without numbers.

@@ -10,7 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -136,17 +136,11 @@ _GRID: dict[str, tuple[float | str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class _LoopMatch:
-    """A design and its two margins in dB, single-rate and multirate."""
+class _LoopMatch(NamedTuple):
+    """A design, and the larger difference (dB) of its margins to the printed ones."""
 
     design: LoopDesign
-    decibels: tuple[float, float]
-
-    @property
-    def off(self) -> float:
-        """The larger difference to the printed margins (dB)."""
-        return max(abs(a - b) for a, b in zip(self.decibels, PRINTED, strict=True))
+    off: float
 
 
 def _search(vehicle: Vehicle) -> list[_LoopMatch]:
@@ -156,7 +150,7 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
     hits = []
     for values in itertools.product(*_GRID.values()):
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
-        design, margins = LoopDesign(**options), []
+        design, differences = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
             # a screen, before all crossings
             end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
@@ -167,9 +161,9 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
             is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
             if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper
                 break
-            margins.append(decibels)
-        if len(margins) == len(PRINTED):
-            hits.append(_LoopMatch(design, (margins[0], margins[1])))
+            differences.append(abs(decibels - printed))
+        if len(differences) == len(PRINTED):
+            hits.append(_LoopMatch(design, max(differences)))
     return sorted(hits, key=lambda hit: hit.off)
 
 

@@ -158,10 +158,9 @@ def _encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str
     low, high = (float(v[finite].min()), float(v[finite].max())) if finite.any() else (0.0, 0.0)
     by = (high - low) / (levels - 1) or 1.0
     quanta = np.round((v[finite] - low) / by).astype(int)
-    encoded: list[int | None] = [None] * len(v)
-    for i, step in zip(np.flatnonzero(finite), np.diff(quanta, prepend=0), strict=True):
-        encoded[i] = int(step)
-    return {"from": low, "by": by, "steps": encoded}
+    encoded = np.full(len(v), None)
+    encoded[finite] = np.diff(quanta, prepend=0)
+    return {"from": low, "by": by, "steps": encoded.tolist()}
 
 
 def _encode_figure(figure: "Figure") -> str:

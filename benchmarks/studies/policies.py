@@ -18,6 +18,7 @@ from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
+from ...envs.vehicle.parameters import VEHICLES
 from ...estimators.vector.estimate import EstimateObservation
 from ..control.entries import ADAPTIVE, JOINT, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
@@ -30,7 +31,6 @@ from ..control.tasks import (
     ControlTask,
     list_scored_tasks,
     make_salted_seeds,
-    vary_scenario,
 )
 from ..harness.parallel import run_cases
 from ..harness.results import Column, ResultTable, Suite
@@ -223,6 +223,15 @@ def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
         }
 
 
+def _vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> JsonMap:
+    """Make a task's scenario with some fields changed; "mass" is a factor on the true car's."""
+    fields, base = dict(change), make_scenario(task.scenario)
+    if "mass" in fields:
+        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
+        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
+    return {"base": task.scenario} | fields
+
+
 @dataclass(frozen=True)
 class Lessons:
     """The lessons of a class of tasks: what a student drives and reads, and who teaches it.
@@ -273,7 +282,7 @@ class Lessons:
             for change in _draw_changes(self.varied, rng):
                 scenario_options: JsonMap = {}
                 if change:
-                    scenario_options["scenario"] = vary_scenario(task, change)
+                    scenario_options["scenario"] = _vary_scenario(task, change)
                 name = reads.get(teacher, self.estimator or REFERENCE_FILTER)
                 count = -(-self.cars // self.varied) if change else self.cars
                 scenario_options["lead_in"] = QUICK_LEAD_IN
@@ -324,7 +333,7 @@ def prepare_start(
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
             fields["scenarios"] = [
-                vary_scenario(task, change) if change else task.scenario
+                _vary_scenario(task, change) if change else task.scenario
                 for task in tasks
                 for change in _draw_changes(varied, rng)
             ]

@@ -73,7 +73,13 @@ def test_ratios_are_taken_seed_by_seed() -> None:
     assert pooled == pytest.approx([0.25])
 
 
-def test_a_part_without_numbers_is_refused() -> None:
+def test_bad_claims_are_refused() -> None:
+    with pytest.raises(ValueError, match="'~'"):
+        Bound("~", 1.0)
+    with pytest.raises(ValueError, match="inf"):
+        Bound("<", float("inf"))
+    with pytest.raises(ValueError, match="at least one part"):
+        Claim("p", "(1)", "t")
     empty = {"s": SimulationResult({("a", "beta"): np.zeros(0)})}
     with pytest.raises(ValueError, match=r"\(0,\) numbers"):
         Claim("p", "(1)", "t", ClaimPart("l", "s", "a")).measure(empty)
