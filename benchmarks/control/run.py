@@ -257,9 +257,9 @@ def measure(
         for case, case_seeds in seeds_by_case.items()
         if first < len(case_seeds)
     ]
-    # a worker of a cluster runs in another folder
-    stored = run_chunk if keep is None else _StoredDrives(keep.absolute())
-    results = run_cases(runner or stored, chunks, title, jobs, console)
+    if runner is None:  # a worker of a cluster runs in another folder
+        runner = run_chunk if keep is None else _StoredDrives(keep.absolute())
+    results = run_cases(runner, chunks, title, jobs, console)
     parts: dict[ControlCase, list[DriveResult]] = {}
     for chunk, item in zip(chunks, results, strict=True):
         parts.setdefault(chunk.case, []).append(item)

@@ -148,12 +148,8 @@ def mean_share(values: Array) -> Estimate:
     """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
-    return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
-
-
-def _odds(values: Array, axis: int = -1) -> Array:
-    """Compute the mean of fractions over the mean of their complements."""
-    return ratio_of_means(values, 1.0 - values, axis)
+    odds = interval(values, lambda x, axis: ratio_of_means(x, 1.0 - x, axis))
+    return Estimate(*(x / (1.0 + x) for x in odds))
 
 
 def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:

@@ -79,7 +79,7 @@ class PolicyEvaluation:
         if self.reference != card.reference:
             text += f" Here it is judged by another reference, {self.reference}: by another cost."
         suite, costs = Suite("enjoy", f"{name} on {task.env_id}", text), self.drives[name].costs
-        lines, verdict = [], []
+        lines, verdict = list[dict[str, Any]](), list[str]()
         for label, drive in self.drives.items():
             entry = self.entries[label]
             line: dict[str, Any] = {metric: interval(drive[metric]) for metric in _METRICS}

@@ -6,10 +6,10 @@ from rich.console import Console
 
 from sideslip.benchmarks.tuning.levels import (
     _convert_levels,
+    _search,
     draw_drive,
     get_levels,
     run_filter,
-    search,
 )
 from sideslip.benchmarks.tuning.next_car import PARTS, main
 
@@ -42,7 +42,7 @@ def test_every_part_can_be_left_out() -> None:
 @pytest.mark.long
 def test_levels_that_are_far_off_are_left() -> None:
     start = get_levels() | {"gyro_noise": 0.1, "force_share": 0.5}
-    _, found, before = search(start, 36, 10, 1, Console(quiet=True))
+    _, found, before = _search(start, 36, 10, 1, Console(quiet=True))
     assert found < before - 0.1
 
 
