@@ -298,13 +298,12 @@ class _StoredDrives:
             return _unpack_result(chunk, dict(archive))
         result = self.function(chunk)
         if not result.error:  # which is worth another try
-            series = {} if result.series is None else {"series": result.series}
+            arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": result.seconds}
+            arrays |= {} if result.series is None else {"series": result.series}
             with suppress(OSError):  # a full disk loses the file, not the run
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with atomic_file(path) as file:
-                    np.savez_compressed(
-                        file, numbers=result.numbers, seconds=result.seconds, **series
-                    )
+                    np.savez_compressed(file, **arrays)
         return result
 
 

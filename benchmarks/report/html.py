@@ -173,8 +173,12 @@ def _encode_figure(figure: "Figure") -> str:
     for trace, plain in zip(figure.data, content["data"], strict=True):
         for axis, levels in _LEVELS.items():
             values = getattr(trace, axis, None)
-            is_line = isinstance(values, np.ndarray) and values.dtype.kind == "f"
-            if is_line and values.ndim == 1 and len(values) > _MIN_PACKED:
+            if (
+                isinstance(values, np.ndarray)
+                and values.dtype.kind == "f"
+                and values.ndim == 1
+                and len(values) > _MIN_PACKED
+            ):
                 plain[axis] = _encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
