@@ -143,16 +143,8 @@ class _Cells:
         return f"{number}{ends} ({100.0 * lost.value:.0f})"
 
 
-def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
-    """Make README's table: a line an entry, a column a tier, and columns of transfer.
-
-    Args:
-        rows: Rows of the entries by tier.
-        transfer: Rows of the suite of procedures.
-
-    Returns:
-        Markdown.
-    """
+def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
+    """Make README's table: a line an entry, a column a tier, and columns of transfer."""
     cells, lines = _Cells(rows), []
     far = {(row.scenario, row.controller, row.metric): row for row in transfer}
     for name, pairs in ENTRIES.items():
@@ -167,15 +159,8 @@ def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
     return format_table(lines, [*tiers, *_TRANSFER])
 
 
-def make_task_table(rows: Sequence[ResultRow]) -> str:
-    """Make the table by task: a line a task, a column an entry, with 95 % intervals.
-
-    Args:
-        rows: Rows of the entries by task.
-
-    Returns:
-        Markdown.
-    """
+def _make_task_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table by task: a line a task, a column an entry, with 95 % intervals."""
     cells = _Cells(rows)
     lines = [
         [task.scenario, *(cells.format(task.name, pairs, True) for pairs in ENTRIES.values())]
@@ -184,15 +169,8 @@ def make_task_table(rows: Sequence[ResultRow]) -> str:
     return format_table(lines, list(ENTRIES))
 
 
-def make_doubled_table(rows: Sequence[ResultRow]) -> str:
-    """Make the table of the world whose ranges are doubled: a line an entry, a column a tier.
-
-    Args:
-        rows: Rows of the entries by tier.
-
-    Returns:
-        Markdown.
-    """
+def _make_doubled_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table of the world whose ranges are doubled: a line an entry, a column a tier."""
     cells, heads = _Cells(rows), [f"tier {tier}{_DOUBLED}" for tier in TITLES]
     lines = [[name, *(cells.format(x, ENTRIES[name], True) for x in heads)] for name in ENTRIES]
     return format_table(lines, heads)
@@ -237,18 +215,7 @@ def _make_headlines(root: Path) -> list[str]:
 
 
 def replace_table(text: str, new_table: str) -> str:
-    """Replace a page's table with the same first column head.
-
-    Args:
-        text: Page.
-        new_table: Markdown.
-
-    Returns:
-        Page with the new table.
-
-    Raises:
-        ValueError: The page has no such table, or several.
-    """
+    """Replace a page's table with the same first column head; ValueError without exactly one."""
     first = re.escape(new_table.split(" | ")[1].split(",")[0])
     pattern = re.compile(rf"^\| \| {first}[^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
@@ -256,16 +223,12 @@ def replace_table(text: str, new_table: str) -> str:
     return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def write_tables(rows: Sequence[ResultRow]) -> None:
-    """Write rows and the tables made of them, in the repository's root.
-
-    Args:
-        rows: Rows of the entries.
-    """
+def _write_tables(rows: Sequence[ResultRow]) -> None:
+    """Write rows and the tables made of them, in the repository's root."""
     transfer = read_json(TRANSFER) if TRANSFER.is_file() else []
-    readme = replace_table(README.read_text(encoding="utf-8"), make_table(rows, transfer))
-    page = replace_table(PAGE.read_text(encoding="utf-8"), make_task_table(rows))
-    page = replace_table(page, make_doubled_table(rows))
+    readme = replace_table(README.read_text(encoding="utf-8"), _make_table(rows, transfer))
+    page = replace_table(PAGE.read_text(encoding="utf-8"), _make_task_table(rows))
+    page = replace_table(page, _make_doubled_table(rows))
     write_json(ROWS, rows)
     write_text(README, readme)
     write_text(PAGE, page)
@@ -279,7 +242,7 @@ def _main(
 ) -> None:
     """Drive README's entries and write their rows and tables."""
     console = Console(stderr=True)
-    write_tables(read_json(ROWS) if driven else _measure_entries(jobs, console, salt, keep))
+    _write_tables(read_json(ROWS) if driven else _measure_entries(jobs, console, salt, keep))
 
 
 if __name__ == "__main__":

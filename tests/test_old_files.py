@@ -26,8 +26,8 @@ from sideslip.agents.baselines import read_tuned
 from sideslip.agents.learned.policy import list_shipped, load_policy
 from sideslip.agents.live import controller, messages
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.control.tasks import TaskMeasurement, read_tasks
-from sideslip.benchmarks.entrants.baselines import read_baselines
+from sideslip.benchmarks.control.tasks import TaskMeasurement, _read_tasks
+from sideslip.benchmarks.entrants.baselines import _read_baselines
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
@@ -138,7 +138,7 @@ def test_a_spec_makes_its_environment(file: str, wrapper: type) -> None:
 
 def test_what_the_package_ships_is_read() -> None:
     assert all(load_policy(name).card.env_id for name in list_shipped())
-    assert read_tasks() and read_baselines() and read_tuned()
+    assert _read_tasks() and _read_baselines() and read_tuned()
 
 
 @pytest.mark.parametrize(("algo", "action"), [("ppo", 0.012264779), ("gradient", -0.5908138)])

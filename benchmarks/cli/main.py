@@ -141,14 +141,12 @@ class _Run:
 
 @register("bench", "Compare estimators and controllers.")
 class _Bench:
-    """Compare estimators and controllers, and a recorded drive with --log; with --agent and
-    --estimator your own beside some of the package's."""
+    """Compare estimators and controllers; with --agent and --estimator your own beside some of
+    the package's."""
 
     suites: Texts = take_argument("Suites; default: all.", None, autocompletion=complete("suites"))
     quick: bool = take("Few seeds: a first look in minutes.", False, "--quick")
-    log: File = take("Replay this recorded drive too.")
     vehicle: Text
-    mapping: Texts
     html: File
     json: File
     parquet: File
@@ -183,19 +181,12 @@ class _Bench:
             check_choice("suite", name, SUITES)
         check_salt(self.salt, names)
         check_page(self.page, names)
-        done = []
-        if self.log is not None:  # first: a log that cannot be read should not cost minutes
-            from ..recorded.replay import replay_file
-
-            done.append(replay_file(self.log, self.vehicle, mapping=self.mapping))
         request = Request(
             self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.salt
         )
         how = "the same command" if self.keep else "add --keep FOLDER, which keeps finished cases"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
-            done += run_suites(names, request, comparison)
-        order = [*names, "replay"]
-        done.sort(key=lambda suite: order.index(suite.name))
+            done = run_suites(names, request, comparison)
         write_output(console, done, vars(self), brief=True)
         if self.picture is not None:
             from ..picture import write_picture
@@ -218,7 +209,7 @@ class _Bench:
             raise ValueError("--estimator none goes with --agent")
         return ComparisonRequest(
             entries,
-            vehicle=None if self.log else self.vehicle,
+            vehicle=self.vehicle,
             scenarios=tuple(self.scenario or []),
             env_id=self.env_id,
             episodes=self.episodes or (QUICK_EPISODES if self.quick else EPISODES),

@@ -154,11 +154,11 @@ def make_task_table(file: Path, kind: str, episodes: int) -> Table:
     Returns:
         Table with a row for each task.
     """
-    from ..studies.policies import evaluate_card
+    from ..studies.policies import record_evaluation
 
     table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
     with use_shared_bar(Console(), f"judge {file}"):
-        written = evaluate_card(file, kind, episodes)
+        written = record_evaluation(file, episodes, kind)
     for task, record in written["cost in % of nominal"].items():
         cost, low, high = record["policy"]
         better, fails = record["better than adaptive-nmpc"][0], record["fails"]

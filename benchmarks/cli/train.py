@@ -132,7 +132,7 @@ class _Train:
         if kind is not None:
             console.print(make_task_table(folder / POLICY, kind, _TASK_EPISODES))
         else:
-            costs = record_evaluation(folder / POLICY, EPISODES).summarise()["cost"]
+            costs = record_evaluation(folder / POLICY, EPISODES)["cost"]
             shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
             where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
             text = f"mean cost on test seeds{where}: {shown}"

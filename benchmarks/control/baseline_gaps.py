@@ -86,16 +86,8 @@ _NONE, _NOMINAL = Entry("none"), Entry(NOMINAL)
 _BASELINES = (_NONE, _NOMINAL, *map(Entry, (*ORACLES[PARAMETERS], *ORACLES[STATE])))
 
 
-def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
-    """Measure what a candidate demands; what could not be driven is in its verdict.
-
-    Args:
-        results: Episodes of `none`, nominal and all oracles.
-        task: Candidate.
-
-    Returns:
-        Entry of the file.
-    """
+def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
+    """Measure what a candidate demands; what could not be driven is in its verdict."""
     none, nominal = results[task, _NONE], results[task, _NOMINAL]
     errors = [f"{x}: {results[task, x].error}" for x in (_NONE, _NOMINAL) if results[task, x].error]
     best = dict[str, str]()
@@ -139,26 +131,19 @@ def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) 
     return "scored"
 
 
-def main(
+def _main(
     write: bool = False,
     episodes: int = EPISODES,
     jobs: int | None = None,
     keep: Path | None = None,
 ) -> None:
-    """Measure which tasks are scored: what they demand of a car, on tuning seeds.
-
-    Args:
-        write: Whether the package's file is replaced.
-        episodes: Tuning seeds a task, at least 2.
-        jobs: Processes; None: one a processor.
-        keep: Folder in which finished cases stay, so that a stopped run goes on.
-    """
+    """Measure which tasks are scored: what they demand of a car, on tuning seeds (2 or more)."""
     console = Console()
     short = {"lead_in": QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
     candidates = [replace(task, changes=short) for task in list_candidates()]
     cases = [(task, entry) for task in candidates for entry in _BASELINES]
     results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console, keep=keep)
-    measurements = [measure_task(results, task) for task in candidates]
+    measurements = [_measure_task(results, task) for task in candidates]
     table = Table("contest", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
     for m in measurements:
         lost = (f"{100.0 * share:.0f}" for share in (m.lost, m.lost_nominal, m.lost_oracle))
@@ -171,4 +156,4 @@ def main(
 if __name__ == "__main__":
     import typer
 
-    typer.run(main)
+    typer.run(_main)

@@ -68,16 +68,8 @@ class CalibrationRecord(TaskRecord):
         return [episode.seed for episode in self.episodes]
 
 
-def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
-    """Derive the seeds of a task's calibration; more of them begin with the same ones.
-
-    Args:
-        task: Task whose `seed_text` enters the seeds.
-        count: Number of seeds.
-
-    Returns:
-        Seeds.
-    """
+def _derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
+    """Derive the seeds of a task's calibration; more of them begin with the same ones."""
     texts = [f"clairvoyant {WORLD_VERSION} {task.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
@@ -154,7 +146,7 @@ class Calibration:
     @cached_property
     def cases(self) -> list[_CalibrationCase]:
         """The case of every episode, task by task."""
-        pairs = ((task, seed) for task in self.tasks for seed in derive_seeds(task, self.seeds))
+        pairs = ((task, seed) for task in self.tasks for seed in _derive_seeds(task, self.seeds))
         return [_CalibrationCase(*pair, self.folder) for pair in pairs]
 
     def run(
@@ -194,23 +186,10 @@ class Calibration:
             self.folder.rmdir()
 
 
-def read_calibration(
+def _read_calibration(
     path: str | Path = FILE, stale: bool = False
 ) -> dict[ControlTask, CalibrationRecord]:
-    """Read the entries of a file by task.
-
-    Args:
-        path: File.
-        stale: Whether what does not fit is left out instead of refused.
-
-    Returns:
-        Records by task.
-
-    Raises:
-        FileNotFoundError: There is no file.
-        ValueError: An entry is cut short or lacks something, is of another world or of other
-            seeds.
-    """
+    """Read the entries of a file by task; stale ones are refused, or left out if `stale`."""
     records = {}
     for i, item in enumerate(read_objects(path), 1):
         where = f"{path}: entry {i}"
@@ -225,7 +204,7 @@ def read_calibration(
         seeds, why = record.seeds, ""
         if record.world_version != WORLD_VERSION:
             why = f"of world {record.world_version}, not {WORLD_VERSION}"
-        elif seeds != derive_seeds(record.task, len(seeds)):
+        elif seeds != _derive_seeds(record.task, len(seeds)):
             why = "its seeds are not this contest's"
         if why and not stale:
             raise ValueError(f"{where}, {record.task.name}, is stale: {why}")
@@ -241,7 +220,7 @@ def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
         path: File.
         new_records: Records.
     """
-    records = read_calibration(path, stale=True) if Path(path).exists() else {}
+    records = _read_calibration(path, stale=True) if Path(path).exists() else {}
     records |= {record.task: record for record in new_records}
     ordered = sorted(records.values(), key=lambda record: record.task.name)
     write_text(path, json.dumps([asdict(record) for record in ordered], indent=1) + "\n")
@@ -260,12 +239,12 @@ def read_current(
         Records by task.
 
     Raises:
-        ValueError: As `read_calibration`; or the car costs something else in a task.
+        ValueError: As `_read_calibration`; or the car costs something else in a task.
     """
     if path is None and not FILE.is_file():
         return {}
     path, none = path or FILE, Entry("none")
-    records = {task: record for task, record in read_calibration(path).items() if task in tasks}
+    records = {task: record for task, record in _read_calibration(path).items() if task in tasks}
     for task, record in records.items():
         (now,) = measure([(task, none)], record.seeds, jobs=1).values()
         then = np.array([episode.costs["none"] for episode in record.episodes])

@@ -25,7 +25,7 @@ from .baseline_gaps import DELAY_TASK, DELAYS
 from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, Entry
 from .run import SIGNALS
 from .score import PairedDrives, Standing, check_losses
-from .tables import Matrix, is_resolved, subtract
+from .tables import Matrix, compute_gaps, subtract
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask
 
 if TYPE_CHECKING:
@@ -81,6 +81,11 @@ def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
     return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
 
 
+def _compute_cost(gains: _Gains) -> Estimate:
+    """Compute the cost over nominal's (%)."""
+    return geometric_mean(*(-r for r in gains.values())).rescale(100.0)
+
+
 @dataclass(frozen=True)
 class _Ranking:
     """Names that are compared by the cost of what they drove."""
@@ -95,36 +100,28 @@ class _Ranking:
 
     @cached_property
     def ranked(self) -> dict[str, dict[str, Estimate]]:
-        """Names by fewest cheaper rivals, each with its cost ratios over rivals, closest first.
-
-        Names that surely lose more cars than nominal come behind all others.
-        """
+        """Names by fewest cheaper rivals, `below` last, with cost ratios over rivals by name."""
         ratios = {
-            name: {x: _compute_cost_ratio(one, y) for x, y in self.gains.items() if x != name}
+            name: {
+                x: ratio
+                for x, y in self.gains.items()
+                if x != name and np.isfinite((ratio := _compute_cost_ratio(one, y)).value)
+            }
             for name, one in self.gains.items()
         }
         losses = {name: sum(x.value > 1.0 for x in ratios[name].values()) for name in self.gains}
         gained = {name: np.mean([r.mean() for r in x.values()]) for name, x in self.gains.items()}
         order = sorted(self.gains, key=lambda x: (x in self.below, losses[x], -gained[x]))
-        known = {
-            name: [
-                (rival, ratio) for rival, ratio in ratios[name].items() if np.isfinite(ratio.value)
-            ]
-            for name in order
-        }
         return {
-            name: dict(sorted(x, key=lambda rival: -rival[1].value)) for name, x in known.items()
+            name: dict(sorted(ratios[name].items(), key=lambda rival: -rival[1].value))
+            for name in order
         }
 
     @property
     def costs(self) -> dict[str, Estimate]:
         """Cost over nominal's (%) of the names with every task, the best first."""
-        ranked = self.complete
-        means = {
-            name: geometric_mean(*(-r for r in ranked.gains[name].values()))
-            for name in ranked.ranked
-        }
-        return {name: mean.rescale(100.0) for name, mean in means.items()}
+        complete = self.complete
+        return {name: _compute_cost(complete.gains[name]) for name in complete.ranked}
 
     def find_best(self) -> str:
         """Find the first of the names with every task, "" without any."""
@@ -164,7 +161,11 @@ def _describe_resolution(matrix: Matrix) -> str:
     """Describe where nominal and oracle-state lie too close, if that is in half of the tasks."""
     state = next((item for item in matrix.overall if item.entry == Entry(STATE)), None)
     pairs = state.pairs if state else {}
-    close = sum(not is_resolved(pair, task) for task, pair in pairs.items())
+    close = 0
+    for task, pair in pairs.items():
+        slip, yaw = compute_gaps(pair, task)
+        lost = float(np.diff(1.0 - pair.finished.mean(axis=1))[0])
+        close += not (slip > 0.2 or yaw > 1.0 or lost > 0.1)  # deg, deg/s, of the cars
     if 2 * close <= len(pairs):
         return ""
     return (
@@ -248,7 +249,10 @@ def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
     questions = (
         ("Which controller holds the car?", {"All contests": _group_agents(by_tier).costs}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _name_agent)),
-        ("Which estimator does a controller drive best with?", _group_costs(by_tier, _name_filter)),
+        (
+            "Which estimator does a controller drive best with?",
+            _group_costs(by_tier, lambda x: x.estimator if x.agent == REFERENCE_CONTROLLER else ""),
+        ),
         ("What would knowing more save?", _group_oracles(matrix)),
     )
     suite.answers += [
@@ -274,17 +278,13 @@ def _group_costs(by_tier: _ByTier, name: Callable[[Entry], str]) -> dict[str, di
     groups = {}
     for tier, standings in by_tier.items():
         costs = {
-            name(item.entry): geometric_mean(*(-r for r in item.scores.values())).rescale(100.0)
+            name(item.entry): _compute_cost(item.scores)
             for item in standings
             if name(item.entry) and item.scores
         }
         title = f"Tier {tier}: {TITLES[tier]}"
         groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
     return {title: costs for title, costs in groups.items() if costs}
-
-
-def _name_filter(entry: Entry) -> str:
-    return entry.estimator if entry.agent == REFERENCE_CONTROLLER else ""
 
 
 def _name_agent(entry: Entry) -> str:
@@ -324,24 +324,15 @@ def _draw_maps(
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
             columns = [task.name for task in tasks]
             figures.append((title, draw.draw_heat_map(names, columns, values, metric, good), text))
-    places = np.array([compute_places(standings, *pair) for pair in _CONSTANTS.values()]).T
+    places = np.array([_compute_places(standings, *pair) for pair in _CONSTANTS.values()]).T
     title = f"Tier {tier}: places, by the score's constants"
     text = "The line between entries that surely lose more cars than nominal, and others, stays."
     heat_map = draw.draw_heat_map(names, list(_CONSTANTS), places, "place", "low")
     return [*figures, (title, heat_map, text)]
 
 
-def compute_places(standings: Sequence[Standing], loss: float, floor_factor: float) -> Array:
-    """Compute the places of entries by a score of other constants, 1 for the best.
-
-    Args:
-        standings: Standings of a tier.
-        loss: r of a drive that nominal alone loses.
-        floor_factor: Factor on J_0.
-
-    Returns:
-        Places, NaN without a score, shape (len(standings),).
-    """
+def _compute_places(standings: Sequence[Standing], loss: float, floor_factor: float) -> Array:
+    """Compute the places of entries by a score of other constants, 1 for the best, NaN for none."""
     keys = []
     for standing in standings:
         scores = [x.compute_scores(loss, floor_factor).mean() for x in standing.pairs.values()]

@@ -41,15 +41,8 @@ FACTORS = (0.0, 2.0)  # of a group's ranges about the ideal
 EPISODES, TASKS = 16, 12
 
 
-def compare_scores(results: Results) -> dict[tuple[str, str], Estimate]:
-    """Compare the scores of every two entries, paired by drive.
-
-    Args:
-        results: Episodes of all entries, nominal's too.
-
-    Returns:
-        First entry's mean r less the second's, by their labels in alphabetical order.
-    """
+def _compare_scores(results: Results) -> dict[tuple[str, str], Estimate]:
+    """Compute each entry's mean r less another's, paired by drive, by their labels in order."""
     ranked = sorted(rank_entries(results, None), key=lambda standing: standing.label)
     differences = {}
     for first, second in itertools.combinations(ranked, 2):
@@ -59,18 +52,10 @@ def compare_scores(results: Results) -> dict[tuple[str, str], Estimate]:
     return differences
 
 
-def list_reversals(
+def _list_reversals(
     base: Mapping[tuple[str, str], Estimate], other: Mapping[tuple[str, str], Estimate]
 ) -> list[tuple[str, str]]:
-    """List the entries that are surely ordered, and surely the other way round elsewhere.
-
-    Args:
-        base: Result of `compare_scores` in one world.
-        other: The same in another.
-
-    Returns:
-        Pairs of labels, the better one in the first world first.
-    """
+    """List entries surely ordered, the better first, and surely the other way round elsewhere."""
     reversals = []
     for names, one in base.items():
         if one.low > 0.0 > other[names].high:
@@ -80,17 +65,10 @@ def list_reversals(
     return reversals
 
 
-def main(
+def _main(
     episodes: int = EPISODES, tasks: int = TASKS, jobs: int | None = None, keep: Path | None = None
 ) -> None:
-    """Drive all entries in the benchmark's world and in those of other ranges; list reversals.
-
-    Args:
-        episodes: Seeds of a task.
-        tasks: Tasks, evenly from the scored ones.
-        jobs: Processes; None: one a processor.
-        keep: Folder in which finished cases stay, so that a stopped run goes on.
-    """
+    """Drive all entries in the benchmark's world and in those of other ranges; list reversals."""
     console, scored = Console(), list_scored_tasks()
     chosen = [scored[i * len(scored) // tasks] for i in range(min(tasks, len(scored)))]
     seeds = make_task_seeds(make_salt(), episodes)
@@ -99,14 +77,14 @@ def main(
         changes = {"lead_in": QUICK_LEAD_IN, "world": world.to_dict()}
         cases = [(replace(task, changes=changes), entry) for task in chosen for entry in ENTRIES]
         results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title=title)
-        return compare_scores(results)
+        return _compare_scores(results)
 
     base = compare(make_world(WORLD), WORLD)
     sure = sum(x.low > 0.0 or x.high < 0.0 for x in base.values())
     console.print(f"{sure} of {len(base)} pairs are surely ordered.")
     for group, factor in itertools.product(GROUPS, FACTORS):
         other = compare(make_world(WORLD).scale(group, factor), f"{group} x {factor:g}")
-        reversals = list_reversals(base, other)
+        reversals = _list_reversals(base, other)
         texts = [f"{better} above {worse}" for better, worse in reversals]
         console.print(f"{group} x {factor:g}: reversed: {'; '.join(texts) or 'none'}")
 
@@ -114,4 +92,4 @@ def main(
 if __name__ == "__main__":
     import typer
 
-    typer.run(main)
+    typer.run(_main)

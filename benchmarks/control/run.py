@@ -5,12 +5,12 @@ everything that their numbers depend on.
 """
 
 import hashlib
-import inspect
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from rich.console import Console
 from ...agents.env_info import list_configs
 from ...agents.learned.policy import hash_policy
 from ...agents.rollout import EpisodeStep, iterate_steps
+from ...envs.io import atomic_file
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import FAST, Array
 from ...envs.task import FAILURES
@@ -31,7 +32,7 @@ from ...envs.validation import parse_actions
 from ...envs.vehicle.dynamics import Motion
 from ...estimators.registry import describe_error
 from ..harness.metrics import EPISODE, REDUCTIONS, StepSample, compute_dissipation
-from ..report.study import CaseStorage, Request
+from ..harness.parallel import run_cases
 from .entries import SLOW_EPISODES, ControlCase, Entry
 from .tasks import ControlTask, Seeds, make_salt
 
@@ -147,24 +148,20 @@ def run_chunk(chunk: Chunk) -> DriveResult:
     Returns:
         Episodes; why an entry cannot be built or driven is its `error`.
     """
+    start_time = time.process_time()
     try:
-        return _run_chunk(chunk)
+        env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
+        steps = iterate_steps(env, agent, list(chunk.seeds))
+        reset = next(steps)
+        tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
+        for step in steps:
+            if chunk.keep and step.running[0]:
+                series.append(_read_signals(env, step))
+            tally.add(step)
+        env.close()
     except Exception as error:
         empty = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
         return DriveResult(empty, np.nan, error=describe_error(error))
-
-
-def _run_chunk(chunk: Chunk) -> DriveResult:
-    start_time = time.process_time()
-    env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
-    steps = iterate_steps(env, agent, list(chunk.seeds))
-    reset = next(steps)
-    tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
-    for step in steps:
-        if chunk.keep and step.running[0]:
-            series.append(_read_signals(env, step))
-        tally.add(step)
-    env.close()
     spent = time.process_time() - start_time
     return DriveResult(tally.numbers(), spent, np.array(series) if chunk.keep else None)
 
@@ -217,6 +214,7 @@ def measure_decision_time(case: ControlCase) -> float:
 
 CHUNK = 64
 """Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
+_LENGTH = 24  # hexadecimal digits of a finished case's file name
 
 
 Results = dict[tuple[ControlTask, Entry], DriveResult]
@@ -241,7 +239,7 @@ def measure(
         jobs: Processes, None for all processors.
         console: Where progress is shown.
         keep: Folder (no `Chunk.keep`) in which finished cases stay, so that a stopped run goes on.
-        runner: Function that drives a chunk instead of `run_chunk`.
+        runner: Function that drives a chunk instead of `run_chunk`, and keeps nothing.
         title: Title of the progress bar.
 
     Returns:
@@ -259,21 +257,21 @@ def measure(
         for case, case_seeds in seeds_by_case.items()
         if first < len(case_seeds)
     ]
-    request = Request(jobs=jobs, console=console, keep=keep)
-    results = request.run_cases(runner or run_chunk, chunks, title, make_storage(runner))
+    if runner is None:  # a worker of a cluster runs in another folder
+        runner = run_chunk if keep is None else _StoredDrives(keep.absolute())
+    results = run_cases(runner, chunks, title, jobs, console)
     parts: dict[ControlCase, list[DriveResult]] = {}
     for chunk, item in zip(chunks, results, strict=True):
         parts.setdefault(chunk.case, []).append(item)
-    return {case: _join_results(item) for case, item in parts.items()}
-
-
-def _join_results(parts: list[DriveResult]) -> DriveResult:
-    return DriveResult(
-        np.concatenate([part.numbers for part in parts]),
-        sum(part.seconds for part in parts),
-        parts[0].series,
-        next((part.error for part in parts if part.error), ""),
-    )
+    return {
+        case: DriveResult(
+            np.concatenate([part.numbers for part in items]),
+            sum(part.seconds for part in items),
+            items[0].series,
+            next((part.error for part in items if part.error), ""),
+        )
+        for case, items in parts.items()
+    }
 
 
 @cache
@@ -285,46 +283,45 @@ def hash_sources() -> str:
     return digest.hexdigest()
 
 
-def make_storage(
-    runner: Callable[[Chunk], DriveResult] | None = None,
-) -> CaseStorage[Chunk, DriveResult]:
-    """Make the storage of finished chunks.
+@dataclass(frozen=True)
+class _StoredDrives:
+    """A function of a chunk, `run_chunk`, behind a folder of its results."""
 
-    A result is taken only where sources (those of the plant and the benchmark too) and a policy's
-    weights are the same.
+    folder: Path
+    function: Callable[[Chunk], DriveResult] = run_chunk
 
-    Args:
-        runner: Function that drives a chunk instead of `run_chunk`, some of whose numbers are NaN.
+    def __call__(self, chunk: Chunk) -> DriveResult:
+        """Return a chunk's result, from the folder if it is there."""
+        path = self.folder / f"{_hash_chunk(chunk)}.npz"
+        # whatever NumPy, zipfile, zlib or `_unpack_result` find wrong: the chunk is run anew
+        with suppress(Exception), np.load(path, allow_pickle=False) as archive:
+            return _unpack_result(chunk, dict(archive))
+        result = self.function(chunk)
+        if not result.error:  # which is worth another try
+            arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": result.seconds}
+            arrays |= {} if result.series is None else {"series": result.series}
+            with suppress(OSError):  # a full disk loses the file, not the run
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with atomic_file(path) as file:
+                    np.savez_compressed(file, **arrays)
+        return result
 
-    Returns:
-        Storage.
-    """
-    describe = partial(_describe_chunk, runner=runner)
-    return CaseStorage(describe, _pack_result, partial(_unpack_result, is_whole=runner is None))
 
-
-def _describe_chunk(chunk: Chunk, runner: Callable[[Chunk], DriveResult] | None) -> str:
+def _hash_chunk(chunk: Chunk) -> str:
+    """Hash a chunk, a policy's weights, and all sources that its numbers depend on."""
     weights, driver = hash_policy(chunk.entry.agent), chunk.case.driver
-    source_text = "" if runner is None else Path(inspect.getfile(runner)).read_text()
-    key = [hash_sources(), source_text, weights, driver, asdict(chunk)]
-    return json.dumps(key, sort_keys=True)
+    key = json.dumps([hash_sources(), weights, driver, asdict(chunk)], sort_keys=True)
+    return hashlib.sha256(key.encode()).hexdigest()[:_LENGTH]
 
 
-def _pack_result(result: DriveResult) -> dict[str, Any] | None:
-    arrays = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
-    series = {} if result.series is None else {"series": result.series}
-    return None if result.error else arrays | series  # an error is worth another try
-
-
-def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array], is_whole: bool) -> DriveResult:
-    """Make a result of finite numbers, all if it is to be whole, else any; ValueError otherwise."""
+def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array]) -> DriveResult:
+    """Make a chunk's result; ValueError for numbers that are not finite or another's."""
     shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
     shapes["seconds"] = ()
-    if chunk.keep and is_whole:
+    if chunk.keep:
         shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
     for name, shape in shapes.items():
-        array, finite = arrays[name], np.isfinite(arrays[name])
-        is_valid = finite.all() if is_whole else finite.any()
-        if not (is_valid and array.dtype == np.float64 and array.shape == shape):
+        array = arrays[name]
+        if not (np.isfinite(array).all() and array.dtype == np.float64 and array.shape == shape):
             raise ValueError(f"{name} are not a chunk's")
     return DriveResult(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))

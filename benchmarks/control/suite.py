@@ -28,10 +28,7 @@ from .tasks import QUICK_LEAD_IN, TITLES, list_scored_tasks, make_salt, make_tas
 
 
 def _measure(request: Request) -> Matrix:
-    """Drive all tiers, the baselines on the clairvoyant's seeds, and those with late sensors.
-
-    A quick run has a task a tier, no slow controllers, and of the rest what a file named asks for.
-    """
+    """Drive all tiers; unless it is quick, on the clairvoyant's seeds and with late sensors too."""
     shared: Any = {"jobs": request.jobs, "console": request.console, "keep": request.keep}
     salt, tasks = request.salt or make_salt(), list(list_scored_tasks())
     tasks = request.choose(tasks, select_quick_tasks(tasks, 1))

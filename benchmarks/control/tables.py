@@ -256,7 +256,6 @@ def _select_cheaper(texts: Sequence[str], logs: Sequence[Array]) -> list[str]:
 
 def _make_oracle_table(matrix: Matrix) -> ResultTable:
     """Make the table of every task's demand and baselines, and of whether they fall in cost."""
-    lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
     note = (
         "Gaps: medians by which oracle-state's root mean square errors are below nominal's. r is "
         "0.69 for half of nominal's cost."
@@ -268,6 +267,7 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
         below = "; ".join(_select_cheaper(names, list(matrix.regrets.values())))
         summary = f"below it: {below}" if below else "nobody is below it (Holm-corrected)"
         note += f" On the clairvoyant's seeds {summary}."
+    lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
     return ResultTable("The ladder", _BASELINES, lines, note, keyed=False)
 
 
@@ -319,31 +319,8 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
     return gaps[0], gaps[1]
 
 
-def is_resolved(pair: PairedDrives, task: ControlTask) -> bool:
-    """Check whether nominal and oracle-state lie further apart than instruments resolve.
-
-    Args:
-        pair: Drives of oracle-state and of nominal.
-        task: Their task.
-
-    Returns:
-        Whether a gap exceeds 0.2 deg of slip, 1 deg/s of yaw rate or 10 % of the cars.
-    """
-    slip, yaw = compute_gaps(pair, task)
-    lost = float(np.diff(1.0 - pair.finished.mean(axis=1))[0])
-    return slip > 0.2 or yaw > 1.0 or lost > 0.1
-
-
 def _describe_order(scores: Sequence[Array], foresight: Array | None) -> str:
-    """Describe whether a baseline surely scores less than one that knows less.
-
-    Args:
-        scores: r of the baselines by rising knowledge, shape (n_i,).
-        foresight: Log of oracle-state's cost over clairvoyant's, None where not calibrated.
-
-    Returns:
-        Text.
-    """
+    """Describe whether a baseline surely scores less than the one before it, which knows less."""
     if foresight is not None and foresight.mean() <= 0.0:
         return "clairvoyant does not"
     rises = [average(subtract(more, less)) for less, more in itertools.pairwise(scores)]

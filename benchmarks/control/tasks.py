@@ -23,7 +23,6 @@ from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.ticks import TICK
 from ...envs.validation import check_choice
-from ...envs.vehicle.parameters import VEHICLES
 from ..harness.results import read_objects
 
 YAW = "sideslip/YawFusion-v0"
@@ -110,28 +109,6 @@ class ControlTask:
         return rate * scenario.duration
 
 
-def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
-    """Make a task's scenario, over its name, with some fields changed.
-
-    Noise comes to the scenario's own; "mass" is a factor on the true car's, of which controllers
-    and filters know nothing.
-
-    Args:
-        task: Task whose scenario is varied.
-        change: Fields of `Scenario`.
-
-    Returns:
-        Scenario as a mapping.
-    """
-    fields, base = dict(change), make_scenario(task.scenario)
-    if "noise" in fields:
-        fields["noise"] = dict(base.noise) | fields["noise"]
-    if "mass" in fields:
-        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
-        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
-    return {"base": task.scenario} | fields
-
-
 @dataclass(frozen=True)
 class TaskRecord:
     """The task of an entry of a file."""
@@ -182,19 +159,8 @@ def list_candidates() -> list[ControlTask]:
     ]
 
 
-def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
-    """Read all candidates of a file.
-
-    Args:
-        path: File.
-
-    Returns:
-        Candidates.
-
-    Raises:
-        FileNotFoundError: There is no file.
-        ValueError: It was measured in another world, is cut short, or names what there is not.
-    """
+def _read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
+    """Read all candidates of a file; ValueError for another world, or names that there are not."""
     measurements = []
     for i, item in enumerate(read_objects(path), 1):
         where = f"{path}: entry {i}"
@@ -216,13 +182,13 @@ def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
 
 @cache
 def list_scored_tasks() -> tuple[ControlTask, ...]:
-    """List the scored tasks, tier by tier; raises as `read_tasks`."""
-    return tuple(entry.task for entry in read_tasks() if entry.verdict == "scored")
+    """List the scored tasks, tier by tier; raises as `_read_tasks`."""
+    return tuple(entry.task for entry in _read_tasks() if entry.verdict == "scored")
 
 
 @cache
 def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
-    return {measurement.task: measurement for measurement in read_tasks()} if FILE.is_file() else {}
+    return {item.task: item for item in _read_tasks()} if FILE.is_file() else {}
 
 
 def find_oracle(task: ControlTask, name: str = STATE) -> str:

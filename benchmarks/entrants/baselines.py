@@ -87,18 +87,8 @@ def make_baseline_cases(
     return [ControlCase(task, entry) for task in tasks for entry in entries]
 
 
-def read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], BaselineRecord]:
-    """Read the records of a file that are of this world.
-
-    Args:
-        path: JSON file of the records.
-
-    Returns:
-        Records by case.
-
-    Raises:
-        ValueError: The file holds no such records.
-    """
+def _read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], BaselineRecord]:
+    """Read the records of a file that are of this world, by case; ValueError for others."""
     items = enumerate(read_objects(path), 1)
     records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
     return {record.case: record for record in records if record.world_version == WORLD_VERSION}
@@ -120,7 +110,7 @@ def find_baselines(
     Returns:
         Salt and episodes, or None.
     """
-    records = read_baselines(FILE) if FILE.is_file() else {}
+    records = _read_baselines(FILE) if FILE.is_file() else {}
     matches = {case: records[case] for case in wanted if case in records}
     salts = {record.salt for record in matches.values()}
     if len(matches) < len(wanted) or any(len(x.costs) < n for x in matches.values()):

@@ -60,51 +60,24 @@ class Comparison:
     @cached_property
     def overall(self) -> list[Standing]:
         """Standings over all tasks, the best first."""
-        return self.standings(None)
-
-    def standings(self, tier: str | None) -> list[Standing]:
-        """Rank everybody in a tier.
-
-        Args:
-            tier: Tier, None for all of them.
-
-        Returns:
-            Standings, the best first.
-        """
-        return rank_entries(self.results, tier)
+        return rank_entries(self.results, None)
 
 
-def compare(
+def _compare(
     request: ComparisonRequest,
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Comparison:
-    """Drive a request: entries of names and files in processes of their own, objects in this one.
-
-    Args:
-        request: Entries and tasks.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-        keep: Folder of the baselines' finished cases.
-
-    Returns:
-        Episodes.
-    """
+    """Drive a request: names and files in processes of their own, objects in this one."""
     entries, tasks = request.entries, request.tasks
     shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
     controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
     filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
     rivals = make_baseline_cases(tasks, controllers, filters)
-    isolated, objects = (
-        [
-            ControlCase(task, entry)
-            for task in tasks
-            for entry in entries
-            if bool(entry.objects) == has_objects
-        ]
-        for has_objects in (False, True)
-    )
+    cases = [ControlCase(task, entry) for task in tasks for entry in entries]
+    isolated = [case for case in cases if not case.entry.objects]
+    objects = [case for case in cases if case.entry.objects]
     known = find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
     allowed: frozenset[str] | None = None
     salt = known[0] if known else request.salt or make_salt()
@@ -136,15 +109,8 @@ def _find_opened_files(
 _MAX_SENTENCES = 4  # contestants with a sentence
 
 
-def compose_verdict(comparison: Comparison) -> list[str]:
-    """Compose at most five lines: the user's entries, the best first, and how far to trust them.
-
-    Args:
-        comparison: Episodes of all contestants.
-
-    Returns:
-        Lines.
-    """
+def _compose_verdict(comparison: Comparison) -> list[str]:
+    """Compose at most five lines: the user's entries, the best first, and how far to trust them."""
     entries = comparison.request.entries
     placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.entry in entries]
     count, more = len(comparison.overall), len(placed) - _MAX_SENTENCES
@@ -213,15 +179,8 @@ def _describe_trust(comparison: Comparison) -> str:
     )
 
 
-def make_table(comparison: Comparison) -> ResultTable:
-    """Make the table of everybody over all tasks, the best first; the user's own are marked.
-
-    Args:
-        comparison: Episodes of all contestants.
-
-    Returns:
-        Table.
-    """
+def _make_table(comparison: Comparison) -> ResultTable:
+    """Make the table of everybody over all tasks, the best first; the user's own are marked."""
     lines: list[Line] = []
     for standing in comparison.overall:
         label = standing.label
@@ -323,7 +282,7 @@ def score(
     request = ComparisonRequest(
         (entry,), vehicle, scenario_list, env_id, episodes, chosen, fresh=fresh, limit=limit
     )
-    comparison = compare(request, jobs)
+    comparison = _compare(request, jobs)
     standing = next(item for item in comparison.overall if item.entry == entry)
     rows = []
     for task, result in standing.results.items():
@@ -361,17 +320,16 @@ def run(
     Returns:
         Suite.
     """
-    comparison = compare(request, jobs, console, keep)
+    comparison = _compare(request, jobs, console, keep)
     suite = Suite("control", "Your own beside the package's", _TEXT)
-    suite.verdict = "\n".join(compose_verdict(comparison))
-    suite.tables += [make_table(comparison)]
-    title = "Contest by contest"
-    suite.tables += [make_task_table(title, comparison.overall, request.tasks)]
+    suite.verdict = "\n".join(_compose_verdict(comparison))
+    by_task = make_task_table("Contest by contest", comparison.overall, request.tasks)
+    suite.tables += [_make_table(comparison), by_task]
     lines = [line[1:] for line in list_failures(comparison.results)]
     if lines:
         header = ("contest", "contestant", "what happened")
         suite.tables.append(ResultTable("Cells that went wrong", header, lines, keyed=False))
     for tier in dict.fromkeys(task.tier for task in request.tasks):
-        for standing in comparison.standings(tier):
+        for standing in rank_entries(comparison.results, tier):
             standing.add_rows(suite, comparison.salt)
     return suite

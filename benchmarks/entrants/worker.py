@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -246,13 +246,6 @@ class _RemoteRow:
             row.x, row.P = values[:n], values[n:].reshape(n, n)
 
 
-def _is_foreign(source: object) -> TypeGuard[str]:
-    """Whether a text names code that is not the package's."""
-    return isinstance(source, str) and (
-        is_user_file(source) or source.endswith(ZIP) or ":" in source
-    )
-
-
 def run_user_chunk(chunk: Chunk) -> DriveResult:
     """Run a chunk; an entry whose every episode ends by an action that is none was not driven.
 
@@ -301,8 +294,9 @@ def _run_isolated_chunk(drive: IsolatedDrive, chunk: Chunk) -> tuple[DriveResult
     objects = dict(entry.objects)
     try:
         for part in ("agent", "estimator"):
-            source: object = getattr(entry, part)
-            if part in objects or not _is_foreign(source):
+            source: str = getattr(entry, part)
+            is_foreign = is_user_file(source) or source.endswith(ZIP) or ":" in source
+            if part in objects or not is_foreign:
                 continue
             child = _ChildProcess((entry.agent, entry.estimator), drive)
             children.append(child)

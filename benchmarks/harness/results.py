@@ -246,11 +246,9 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
         path: File.
         rows: Rows of a run's suites.
     """
+    numbers = ("value", "low", "high")
     plain = [
-        {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in asdict(row).items()
-        }
+        asdict(row) | {x: None for x in numbers if not math.isfinite(getattr(row, x))}
         for row in rows
     ]
     write_text(path, "[\n" + ",\n".join(map(json.dumps, plain)) + "\n]\n")

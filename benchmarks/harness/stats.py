@@ -148,12 +148,8 @@ def mean_share(values: Array) -> Estimate:
     """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
-    return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
-
-
-def _odds(values: Array, axis: int = -1) -> Array:
-    """Compute the mean of fractions over the mean of their complements."""
-    return ratio_of_means(values, 1.0 - values, axis)
+    odds = interval(values, lambda x, axis: ratio_of_means(x, 1.0 - x, axis))
+    return Estimate(*(x / (1.0 + x) for x in odds))
 
 
 def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:
@@ -255,29 +251,6 @@ def compute_tail_mean(costs: Array) -> Estimate:
     beyond = np.maximum(costs - ordered[-count], 0.0)
     reach = math.exp(margin_of_error(len(costs) / count * beyond / value))
     return Estimate(value, value / reach, value * reach)
-
-
-def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
-    """Compute the sum over strata of the mean top over that of the mean bottom.
-
-    The interval is that of the mean residual top - ratio x bottom of each episode.
-
-    Args:
-        tops: Numerators of each stratum, shape (n_i,).
-        bottoms: Denominators of the same episodes, shape (n_i,).
-
-    Returns:
-        Ratio and interval; NaN without strata, or where the sum of bottoms is not positive.
-    """
-    if not tops or min(map(len, tops)) == 0:
-        return Estimate(math.nan)
-    above, below = (sum(float(np.mean(stratum)) for stratum in side) for side in (tops, bottoms))
-    if not below > 0.0:
-        return Estimate(math.nan)
-    ratio = above / below
-    pairs = zip(tops, bottoms, strict=True)
-    reach = margin_of_error(*((top - ratio * bottom) / below for top, bottom in pairs))
-    return Estimate(ratio, ratio - reach, ratio + reach)
 
 
 def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:

@@ -123,18 +123,6 @@ _ENV_ID = "sideslip/AfsYawFusion-v0"
 _STATES = ("beta", "gamma", "d1", "d2")
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """The errors of an episode from its reference, over all ticks."""
-
-    rms_beta: float  # rad, of the error
-    rms_gamma: float  # rad/s, of the error
-    peak_beta: float  # rad, of the sideslip angle itself
-    saturated: float  # fraction of the ticks that command the whole yaw moment
-    steered: float  # largest fraction of the steering's authority that was commanded
-    failed: bool
-
-
 def run_episode(
     seed: int,
     scenario: _Manoeuvre = "dakf-fig7",
@@ -160,24 +148,23 @@ def run_episode(
     return rollout(env, make_agent(agent, env, **options), seed)
 
 
-def measure_tracking(episode: Rollout) -> Tracking:
-    """Measure how an episode tracks its reference.
+def measure_tracking(episode: Rollout) -> dict[str, float]:
+    """Measure how an episode tracks its reference, over all ticks.
 
     Args:
         episode: Episode of `run_episode`.
 
     Returns:
-        Errors, peak and saturation.
+        RMS errors rms_beta (rad) and rms_gamma (rad/s), peak_beta (rad) of the sideslip angle
+        itself, saturated: fraction of the ticks that command the whole yaw moment, and failed.
     """
-    moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
-    return Tracking(
-        rms_beta=_rms(episode["beta"] - episode["beta_ref"]),
-        rms_gamma=_rms(episode["gamma"] - episode["gamma_ref"]),
-        peak_beta=float(np.abs(episode["beta"]).max()),
-        saturated=float(np.mean(moment >= 1.0)),
-        steered=float(steering.max()),
-        failed=episode.failed,
-    )
+    return {
+        "rms_beta": _rms(episode["beta"] - episode["beta_ref"]),
+        "rms_gamma": _rms(episode["gamma"] - episode["gamma_ref"]),
+        "peak_beta": float(np.abs(episode["beta"]).max()),
+        "saturated": float(np.mean(np.abs(episode["action_0"]) >= 1.0)),
+        "failed": float(episode.failed),
+    }
 
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
@@ -253,7 +240,7 @@ class SlipSimulation(_AgentSimulation):
 
 @dataclass(frozen=True)
 class FollowingSimulation(_AgentSimulation):
-    """dakf-stability's controller by wire, with and without parts of it; numbers of `Tracking`.
+    """dakf-stability's controller by wire, with and without parts of it, by `measure_tracking`.
 
     Contestants are options of `run_episode` by label.
     """
@@ -262,8 +249,7 @@ class FollowingSimulation(_AgentSimulation):
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         drive = run_episode(seed, self.scenario, **self.contestants[label])
-        values = vars(measure_tracking(drive))
-        return drive, {name: float(value) for name, value in values.items()}
+        return drive, measure_tracking(drive)
 
 
 def _compute_courses(example: Example, labels: Sequence[str]) -> dict[str, Array]:

@@ -90,11 +90,9 @@ def _rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
 
 
 def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
-    """Compute the rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D.
-
-    For the continuous A; exact sampling cannot raise it, since e^(A T) keeps every A-invariant
-    subspace, nor lower it but for special sampling times.
-    """
+    """Compute the rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D, for the continuous A."""
+    # exact sampling cannot raise it, since e^(A T) keeps every A-invariant subspace, nor lower it
+    # but for special sampling times
     block: Matrix = [[Fraction(entry) for entry in row] for row in C]
     stacked = list(block)
     for _ in range(len(A) - 1):
@@ -165,10 +163,7 @@ def _compare_maps(A: Array, C: Array, L: Array) -> float:
 
 
 def _measure_maps(seed: int) -> tuple[Numbers, None]:
-    """Compare maps of a random system of three states, all measured, and of the extended model.
-
-    That one's Kalman gain is what a random process noise has after 5 s of fast measurements.
-    """
+    """Compare maps of a random system of three states, all measured, and of the extended model."""
     A, C = make_extended_model()
     R = np.array([[COURSE_SD**2]])
     rng = np.random.default_rng(seed)
@@ -177,7 +172,7 @@ def _measure_maps(seed: int) -> tuple[Numbers, None]:
     square = _compare_maps(a, c, kalman.kalman_gain(np.eye(3), c, np.eye(3)))
     Q = np.diag(10.0 ** rng.uniform([-4, -4, -8, -2, -2, -7], [-2, -2, -6, 0, 0, -5])) * 1e-3
     P = np.eye(6) * 1e-2
-    for _ in range(5000):
+    for _ in range(5000):  # 5 s of fast measurements
         L = kalman.kalman_gain(P, C, R)
         P = A @ kalman.joseph_form(P, L, C, R) @ A.T + Q
     application = _compare_maps(A, C, L)
@@ -185,17 +180,13 @@ def _measure_maps(seed: int) -> tuple[Numbers, None]:
 
 
 def _measure_gains(seed: int) -> tuple[Numbers, None]:
-    """Measure the growth of the error from sample to sample with gains from the noise (29).
-
-    Strong: process noise 1e-4 per second on the states and the same 5 to 50 on each of the three
-    extended states, log-uniform. Any: 1e-6 to 1 on each state, 1e-3 to 100 on each extended one.
-    """
+    """Measure the growth of the error from sample to sample with gains from the noise (29)."""
     A, C = make_extended_model()
     R = np.array([[COURSE_SD**2]])
     radii: Numbers = {}
     rng = np.random.default_rng(seed)
     strong = 10.0 ** rng.uniform(math.log10(5.0), math.log10(50.0))
-    tunings = {
+    tunings = {  # process noise (1/s) of the three states, and of the three extended ones
         STRONG: np.array([1e-4] * 3 + [strong] * 3),
         ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
     }

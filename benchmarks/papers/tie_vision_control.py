@@ -10,7 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -110,12 +110,9 @@ def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts,
 
 
 def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
-    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant.
-
-    The filter's input is the moment that the PI commands: opened behind both, a filter with the
-    right model would not show in the loop at all. It has its steady gain and the PI reads the
-    estimate after the correction.
-    """
+    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
+    # The filter's input is the moment that the PI commands: opened behind both, a filter with the
+    # right model would not show in the loop at all.
     import control
 
     plant, asks = _split_loop(vehicle, design, dt)
@@ -139,30 +136,21 @@ _GRID: dict[str, tuple[float | str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class _LoopMatch:
-    """A design and its two margins in dB, single-rate and multirate."""
+class _LoopMatch(NamedTuple):
+    """A design, and the larger difference (dB) of its margins to the printed ones."""
 
     design: LoopDesign
-    decibels: tuple[float, float]
-
-    @property
-    def off(self) -> float:
-        """The larger difference to the printed margins (dB)."""
-        return max(abs(a - b) for a, b in zip(self.decibels, PRINTED, strict=True))
+    off: float
 
 
 def _search(vehicle: Vehicle) -> list[_LoopMatch]:
-    """Search the designs of the grid whose margins both lie within some dB of Table II, best first.
-
-    Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
-    """
+    """Search the grid's designs with both margins near Table II's, as stable, best first."""
     import control
 
     hits = []
     for values in itertools.product(*_GRID.values()):
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
-        design, margins = LoopDesign(**options), []
+        design, differences = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
             # a screen, before all crossings
             end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
@@ -171,11 +159,11 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
             loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = _compute_gain_margin(loop)
             is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
-            if abs(omega * dt - math.pi) > 1e-9 or not is_stable:
+            if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper
                 break
-            margins.append(decibels)
-        if len(margins) == len(PRINTED):
-            hits.append(_LoopMatch(design, (margins[0], margins[1])))
+            differences.append(abs(decibels - printed))
+        if len(differences) == len(PRINTED):
+            hits.append(_LoopMatch(design, max(differences)))
     return sorted(hits, key=lambda hit: hit.off)
 
 
@@ -184,15 +172,10 @@ _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling ra
 
 
 def _find_crossings(loop: "Loop") -> Array:
-    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
-
-    L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
-    python-control's `stability_margins` finds crossings by a change of sign, and there is none at
-    the end of the axis. The others are bracketed on a grid (4000 points over six decades) and
-    refined: a pair of crossings closer than that is missed.
-
-    Raises ValueError for a loop in continuous time or with several inputs or outputs.
-    """
+    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2)."""
+    # L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
+    # python-control's `stability_margins` finds crossings by a change of sign, and there is none at
+    # the end of the axis. The others are bracketed on a grid and refined.
     if not loop.isdtime(strict=True) or loop.dt is True:
         raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
     if not loop.issiso():

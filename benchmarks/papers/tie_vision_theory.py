@@ -171,10 +171,8 @@ def _compute_spectral_radius(K: Array) -> float:
 
 
 def _measure_tunings(seed: int) -> tuple[Numbers, None]:
-    """Measure the fraction of 20 random tunings with which the error grows.
-
-    The process noise of each state is log-uniform over eight decades up to 1 (unit)^2/s.
-    """
+    """Measure the fraction of 20 random tunings with which the error grows."""
+    # process noise of each state, up to 1 (unit)^2/s
     tunings = 10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, (20, 4))
     radii = {
         LITERAL: [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings],
@@ -195,11 +193,7 @@ def _compute_shipped_radius(Q: Array) -> float:
 
 
 def _measure_maps(seed: int) -> tuple[Numbers, Example]:
-    """Compare the error dynamics with pseudo-residuals to those of a fast camera.
-
-    In the vision model at 1 ms every row is slow. The seed draws the process noise of the Kalman
-    gain. The example has the size of the maps of the appendix's three cases.
-    """
+    """Compare the error dynamics with pseudo-residuals to those of a fast camera; all rows slow."""
     model = make_vision_model(COMS, SPEED)
     G, _ = model.discretise(1e-3)
     Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))

@@ -32,7 +32,10 @@ def draw_figures(results: Mapping[str, CaseResults]) -> list[tuple[str, go.Figur
         )
         figures.append((title, _draw_yaw_rates(of_car["fmvss-126"]), text))
         for name in iso3888.TRACKS:
-            runs = {case: _choose_best(result) for case, result in of_car[name].items()}
+            runs = {
+                case: max((x for x in result if x.passed), key=lambda x: x.speed, default=result[0])
+                for case, result in of_car[name].items()
+            }
             speeds = ", ".join(f"{k.agent} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
             text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
             figures.append((f"{name}, {car}: way and cones", _draw_cones(runs), text))
@@ -67,11 +70,6 @@ def _compute_shares(shown: Series, t: Array) -> Array:
     steered = (shown.t >= fmvss126.REVERSAL) & (shown.t <= fmvss126.COMPLETION)
     peak = np.max(-shown.gamma[steered], initial=1e-9)  # the first half steers to the left
     return np.interp(t, shown.t, -shown.gamma / peak, right=np.nan)
-
-
-def _choose_best(runs: list[iso3888.TrackRun]) -> iso3888.TrackRun:
-    """Choose the fastest clean run, or the first of all."""
-    return max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
 
 
 def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:

@@ -132,11 +132,8 @@ def _compute_responses(series: Series) -> dict[str, StepResponse]:
 
 
 def _run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
-    """Drive a sine from 0.05 to 2.5 Hz, and estimate the responses; steer: amplitude (rad).
-
-    It has passed half a segment when it comes to the lowest frequency of the standard.
-    """
-    seconds = 100.0
+    """Drive a sine from 0.05 to 2.5 Hz, and estimate the responses; steer: amplitude (rad)."""
+    seconds = 100.0  # half a segment has passed when it comes to the standard's lowest frequency
     series = drive({
         "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
         "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,

@@ -131,16 +131,7 @@ def run_check() -> OutsideCheck:
     return OutsideCheck(*(fmvss126.run(drive, car, A, [multiple]) for drive, multiple in pairs))
 
 
-@dataclass(frozen=True)
-class OutsideEpisode:
-    """An episode of one seed."""
-
-    cost: float
-    failed: bool
-    peak: float  # rad, of the sideslip angle
-
-
-def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> list[OutsideEpisode]:
+def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> Array:
     """Run the episodes of a controller on an outside plant.
 
     Args:
@@ -149,7 +140,7 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> lis
         seeds: Seeds of the episodes.
 
     Returns:
-        Episodes in the order of their seeds.
+        Cost, 1 where it failed, and largest sideslip angle (rad) of each seed, shape (seeds, 3).
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     options |= {"steering": True, "sensors": "fusion"}
@@ -157,4 +148,4 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> lis
     env = make_env(_ENV_ID, estimator, estimate, **options)
     agent = entry.make_agent(model, env)
     rollouts = [rollout(env, agent, seed) for seed in seeds]
-    return [OutsideEpisode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in rollouts]
+    return np.array([[x.cost, x.failed, np.abs(x["beta"]).max()] for x in rollouts])

@@ -216,14 +216,13 @@ def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
 def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
     """Outside plants: cost and spins of each controller."""
     records = []
-    costs = {case: np.array([x.cost for x in episodes]) for case, episodes in done.items()}
-    rivals = {case.car: costs[case] for case in done if case.agent == RIVAL}
+    rivals = {case.car: episodes[:, 0] for case, episodes in done.items() if case.agent == RIVAL}
     for case, episodes in done.items():
-        numbers = {"cost": interval(costs[case]), "share": np.mean([x.failed for x in episodes])}
+        cost, failed, peak = episodes.T
+        numbers = {"cost": interval(cost), "share": failed.mean(), "peak": np.median(peak)}
         if case.car in rivals and case.agent != RIVAL:
-            logs = np.log(compute_cost_ratios(costs[case], rivals[case.car]))
-            numbers["ratio"] = geometric_mean(logs)
-        numbers |= {"n": len(episodes), "peak": np.median([x.peak for x in episodes])}
+            numbers["ratio"] = geometric_mean(np.log(compute_cost_ratios(cost, rivals[case.car])))
+        numbers |= {"n": len(episodes)}
         records.append(_make_record(case, **numbers, salt="fixed"))
     return records
 

@@ -273,16 +273,12 @@ def draw_heat_map(
     """
     flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
     scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
-    text = [
-        [f"{v:.2f}".removesuffix(".00") if np.isfinite(v) else "" for v in row] for row in values
-    ]
     low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
     trace = go.Heatmap(
-        z=[[float(v) if np.isfinite(v) else None for v in row] for row in values],
+        z=values,
         x=list(columns),
         y=list(names),
-        text=text,
-        texttemplate="%{text}",
+        texttemplate="%{z:.2~f}",
         textfont={"size": 10},
         colorscale=scale,
         zmin=float(low),
@@ -290,7 +286,7 @@ def draw_heat_map(
         xgap=1,
         ygap=1,
         colorbar={"title": {"text": unit}},
-        hovertemplate="%{y}<br>%{x}: %{text}<extra></extra>",
+        hovertemplate="%{y}<br>%{x}: %{z:.2~f}<extra></extra>",
     )
     figure = go.Figure(trace)
     figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)

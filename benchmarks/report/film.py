@@ -1,5 +1,6 @@
 """Films of drives, with other cars as ghosts, as MP4 or GIF; and tracks for map programs (KML)."""
 
+import itertools
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -101,17 +102,11 @@ def _render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) 
 def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> None:
     from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 
-    writer = None
-    try:
-        for frame in frames:
-            if writer is None:
-                size = frame.shape[1], frame.shape[0]
-                quality = ["-crf", "20", "-movflags", "+faststart"]
-                writer = FFMPEG_VideoWriter(str(path), size, rate, ffmpeg_params=quality)
+    first = next(iterator := iter(frames))
+    size, quality = first.shape[1::-1], ["-crf", "20", "-movflags", "+faststart"]
+    with FFMPEG_VideoWriter(str(path), size, rate, ffmpeg_params=quality) as writer:
+        for frame in itertools.chain([first], iterator):
             writer.write_frame(frame)
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:

@@ -17,7 +17,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -158,10 +158,9 @@ def _encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str
     low, high = (float(v[finite].min()), float(v[finite].max())) if finite.any() else (0.0, 0.0)
     by = (high - low) / (levels - 1) or 1.0
     quanta = np.round((v[finite] - low) / by).astype(int)
-    encoded: list[int | None] = [None] * len(v)
-    for i, step in zip(np.flatnonzero(finite), np.diff(quanta, prepend=0), strict=True):
-        encoded[i] = int(step)
-    return {"from": low, "by": by, "steps": encoded}
+    encoded = np.full(len(v), None)
+    encoded[finite] = np.diff(quanta, prepend=0)
+    return {"from": low, "by": by, "steps": encoded.tolist()}
 
 
 def _encode_figure(figure: "Figure") -> str:
@@ -174,20 +173,15 @@ def _encode_figure(figure: "Figure") -> str:
     for trace, plain in zip(figure.data, content["data"], strict=True):
         for axis, levels in _LEVELS.items():
             values = getattr(trace, axis, None)
-            if _is_line(values):
+            if (
+                isinstance(values, np.ndarray)
+                and values.dtype.kind == "f"
+                and values.ndim == 1
+                and len(values) > _MIN_PACKED
+            ):
                 plain[axis] = _encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
-
-
-def _is_line(values: object) -> TypeGuard[Array]:
-    """Check whether values are many enough, in a row, to be worth their steps."""
-    return (
-        isinstance(values, np.ndarray)
-        and values.dtype.kind == "f"
-        and values.ndim == 1
-        and len(values) > _MIN_PACKED
-    )
 
 
 POINTS = 250  # samples of a cell in a figure with menus

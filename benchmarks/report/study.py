@@ -6,22 +6,17 @@ results, `add_tables` makes rows and tables of them, `compose_verdict` their ans
 `Suite.add_rows` makes rows of them, `ResultTable` with its columns a table.
 """
 
-import contextlib
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
-import numpy as np
 from rich.console import Console
 
-from ...envs.io import atomic_file
-from ...envs.record import Array
 from ..harness.parallel import run_cases, split_seeds
 from ..harness.results import Suite
 
@@ -30,7 +25,6 @@ Condition = TypeVar("Condition")
 Result = TypeVar("Result")
 Results = TypeVar("Results")
 Choice = TypeVar("Choice")
-_LENGTH = 24  # hexadecimal digits of a finished case's file name
 
 
 @dataclass(frozen=True)
@@ -58,11 +52,7 @@ class Request:
         return quick if self.quick else usual
 
     def run_cases(
-        self,
-        function: Callable[[Case], Result],
-        cases: Sequence[Case],
-        title: str,
-        storage: "CaseStorage[Case, Result] | None" = None,
+        self, function: Callable[[Case], Result], cases: Sequence[Case], title: str
     ) -> list[Result]:
         """Run a function on every case, in processes.
 
@@ -70,14 +60,10 @@ class Request:
             function: Function of a case, importable by workers.
             cases: Arguments of the function, one for each call.
             title: Title of the progress bar.
-            storage: How finished cases lie in the folder `keep`; None: they do not.
 
         Returns:
             Results in the order of the cases.
         """
-        if self.keep is not None and storage is not None:
-            folder = self.keep.absolute()  # a worker of a cluster runs elsewhere
-            function = StoredFunction(function, folder, storage)
         return run_cases(function, cases, title, self.jobs, self.console)
 
     def run_seeds(
@@ -104,38 +90,6 @@ class Request:
         cases = list(product(conditions, chunks))
         results = iter(self.run_cases(function, cases, title))
         return [[item for _ in chunks for item in next(results)] for _ in conditions]
-
-
-class CaseStorage(NamedTuple, Generic[Case, Result]):
-    """Finished cases as arrays in files, whose names are hashes of all that they depend on."""
-
-    describe: Callable[[Case], str]  # text of all that the case's result depends on
-    pack: Callable[[Result], dict[str, Any] | None]  # arrays; None: worth another try
-    unpack: Callable[[Case, Mapping[str, Array]], Result]  # raises for another's arrays
-
-
-@dataclass(frozen=True)
-class StoredFunction(Generic[Case, Result]):
-    """A function of a case behind a folder of its results."""
-
-    function: Callable[[Case], Result]
-    folder: Path
-    storage: CaseStorage[Case, Result]
-
-    def __call__(self, case: Case) -> Result:
-        """Return the case's result, from the folder if it is there."""
-        name = hashlib.sha256(self.storage.describe(case).encode()).hexdigest()[:_LENGTH]
-        path = self.folder / f"{name}.npz"
-        # whatever NumPy, zipfile, zlib or the storage find wrong: the case is run anew
-        with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as archive:
-            return self.storage.unpack(case, dict(archive))
-        result = self.function(case)
-        if (arrays := self.storage.pack(result)) is not None:
-            with contextlib.suppress(OSError):  # a full disk loses the file, not the run
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with atomic_file(path) as file:
-                    np.savez_compressed(file, **arrays)
-        return result
 
 
 @dataclass(frozen=True)

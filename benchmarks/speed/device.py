@@ -108,10 +108,7 @@ def _main(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = _ROUNDS,
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
 ) -> None:
-    """Measure env-steps per second against the size of the batch; ValueError without the device.
-
-    Episodes end and start anew where the steps are many enough; the resets are then part of it.
-    """
+    """Measure env-steps per second, resets included, against the size of the batch."""
     check_writable(out)
     console, timings, copied = Console(), [], 0.0
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")

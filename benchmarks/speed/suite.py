@@ -50,10 +50,7 @@ TARGETS = (
 
 
 def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, str]) -> None:
-    """Add rows of measured targets, and first of all the table of all.
-
-    taken: CPU times a unit (us), or CPU seconds of the first use; absent: reasons; by name.
-    """
+    """Add rows of measured targets, and before all tables that of all; `absent` has reasons."""
     cells, missing = [], dict[str, str]()
     for target in TARGETS:
         needed = [target.over, target.workload] if target.over else [target.workload]

@@ -146,10 +146,7 @@ CONDITIONS = (
 
 
 def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tuple[Log, Any, Any]:
-    """Log without the edit, unwrapped env and its `car_truth` at the start.
-
-    Without constant errors of sensors a seed's car moves alike.
-    """
+    """Log without the edit, env and its `car_truth`; a car moves alike without constant errors."""
     rng = np.random.default_rng([46, seed])
     speed = float(rng.uniform(*condition.speed))
     amplitude = condition.amplitude * min(1.0, (16.0 / speed) ** 1.2)

@@ -44,11 +44,8 @@ _STATES = ("beta", "gamma", "psi", "y_l")
 
 
 def _compute_loop_radius(scenario: str | dict[str, object], bandwidth: float) -> float:
-    """Compute the spectral radius of dakf-stability's loop, sampled every millisecond, unfiltered.
-
-    The true car with its lags, the PI (31) designed for the nominal one and summed by forward
-    Euler: beyond 1 the loop is unstable.
-    """
+    """Compute the spectral radius of dakf-stability's sampled loop: beyond 1 it is unstable."""
+    # the true car with its lags, the PI (31) of the nominal one, summed by forward Euler; no filter
     parsed = make_scenario(scenario)
     env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=parsed).unwrapped
     env.reset(seed=0)
@@ -71,14 +68,11 @@ def _compute_loop_radius(scenario: str | dict[str, object], bandwidth: float) ->
 
 
 def _track_reference(case: tuple[float, int]) -> Array:
-    """Run the step with dakf in the loop: rms_beta (rad), rms_gamma (rad/s), saturated, failed.
-
-    case: Bandwidth (rad/s; 0: no control) and seed.
-    """
-    K, seed = case
+    """Run the step with dakf in the loop: rms_beta (rad), rms_gamma (rad/s), saturated, failed."""
+    K, seed = case  # rad/s, 0 for no control
     options: dict[str, Any] = {"bandwidth": (K, K)} if K > 0.0 else {"agent": "none"}
-    result = measure_tracking(run_episode(seed, _STEP, **options))
-    return np.array([result.rms_beta, result.rms_gamma, result.saturated, result.failed], float)
+    numbers = measure_tracking(run_episode(seed, _STEP, **options))
+    return np.array([numbers[x] for x in ("rms_beta", "rms_gamma", "saturated", "failed")])
 
 
 def _keep_lane(index: int, cars: int) -> Array:

@@ -103,12 +103,7 @@ def _run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple
 def _measure(request: Request) -> Results:
     seeds = request.episodes or 0
     drives = request.run_seeds(_run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
-    return list(map(_stack_seeds, drives))
-
-
-def _stack_seeds(drives: Sequence[Mapping[str, tuple[float, float]]]) -> dict[str, Array]:
-    """Stack the numbers of every seed to (seeds, 2), by name."""
-    return {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
+    return [{name: np.array([x[name] for x in run]) for name in run[0]} for run in drives]
 
 
 def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
+from ...envs.vehicle.parameters import VEHICLES
 from ...estimators.vector.estimate import EstimateObservation
 from ..control.entries import ADAPTIVE, JOINT, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
@@ -30,10 +31,9 @@ from ..control.tasks import (
     ControlTask,
     list_scored_tasks,
     make_salted_seeds,
-    vary_scenario,
 )
 from ..harness.parallel import run_cases
-from ..harness.results import ResultTable, Suite
+from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
 from ..harness.verdict import format_percent, format_verdict
 
@@ -42,6 +42,15 @@ if TYPE_CHECKING:
     from ...agents.training.distill import DistillTask
 
 _CLASSICAL, FILTER = "lqr", "exact-kf"
+_METRICS = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
+_COLUMNS = (
+    Column("label", "controller"),
+    "cost ratio",
+    Column("better", "better / %", 100.0, ".0f"),
+    Column("rms_slip", "RMS slip / mrad", 1e3, ".2f", interval=False),
+    Column("largest_step", "step / (N m)", form=".0f", interval=False),
+    Column("fails", "fails / %", 100.0, ".1f"),
+)
 
 
 @dataclass
@@ -57,20 +66,11 @@ class PolicyEvaluation:
     drives: dict[str, DriveResult]  # episodes by name
     left_out: dict[str, str]  # why an entry is not among them, by name
 
-    def summarise(self) -> JsonMap:
-        """Summarise for a card: salt, episodes, and each mean cost with its 95 % interval."""
-        costs = {}
-        for name, drive in self.drives.items():
-            numbers = (round(number, 6) for number in interval(drive.costs))
-            costs[name] = dict(zip(("mean", "low", "high"), numbers, strict=True))
-        return {"salt": self.salt, "episodes": len(self.seeds), "cost": costs}
-
     def make_suite(self) -> Suite:
         """Make a suite of table and rows, and of the first episode over time and in motion."""
         from ..control.report import make_time_explorer
 
-        name, card = self.policy.name, self.policy.card
-        task = self.task
+        name, card, task = self.policy.name, self.policy.card, self.task
         text = (
             f"{len(self.seeds)} episodes of {task.scenario}, the same seeds for all. "
             f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
@@ -78,63 +78,40 @@ class PolicyEvaluation:
         )
         if self.reference != card.reference:
             text += f" Here it is judged by another reference, {self.reference}: by another cost."
-        suite = Suite("enjoy", f"{name} on {task.env_id}", text, tables=[self._make_table()])
-        self._add_rows(suite)
+        suite, costs = Suite("enjoy", f"{name} on {task.env_id}", text), self.drives[name].costs
+        lines, verdict = list[dict[str, Any]](), list[str]()
+        for label, drive in self.drives.items():
+            entry = self.entries[label]
+            line: dict[str, Any] = {metric: interval(drive[metric]) for metric in _METRICS}
+            line |= {"label": label, "fails": float(np.mean(drive["failure"] != 0.0))}
+            if label != name:
+                ratio = geometric_mean(np.log(compute_cost_ratios(costs, drive.costs)))
+                line |= {"cost ratio": format_percent(ratio)}
+                line |= {"better": compute_win_rate(costs, drive.costs).value}
+                verdict.append(f"{name} costs {line['cost ratio']} of {label}, seed by seed.")
+            lines.append(line)
+            columns = {"estimator": entry.estimator, "scenario": task.scenario, "salt": self.salt}
+            columns |= {"controller": name if label == name else entry.agent}
+            columns |= {"spec": ControlCase(task, entry).spec}
+            suite.add_rows([line], task.env_id, n=len(self.seeds), **columns)
+        note = (
+            f"cost ratio: {name}'s over each other's, paired geometric means with 95 % intervals. "
+            f"better: on how many of the seeds {name} costs less. step: the largest between two "
+            "decisions."
+        )
+        left_out = [f"{x} was not driven: {error}." for x, error in self.left_out.items()]
+        note = " ".join([note, *left_out])
+        suite.tables.append(ResultTable("What it costs", _COLUMNS, lines, note))
         driven = {(label,): drive.series for label, drive in self.drives.items()}
         series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
         explorer = make_time_explorer("The first seed, side by side", (), series, name)
         suite.explorers.append(explorer)
-        fails = f"It fails in {self._compute_failures(name):.0f} % of the episodes."
+        fails = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes."
         suite.verdict = format_verdict(
-            *(
-                f"{name} costs {self._format_cost_ratio(other)} of {other}, seed by seed."
-                for other in self.drives
-                if other != name
-            ),
+            *verdict,
             f"{fails} Not said: other cars, scenarios and seeds than these {len(self.seeds)}.",
         )
         return suite
-
-    def _compute_failures(self, name: str) -> float:
-        """Compute the percentage of episodes that fail."""
-        return float(100.0 * np.mean(self.drives[name]["failure"] != 0.0))
-
-    def _format_cost_ratio(self, other: str) -> str:
-        costs, others = (self.drives[name].costs for name in (self.policy.name, other))
-        return format_percent(geometric_mean(np.log(compute_cost_ratios(costs, others))))
-
-    def _make_table(self) -> ResultTable:
-        """Table of what the policy costs over each other's, and of everybody's motion."""
-        first, cells = self.policy.name, []
-        for name, drive in self.drives.items():
-            ratio, better = "", ""
-            if name != first:
-                ratio = self._format_cost_ratio(name)
-                win_rate = compute_win_rate(self.drives[first].costs, drive.costs)
-                better = f"{100.0 * win_rate.value:.0f} %"
-            slip, step = 1e3 * drive["rms_slip"].mean(), drive["largest_step"].mean()
-            fails = f"{self._compute_failures(name):.1f} %"
-            cells.append([name, ratio, better, f"{slip:.2f}", f"{step:.0f}", fails])
-        header = ("controller", "cost ratio", "better", "RMS slip", "step", "fails")
-        note = (
-            f"{first}'s cost over each other's: paired geometric means with 95 % intervals. "
-            f"better: share of the seeds on which {first} costs less. Slip in mrad. step: "
-            "the largest between two decisions, in N m."
-        )
-        left_out = [f"{name} was not driven: {error}." for name, error in self.left_out.items()]
-        return ResultTable("What it costs", header, cells, " ".join([note, *left_out]))
-
-    def _add_rows(self, suite: Suite) -> None:
-        """Add rows of every entry: cost, slip, effort and steps."""
-        for name, outcome in self.drives.items():
-            entry = self.entries[name]
-            task, is_policy = self.task, name == self.policy.name
-            labels = {"estimator": entry.estimator, "scenario": task.scenario, "salt": self.salt}
-            labels |= {"controller": name if is_policy else entry.agent}
-            metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
-            numbers = {metric: interval(outcome[metric]) for metric in metrics}
-            labels |= {"spec": ControlCase(task, entry).spec}
-            suite.add_rows([numbers], task.env_id, n=len(self.seeds), **labels)
 
 
 def evaluate_policy(
@@ -183,20 +160,30 @@ def evaluate_policy(
     return PolicyEvaluation(loaded, salt, seeds, base.reference, task, entries, drives, errors)
 
 
-def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation:
-    """Drive a policy's test seeds in its own env and write what it costs into its card.
+def record_evaluation(path: Path, episodes: int = 256, kind: str = "") -> JsonMap:
+    """Drive a policy's test seeds and write what it costs into its card.
 
     Args:
         path: File of the policy.
-        episodes: Episodes of each entry.
+        episodes: Episodes of each entry, in the policy's own env and in each task.
+        kind: Class of tasks that it drives too, beside their baselines; "" for none.
 
     Returns:
-        Episodes of all entries.
+        The card's evaluation.
     """
-    result = evaluate_policy(str(path), episodes)
-    policy = result.policy
-    save_policy(path, policy.network, replace(policy.card, evaluation=result.summarise()))
-    return result
+    evaluation = evaluate_policy(str(path), episodes)
+    policy, costs = evaluation.policy, dict[str, JsonMap]()
+    for name, drive in evaluation.drives.items():
+        numbers = (round(number, 6) for number in interval(drive.costs))
+        costs[name] = dict(zip(("mean", "low", "high"), numbers, strict=True))
+    record: JsonMap = {"salt": evaluation.salt, "episodes": len(evaluation.seeds), "cost": costs}
+    if kind:
+        tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
+        of_nominal = run_cases(evaluate, tasks, "contests", jobs=1)
+        names = (task.scenario for task in tasks)
+        record["cost in % of nominal"] = dict(zip(names, of_nominal, strict=True))
+    save_policy(path, policy.network, replace(policy.card, evaluation=record))
+    return record
 
 
 _RIVAL = "adaptive-nmpc"
@@ -234,6 +221,15 @@ def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
             "wind_length": (1.0, 4.0),
             "mass": float(rng.uniform(*VARIED["mass"])),
         }
+
+
+def _vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> JsonMap:
+    """Make a task's scenario with some fields changed; "mass" is a factor on the true car's."""
+    fields, base = dict(change), make_scenario(task.scenario)
+    if "mass" in fields:
+        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
+        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
+    return {"base": task.scenario} | fields
 
 
 @dataclass(frozen=True)
@@ -286,7 +282,7 @@ class Lessons:
             for change in _draw_changes(self.varied, rng):
                 scenario_options: JsonMap = {}
                 if change:
-                    scenario_options["scenario"] = vary_scenario(task, change)
+                    scenario_options["scenario"] = _vary_scenario(task, change)
                 name = reads.get(teacher, self.estimator or REFERENCE_FILTER)
                 count = -(-self.cars // self.varied) if change else self.cars
                 scenario_options["lead_in"] = QUICK_LEAD_IN
@@ -337,33 +333,13 @@ def prepare_start(
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
             fields["scenarios"] = [
-                vary_scenario(task, change) if change else task.scenario
+                _vary_scenario(task, change) if change else task.scenario
                 for task in tasks
                 for change in _draw_changes(varied, rng)
             ]
         return make_finetune_task(policy, **fields)
 
     return policy, make_task
-
-
-def evaluate_card(path: Path, kind: str, episodes: int) -> JsonMap:
-    """Drive a policy and its class's baselines, and write what it costs into its card.
-
-    Args:
-        path: File of the policy.
-        kind: Class of tasks.
-        episodes: Episodes of each task.
-
-    Returns:
-        The card's evaluation.
-    """
-    policy, policy_evaluation = load_policy(path), evaluate_policy(str(path), episodes)
-    tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
-    task_costs = run_cases(evaluate, tasks, "contests", jobs=1)
-    costs = dict(zip((task.scenario for task in tasks), task_costs, strict=True))
-    record = policy_evaluation.summarise() | {"cost in % of nominal": costs}
-    save_policy(path, policy.network, replace(policy.card, evaluation=record))
-    return record
 
 
 def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:

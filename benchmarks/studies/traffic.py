@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from ...agents import make_agent
-from ...agents.baselines import make_oracle
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.task import FAILURES
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..control.entries import REFERENCE_FILTER, ControlCase, Entry
+from ..control.entries import REFERENCE_FILTER, Entry
 from ..control.tasks import ORACLES, STATE, ControlTask
-from ..harness.drives import call_quietly, make_env
+from ..harness.drives import call_quietly
 from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
 from ..harness.verdict import format_percent, format_verdict
@@ -41,16 +40,7 @@ READERS = ("multirate-residual-kf", "exact-kf", _RETURNED, _NEWEST)
 def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
     """Run a controller on some seeds: cost, failure and largest slip (rad) of each."""
     controller, seeds = case
-    entry = Entry(controller, _READS.get(controller, REFERENCE_FILTER))
-    contest = ControlCase(_TASK, entry)
-    if entry.is_oracle:
-        env, agent = make_oracle(contest.driver, ID, options=contest.options, **contest.env_options)
-    else:
-        name, options = "", dict[str, Any]()
-        if entry.estimator:
-            name, options = "exact-kf", contest.estimate_options
-        env = make_env(ID, name, options, **contest.env_options)
-        agent = make_agent(controller, env, **contest.agent_options)
+    env, agent = Entry(controller, _READS.get(controller, REFERENCE_FILTER)).make(_TASK)
     rows = []
     for seed in seeds:
         steps = list(iterate_steps(env, agent, FIRST_SEED + seed))
@@ -60,11 +50,7 @@ def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
 
 
 def _keep_lane(case: tuple[str, int]) -> Array:
-    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,).
-
-    Errors of slip, yaw rate, heading (rad, rad/s) and the preview point's offset (m); the car's
-    offset from the lane's centre (m).
-    """
+    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,)."""
     from ...envs.highway.lane_keeping_adapter import STATES, KeepingEnv, NativeObservation
 
     reader, seed = case
@@ -77,7 +63,7 @@ def _keep_lane(case: tuple[str, int]) -> Array:
     agent = make_agent("lane-keeping", env, moment=False)
     names = [entry.name for entry in env.get_wrapper_attr("layout")]
     columns = [names.index(f"{name}_hat") for name in STATES]
-    rows = []
+    rows = []  # errors of slip, yaw rate, heading, preview offset (rad, rad/s, m); offset (m)
     for step in iterate_steps(env, agent, seed):
         rows.append([*(step.obs[columns] - base.truth), base.motion.y])
     return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)

@@ -92,13 +92,6 @@ LOGS = Path(__file__).with_name("logs")
 _UNTUNED: Options = {"filter": {}, "controller": {}}
 
 
-def _get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
-    """Get the numbers of a controller in a class of tasks; ValueError for unknown names."""
-    check_choice("controller", name, SPACES)
-    check_choice("class", kind, KINDS)
-    return tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
-
-
 @dataclass(frozen=True)
 class ControllerTuning:
     """A search of a controller's numbers over the tasks of a class, on tuning seeds."""
@@ -154,7 +147,10 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
     Raises:
         ValueError: The name or class is unknown, or there are no tasks or no seeds.
     """
-    numbers, changes = _get_space(name, kind), {"lead_in": QUICK_LEAD_IN}
+    check_choice("controller", name, SPACES)
+    check_choice("class", kind, KINDS)
+    numbers = tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
+    changes = {"lead_in": QUICK_LEAD_IN}
     tasks = [replace(t, changes=changes) for t in list_scored_tasks() if t.kind == kind]
     if not tasks or not seeds:
         raise ValueError(f"{kind}: {len(tasks)} contests, {len(seeds)} seeds; both are needed")
@@ -191,10 +187,8 @@ def _compute_objective(
 def _evaluate_trials(
     task: ControllerTuning, jobs: int, batch: Sequence[dict[str, float]]
 ) -> list[tuple[float, int]]:
-    """Evaluate a batch of trials, each to its objective and the number of seeds that it drove.
-
-    The worse half of a slow controller's trials ends after each of `_STAGES` (successive halving).
-    """
+    """Evaluate a batch of trials, each to its objective and the number of seeds that it drove."""
+    # the worse half of a slow controller's trials ends after each stage: successive halving
     stages = [stage for stage in _STAGES if task.name in _SLOW and stage < len(task.seeds)]
     results, remaining, done = [(0.0, 0)] * len(batch), list(range(len(batch))), 0
     for count in (*stages, len(task.seeds)):

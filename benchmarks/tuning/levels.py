@@ -178,16 +178,8 @@ def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[A
     return error, estimates.std[rows, column]
 
 
-def convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, float]:
-    """Convert levels to options of a filter for a drive.
-
-    Args:
-        levels: Numbers by name; the course's noise is that at 60 km/h.
-        log: The drive.
-
-    Returns:
-        Options of `make_estimator`, those alone whose sensors are there.
-    """
+def _convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, float]:
+    """Convert levels to a filter's options for a drive, those alone whose sensors are there."""
     options, sensors = dict(levels), set(log.slow)
     options["q_rear_tyres"] = options["q_front_tyres"]
     options["rear_tyres_sd"] = options["front_tyres_sd"]
@@ -200,9 +192,7 @@ def convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, float]:
     return {key: value for key, value in options.items() if key not in left_out}
 
 
-@cache
-def _draw_once(seed: int) -> LoggedEpisode:
-    return draw_drive(seed)
+_draw_once = cache(draw_drive)
 
 
 def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
@@ -211,7 +201,7 @@ def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
     scores = []
     for seed in seeds:
         episode = _draw_once(seed)
-        error, deviation = run_filter(episode, convert_levels(levels, episode.log))
+        error, deviation = run_filter(episode, _convert_levels(levels, episode.log))
         if not len(error):  # it spun before the filter had settled
             continue
         squares = np.minimum((error / deviation) ** 2, _WORST)
@@ -219,21 +209,10 @@ def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
     return scores
 
 
-def search(
+def _search(
     start: Mapping[str, float], trials: int, drives: int, jobs: int | None, console: Console
 ) -> tuple[dict[str, float], float, float]:
-    """Search levels by CMA-ES on the logarithm of their factors.
-
-    Args:
-        start: Levels to start from, by name.
-        trials: Number of trials.
-        drives: Number of drives, the same for all trials.
-        jobs: Processes; None: one a processor.
-        console: Where progress is shown.
-
-    Returns:
-        The best levels, their mean negative log score (rad) and that of the start.
-    """
+    """Search by CMA-ES on the logs of factors; best levels, their log score (rad), the start's."""
     from cmaes import CMA  # of the extra `tune`
 
     names, scores = list(start), list[float]()
@@ -277,7 +256,7 @@ def main(
 ) -> None:
     """Search the levels of `joint` and write them."""
     first = get_levels() if start is None else json.loads(start.read_text(encoding="utf-8"))
-    best, score, before = search(first, trials, drives, jobs, Console())
+    best, score, before = _search(first, trials, drives, jobs, Console())
     levels = {name: float(f"{value:.3g}") for name, value in best.items()}
     write_text(out, json.dumps({"score": score, "before": before, "levels": levels}, indent=1))
 

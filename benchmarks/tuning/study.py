@@ -63,10 +63,7 @@ def _load_drives(path: str) -> list[LoggedEpisode]:
 def _compute_squares(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
 ) -> Array:
-    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds).
-
-    It is infinite where an estimate is not finite; ValueError where the estimator fails.
-    """
+    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds)."""
     options, turn = task.options | dict(values), 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
     for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
@@ -143,10 +140,7 @@ def _search(
     drives: Sequence[LoggedEpisode],
     search: SearchOptions,
 ) -> dict[str, float]:
-    """Search on training drives until the study has so many trials; the best numbers, 3 digits.
-
-    Raises ValueError for a storage that fails and where no trial gave a stable filter.
-    """
+    """Search on training drives until the study has so many trials; the best numbers, 3 digits."""
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "drives")  # from which workers read them
         joblib.dump(list(drives), path)

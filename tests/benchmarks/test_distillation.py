@@ -13,7 +13,7 @@ from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Policy, save_policy
 from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.control.entries import ADAPTIVE, ControlCase, Entry
-from sideslip.benchmarks.control.tasks import list_scored_tasks, vary_scenario
+from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.studies import policies
 from sideslip.benchmarks.studies.policies import (
     FILTERS,
@@ -126,7 +126,10 @@ def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
     calm = {key: value for key, value in change.items() if not key.startswith("wind_")}
     aside = []
     for each in (change, calm):
-        options = contest.env_options | {"scenario": vary_scenario(contest, each), "lead_in": 0.0}
+        options = contest.env_options | {
+            "scenario": policies._vary_scenario(contest, each),
+            "lead_in": 0.0,
+        }
         cars: Any = gym.make_vec(contest.env_id, num_envs=8, **options).unwrapped
         cars.reset(seed=list(range(8)))
         column = [entry.name for entry in cars.layout].index("gps_Y")

@@ -17,9 +17,9 @@ ROOT = Path(readme.__file__ or "").resolve().parents[1]
 
 def test_the_tables_are_made_from_their_files() -> None:
     rows, transfer = (read_json(ROOT / path) for path in (readme.ROWS, readme.TRANSFER))
-    pages = {readme.README: readme.make_table(rows, transfer)}
-    doubled = readme.make_doubled_table(rows)
-    pages[readme.PAGE] = readme.make_task_table(rows)
+    pages = {readme.README: readme._make_table(rows, transfer)}
+    doubled = readme._make_doubled_table(rows)
+    pages[readme.PAGE] = readme._make_task_table(rows)
     pages[own_ground.PAGE] = own_ground.make_table(read_json(ROOT / own_ground.ROWS))
     for path, made in pages.items():
         text = (ROOT / path).read_text()
@@ -46,7 +46,7 @@ def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -
     rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
     rows += [replace(row, scenario="tier limit", controller="esc") for row in rows]
     far = replace(cost, scenario="fmvss-126 passenger-car", metric="amplitude", value=3.5)
-    lines = readme.make_table(rows, [far]).splitlines()
+    lines = readme._make_table(rows, [far]).splitlines()
     assert lines[0].startswith("| | small car, 18-28 km/h | road, ") and len(TITLES) == 3
     (line,) = (line for line in lines if line.startswith("| no control"))
     assert line == "| no control |  | 50 (7) |  | 3.5 |  |"
@@ -69,7 +69,7 @@ def test_a_task_has_a_line_with_intervals() -> None:
     task = next(task for task in list_scored_tasks() if task.env_id == STEERING)
     cost = ResultRow("control", task.name, "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12)
     rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
-    (line,) = (x for x in readme.make_task_table(rows).splitlines() if "50 [" in x)
+    (line,) = (x for x in readme._make_task_table(rows).splitlines() if "50 [" in x)
     assert line.startswith(f"| {task.scenario} |") and line.endswith("| 50 [40, 60] (7) |")
 
 

@@ -10,8 +10,8 @@ from sideslip.benchmarks.control import calibration
 from sideslip.benchmarks.control.calibration import (
     CalibrationRecord,
     ClairvoyantEpisode,
-    derive_seeds,
-    read_calibration,
+    _derive_seeds,
+    _read_calibration,
 )
 from sideslip.benchmarks.control.tasks import list_scored_tasks
 from tests.benchmarks.conftest import Run
@@ -51,8 +51,8 @@ def test_it_writes_beside_the_user(
     status, out, _ = run("calibrate", *arguments, "--contest", FIRST.name, "--seeds", 2, "-j", 1)
     assert status == 0 and "wrote " in out
     assert files(here) == [written]
-    (entry,) = read_calibration(here / written).values()
-    assert entry.task == FIRST and [e.seed for e in entry.episodes] == derive_seeds(FIRST, 2)
+    (entry,) = _read_calibration(here / written).values()
+    assert entry.task == FIRST and [e.seed for e in entry.episodes] == _derive_seeds(FIRST, 2)
     assert entry.command.startswith("sideslip calibrate")
 
 

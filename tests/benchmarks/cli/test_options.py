@@ -75,8 +75,6 @@ CASES = [
          ("--vehicle coms", "comparison.vehicle", "coms")),
     *_of("bench control --agent esc", "benchmarks.entrants.challenge.make_user_entries",
          ("--trust", "trust", True)),
-    *_of("bench --log log.csv", "benchmarks.recorded.replay.replay_file",
-         ("--map yaw_rate_degps=r", "mapping", ["yaw_rate_degps=r"])),
     *_of("bench control", f"{CLI}.main.write_page", ("--page a.md", "path", Path("a.md"))),
     *_of("calibrate", f"{CLI}.search.use_engine", *CLUSTER),
     *_of("enjoy distill-car-yaw", "benchmarks.studies.policies.evaluate_policy",

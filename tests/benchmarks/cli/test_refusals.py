@@ -48,7 +48,6 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("replay", "nowhere.csv"), "nowhere.csv"),
     (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),
     (("replay", "nowhere.csv", "--kml", "a.kml"), "--kml are for a receiver's log"),
-    (("bench", "--log", "nowhere.csv"), "nowhere.csv"),
     (("calibrate", "--contest", "moon"), "unknown contest 'moon'"),
     (("calibrate", "--seeds", "1"), "two seeds or more, got 1"),
     (("calibrate", "nowhere/mine.json"), "cannot write nowhere/mine.json"),

@@ -5,7 +5,6 @@ import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
@@ -23,7 +22,7 @@ from sideslip.benchmarks.studies.policies import _list_tasks
 from tests.benchmarks.conftest import Run
 from tests.policies import TRACES
 
-NO_COSTS = Mock(**{"summarise.return_value": {"cost": {}}})
+NO_COSTS: dict[str, Any] = {"cost": {}}
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
 
 

@@ -12,9 +12,8 @@ import pytest
 from sideslip.agents.learned.network import SUFFIX
 from sideslip.benchmarks.control import run
 from sideslip.benchmarks.control.entries import Entry
-from sideslip.benchmarks.control.run import Chunk, DriveResult, make_storage
+from sideslip.benchmarks.control.run import Chunk, DriveResult, _hash_chunk, _StoredDrives
 from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.report.study import StoredFunction
 from sideslip.envs.numerics import kernel_cache
 
 SEEDS = (3, 4, 5)
@@ -76,7 +75,7 @@ def test_a_damaged_case_is_driven_again(damage: str, tmp_path: Path) -> None:
         driven.append(chunk)
         return DriveResult(numbers, 1.0, series)
 
-    cached = StoredFunction(drive_it, tmp_path, make_storage())
+    cached = _StoredDrives(tmp_path, drive_it)
     chunk = Chunk(ControlTask(scenario="gust"), Entry("none"), SEEDS, keep=True)
     cached(chunk)
     (path,) = tmp_path.iterdir()
@@ -87,6 +86,13 @@ def test_a_damaged_case_is_driven_again(damage: str, tmp_path: Path) -> None:
         assert found.series is not None and np.array_equal(found.series, series)
     assert len(driven) == 2
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_could_not_be_driven_is_not_kept(tmp_path: Path) -> None:
+    failed = DriveResult(np.full((len(SEEDS), NUMBERS), np.nan), np.nan, error="no solver")
+    chunk = Chunk(ControlTask(scenario="gust"), Entry("none"), SEEDS)
+    assert _StoredDrives(tmp_path, lambda _: failed)(chunk).error == "no solver"
+    assert not list(tmp_path.iterdir())
 
 
 def test_other_options_of_an_id_and_another_car_s_file_are_another_case(
@@ -112,7 +118,7 @@ def test_other_tuned_options_are_another_case(monkeypatch: pytest.MonkeyPatch) -
     for salt in ("one", "another", "one"):
         monkeypatch.setattr(run, "make_salt", lambda salt=salt: salt)
         run.hash_sources.cache_clear()
-        names.append(make_storage().describe(chunk))
+        names.append(_hash_chunk(chunk))
     run.hash_sources.cache_clear()
     assert names[0] == names[2] != names[1]
 
@@ -124,5 +130,5 @@ def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None
     for weights in (b"one", b"another", b"one"):
         file.write_bytes(weights)
         chunk = Chunk(ControlTask(scenario="gust"), Entry(str(file)), SEEDS)
-        names.append(make_storage().describe(chunk))
+        names.append(_hash_chunk(chunk))
     assert names[0] == names[2] != names[1]

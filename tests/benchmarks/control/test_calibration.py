@@ -18,9 +18,9 @@ from sideslip.benchmarks.control import calibration
 from sideslip.benchmarks.control.calibration import (
     Calibration,
     CalibrationRecord,
-    derive_seeds,
+    _derive_seeds,
+    _read_calibration,
     measure_regrets,
-    read_calibration,
     read_current,
     update,
 )
@@ -56,19 +56,19 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_seeds_are_its_own_and_follow_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    few, many = derive_seeds(GUST, 4), derive_seeds(GUST)
+    few, many = _derive_seeds(GUST, 4), _derive_seeds(GUST)
     assert many[:4] == few and len(set(many)) == 64
     assert min(many) > 10**6
-    assert not set(many) & set(derive_seeds(SINE))
+    assert not set(many) & set(_derive_seeds(SINE))
     monkeypatch.setattr(calibration, "WORLD_VERSION", 999)
-    assert not set(many) & set(derive_seeds(GUST))
+    assert not set(many) & set(_derive_seeds(GUST))
 
 
 def test_a_stopped_run_goes_on(asked: list[int], tmp_path: Path) -> None:
     folder = tmp_path / "cases"
     Calibration([GUST], folder, 3).run(jobs=1)
     (entry,) = Calibration([GUST], folder, 5).run(jobs=1)
-    assert asked == derive_seeds(GUST, 5)  # each once
+    assert asked == _derive_seeds(GUST, 5)  # each once
     assert entry.costs.tolist() == [seed % 10 for seed in asked]
     Calibration([SINE], folder, 3).run(jobs=1)
     assert len(asked) == 8  # another question
@@ -84,7 +84,7 @@ def test_a_file_keeps_other_entries(asked: list[int], tmp_path: Path) -> None:
     update(path, both)
     changed = dataclasses.replace(both[0], command="other")
     update(path, [changed])
-    assert read_calibration(path) == {GUST: changed, SINE: both[1]}
+    assert _read_calibration(path) == {GUST: changed, SINE: both[1]}
 
 
 SPOILED: dict[str, Callable[[str], str]] = {
@@ -109,7 +109,9 @@ def test_a_file_that_does_not_fit_is_refused_by_name(
     spoiled = SPOILED[message](path.read_text())
     path.write_text(spoiled)
     stale = "is stale" in message
-    for use in (read_calibration,) if stale else (read_calibration, lambda path: update(path, [])):
+    for use in (
+        (_read_calibration,) if stale else (_read_calibration, lambda path: update(path, []))
+    ):
         with pytest.raises(ValueError, match=message) as caught:
             use(path)
         assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
@@ -117,7 +119,7 @@ def test_a_file_that_does_not_fit_is_refused_by_name(
     if stale:  # its other entries stay, and new ones can be written
         (made,) = calibrate(tmp_path, SINE)
         update(path, [made])
-        assert read_calibration(path) == {SINE: made}
+        assert _read_calibration(path) == {SINE: made}
 
 
 def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_path: Path) -> None:
@@ -128,7 +130,7 @@ def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_pat
     assert read_current(path, [SINE]) == {}
     with pytest.raises(ValueError, match="file: gust, yaw is stale: the uncontrolled car costs"):
         read_current(path, [GUST])
-    found = measure([(GUST, Entry("none"))], derive_seeds(GUST, 2), jobs=1)
+    found = measure([(GUST, Entry("none"))], _derive_seeds(GUST, 2), jobs=1)
     none = found[GUST, Entry("none")].costs
     episodes = tuple(
         dataclasses.replace(episode, costs={"none": cost})
@@ -147,7 +149,7 @@ def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
     cases = [ControlCase(changed, Entry("none")), ControlCase(SINE, Entry("none"))]
     regrets, there = measure_regrets({GUST: entry}, cases, jobs=1)
     assert list(there) == [none]
-    costs = measure([none], derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
+    costs = measure([none], _derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
     expected = np.clip(np.log((costs + 0.001) / (entry.costs + 0.001)), -3.0, 3.0)
     assert regrets[none] == pytest.approx(expected)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import tasks as module
-from sideslip.benchmarks.control.baseline_gaps import _BASELINES, measure_task
+from sideslip.benchmarks.control.baseline_gaps import _BASELINES, _measure_task
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, measure
 from sideslip.benchmarks.control.score import PairedDrives
@@ -22,10 +22,10 @@ from sideslip.benchmarks.control.tasks import (
     TIERS,
     ControlTask,
     TaskMeasurement,
+    _read_tasks,
     list_candidates,
     list_scored_tasks,
     make_salted_seeds,
-    read_tasks,
 )
 from sideslip.benchmarks.entrants.worker import run_user_chunk
 from sideslip.benchmarks.harness.stats import average
@@ -58,7 +58,7 @@ def found(
         made[contest, Entry(name)] = driven(level * seeds, count, peak=peak)
     for entry in _BASELINES:
         made.setdefault((contest, entry), driven(np.full(40, np.nan), error="no plant"))
-    return measure_task(made, contest)
+    return _measure_task(made, contest)
 
 
 ALL = {NOMINAL: 2.0} | dict.fromkeys(ORACLES[PARAMETERS], 1.5)
@@ -118,7 +118,7 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
     path = tmp_path / "contests.json"
     entry = found(ONE, BOTH)
     path.write_text(json.dumps([dataclasses.asdict(entry)]))
-    assert read_tasks(path) == (entry,)
+    assert _read_tasks(path) == (entry,)
     for change, message in (
         ({"world_version": 0}, "measured in world 0, this is 1"),
         ({"scenario": "moon"}, "is no contest of this version"),
@@ -129,17 +129,17 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
     ):
         path.write_text(json.dumps([dataclasses.asdict(entry) | change]))
         with pytest.raises(ValueError, match=message) as caught:
-            read_tasks(path)
+            _read_tasks(path)
         assert str(path) in str(caught.value)
     path.write_text("[")
     with pytest.raises(ValueError, match="cut short"):
-        read_tasks(path)
+        _read_tasks(path)
 
 
 def test_every_tier_has_its_contests_and_they_can_be_built() -> None:
     assert {contest.tier for contest in list_candidates()} == set(TIERS)
     assert len({contest.name for contest in list_candidates()}) == len(list_candidates())
-    assert {each.task for each in read_tasks()} == set(list_candidates())
+    assert {each.task for each in _read_tasks()} == set(list_candidates())
     for contest in list_scored_tasks():
         assert SCENARIOS[contest.scenario].tier == contest.tier
         assert (contest.env_id, contest.vehicle, contest.reference) in TIERS[contest.tier]

@@ -27,7 +27,7 @@ from sideslip.benchmarks.control.tasks import (
     list_scored_tasks,
     make_salt,
 )
-from sideslip.benchmarks.report.study import Request, StoredFunction
+from sideslip.benchmarks.report.study import Request
 from sideslip.envs import COMS, FAILURES, SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import EstimateObservation
@@ -201,7 +201,7 @@ def test_standing_car_and_diverging_plant_end_finite() -> None:
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk = Chunk(GUST, Entry("none"), SEEDS, keep=True)
-    cached = StoredFunction(drive.run_chunk, tmp_path, drive.make_storage())
+    cached = drive._StoredDrives(tmp_path)
     first = cached(chunk)
     cached = replace(cached, function=lambda _: pytest.fail("it is driven again"))
     again = cached(chunk)

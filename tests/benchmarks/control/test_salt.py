@@ -180,7 +180,7 @@ def test_seeds_stay_whatever_the_fields_of_a_contest_are_called() -> None:
     every = [ControlTask(), *list_candidates()]
     drawn = [make_task_seeds(ONE, 4)(each) for each in every]
     assert digest(drawn) == "e42c9b2fc4da0ad9"
-    assert digest([calibration.derive_seeds(each, 4) for each in every]) == "b87f03b3d2e8a2ff"
+    assert digest([calibration._derive_seeds(each, 4) for each in every]) == "b87f03b3d2e8a2ff"
 
 
 def test_tuning_seeds_are_nobody_elses() -> None:

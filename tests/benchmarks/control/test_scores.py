@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control.entries import Entry
-from sideslip.benchmarks.control.report import compute_places
-from sideslip.benchmarks.control.robustness import compare_scores, list_reversals
+from sideslip.benchmarks.control.report import _compute_places
+from sideslip.benchmarks.control.robustness import _compare_scores, _list_reversals
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.score import (
     PairedDrives,
@@ -113,7 +113,7 @@ def test_places_follow_the_constants() -> None:
     ranked = rank_entries(results, "road")
     by_loss = {}
     for loss in (0.5, 30.0):
-        places = compute_places(ranked, loss, 1.0)
+        places = _compute_places(ranked, loss, 1.0)
         by_loss[loss] = {x.label: place for x, place in zip(ranked, places, strict=True)}
     assert by_loss[0.5]["fast"] < by_loss[0.5]["safe"]
     assert by_loss[30.0]["safe"] < by_loss[30.0]["fast"]
@@ -132,10 +132,10 @@ def test_a_reversal_is_sure_in_both_worlds() -> None:
         results = {(TASK, Entry(NOMINAL)): driven(np.full(40, 8.0))}
         for (name, level), factor in zip(levels.items(), noise, strict=True):
             results[TASK, Entry(name)] = driven(level * factor)
-        return compare_scores(results)
+        return _compare_scores(results)
 
     base = compare(a=1.0, b=2.0, c=2.01)
-    assert list_reversals(base, compare(a=2.0, b=1.0, c=2.01)) == [("a", "b")]
-    assert list_reversals(base, compare(a=2.0, b=4.0, c=4.0)) == []
-    assert list_reversals(compare(a=2.0, b=1.0, c=1.0), base) == [("b", "a"), ("c", "a")]
-    assert not list_reversals(base, compare(a=1.0, b=2.01, c=2.0))
+    assert _list_reversals(base, compare(a=2.0, b=1.0, c=2.01)) == [("a", "b")]
+    assert _list_reversals(base, compare(a=2.0, b=4.0, c=4.0)) == []
+    assert _list_reversals(compare(a=2.0, b=1.0, c=1.0), base) == [("b", "a"), ("c", "a")]
+    assert not _list_reversals(base, compare(a=1.0, b=2.01, c=2.0))

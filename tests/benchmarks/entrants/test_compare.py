@@ -34,7 +34,7 @@ from sideslip.benchmarks.entrants.challenge import (
     make_user_entries,
     make_user_entry,
 )
-from sideslip.benchmarks.entrants.score import _make_sentence, compose_verdict, make_table
+from sideslip.benchmarks.entrants.score import _compose_verdict, _make_sentence, _make_table
 from tests.benchmarks.conftest import Run
 from tests.policies import VISION
 
@@ -147,14 +147,14 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
 ) -> None:
     on_file(tmp_path, monkeypatch)
     del driven[:]
-    found = score.compare(challenge(tmp_path, episodes=8))
+    found = score._compare(challenge(tmp_path, episodes=8))
     assert found.on_file and found.salt == "abcd"
     mine = [(cell, seeds) for cell, seeds in driven if cell[1].is_users]
     assert mine and all(seeds == salted("abcd", 8, cell) for cell, seeds in mine)
     again = [(cell, seeds) for cell, seeds in driven if not cell[1].is_users]
     assert again and all(seeds == salted("abcd", 2, cell) for cell, seeds in again)
     assert {entry.agent for (_, entry), _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
-    assert "on file, a sample driven again" in compose_verdict(found)[-1]
+    assert "on file, a sample driven again" in _compose_verdict(found)[-1]
 
 
 @pytest.mark.parametrize("why", ["costs", "episodes", "vehicle", "scenario", "seeds", "fresh"])
@@ -171,7 +171,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     }
     options = changes.get(why, {})
     del driven[:]
-    found = score.compare(challenge(tmp_path, **{"episodes": 8} | options))
+    found = score._compare(challenge(tmp_path, **{"episodes": 8} | options))
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
     assert set(everyone) == set(found.results)
@@ -189,7 +189,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
             for car in ("vehicle", "nominal")
         ]
         assert {car["mass"] for car in cars} == {900.0}
-    assert ("Publishable" in compose_verdict(found)[-1]) == (why == "fresh")
+    assert ("Publishable" in _compose_verdict(found)[-1]) == (why == "fresh")
 
 
 def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
@@ -198,11 +198,11 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
     monkeypatch.setattr(score, "_find_opened_files", lambda *_: rehearsed)
-    found = [score.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
+    found = [score._compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
     assert found[0].salt != found[1].salt
-    again = score.compare(challenge(tmp_path, salt=found[0].salt))
-    assert again.salt == found[0].salt and "Not publishable" in compose_verdict(again)[-1]
-    assert f"--salt {found[0].salt} repeats them" in compose_verdict(found[0])[-1]
+    again = score._compare(challenge(tmp_path, salt=found[0].salt))
+    assert again.salt == found[0].salt and "Not publishable" in _compose_verdict(again)[-1]
+    assert f"--salt {found[0].salt} repeats them" in _compose_verdict(found[0])[-1]
     mine = [seeds for cell, seeds in driven if cell[1].is_users]
     third = len(mine) // 3
     assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
@@ -211,7 +211,7 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
         request = ComparisonRequest((on_default(f"{tmp_path}/pd.py"),), fresh=True)
-        salts.add(score.compare(request).salt)
+        salts.add(score._compare(request).salt)
     assert len(salts) == 2
 
 
@@ -221,8 +221,8 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     pairs = [on_default(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
         Path(pair.agent).write_text(PD)
-    found = score.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
-    lines = compose_verdict(found)
+    found = score._compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
+    lines = _compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
     mine, fails, broken = (
         _make_sentence(next(x for x in found.overall if x.entry == pairs[i])) for i in (0, 4, 1)
@@ -233,7 +233,7 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     assert "loses 0.0 % of the cars (nominal 0.0 %)," in lines[0]
     assert "loses 33.3 % of the cars (nominal 0.0 %), surely more" in fails
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
-    cells = make_table(found).cells
+    cells = _make_table(found).cells
     assert sum(line["label"].startswith("> ") for line in cells) == 5
     assert len(cells) == 5 + 4
 
@@ -318,5 +318,5 @@ def test_options_that_do_not_go_together(
 def test_the_baselines_on_file_still_cost_the_same() -> None:
     """Else: `python -m sideslip.benchmarks.entrants.baselines`."""
     cells = baselines.make_baseline_cases(select_quick_tasks(list_scored_tasks()))
-    assert len(baselines.read_baselines()) == len(cells)
+    assert len(baselines._read_baselines()) == len(cells)
     assert baselines.find_baselines(cells, EPISODES) is not None

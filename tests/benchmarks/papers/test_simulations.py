@@ -74,7 +74,7 @@ def test_following_has_the_reference_beside_the_car() -> None:
     error = curves["without"]["gamma"] - curves["reference"]["gamma"]
     expected = np.sqrt(np.mean(error**2))
     assert found.numbers["without", "rms_gamma"] == pytest.approx(expected)
-    assert found.numbers["without", "steered"] == 0.0
+    assert found.numbers["without", "saturated"] == 0.0
 
 
 def test_seeds_are_split_and_shared() -> None:

@@ -38,30 +38,23 @@ def compared(seeds: Iterable[int], scenario: Any, **options: Any) -> dict[str, A
     for seed in seeds:
         none = measure_tracking(run_episode(seed, scenario, "none"))
         ours = measure_tracking(run_episode(seed, scenario, **options))
-        rows.append(
-            {
-                "rms_beta": ours.rms_beta / none.rms_beta,
-                "rms_gamma": ours.rms_gamma / none.rms_gamma,
-                "peak_beta": ours.peak_beta / none.peak_beta,
-                "saturated": ours.saturated,
-                "failed": float(ours.failed),
-            }
-        )
+        ratios = {x: ours[x] / none[x] for x in ("rms_beta", "rms_gamma", "peak_beta")}
+        rows.append(ours | ratios)
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def test_the_numbers_are_those_of_the_episode() -> None:
     episode = run_episode(0, FIG7 | {"duration": 2.0})
     found = measure_tracking(episode)
-    assert found.rms_beta == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
-    assert found.rms_gamma == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
-    assert found.peak_beta == np.max(np.abs(episode["beta"]))
-    assert not found.failed
+    assert found["rms_beta"] == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
+    assert found["rms_gamma"] == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
+    assert found["peak_beta"] == np.max(np.abs(episode["beta"]))
+    assert not found["failed"]
     assert episode["t"][-1] == 2.0
     assert len(episode["t"]) == 2001
-    assert 0.0 < found.steered < 1.0
+    assert 0.0 < np.abs(episode["action_1"]).max() < 1.0
     none = measure_tracking(run_episode(0, FIG7 | {"duration": 2.0}, "none"))
-    assert (none.saturated, none.steered) == (0.0, 0.0)
+    assert none["saturated"] == 0.0
 
 
 @pytest.mark.long

@@ -1,6 +1,5 @@
 """The skeleton of suites: numbers of seeds, optional modules, finished cases, rows of records."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.study import CaseStorage, Request, Study
+from sideslip.benchmarks.report.study import Request, Study
 
 
 def run(request: Request, **options: Any) -> Suite:
@@ -62,25 +61,3 @@ def test_seeds_are_run_in_chunks_of_each_condition() -> None:
     one, other = Request(jobs=1).run_seeds(square, (3, 4), 5, 2, "")
     assert [drive["a"] for drive in one] == [(3, 0), (3, 1), (3, 2), (3, 3), (3, 4)]
     assert [drive["a"][0] for drive in other] == [4] * 5 and other[0]["b"] == (0.0, 1.0)
-
-
-def test_finished_cases_are_taken_from_the_folder(tmp_path: Path) -> None:
-    """Not those that are damaged, those of another key, and those not worth keeping."""
-    runs: list[int] = []
-
-    def double(case: int) -> float:
-        runs.append(case)
-        return 2.0 * case
-
-    storage = CaseStorage[int, float](
-        str,
-        lambda result: {"x": np.array(result)} if result else None,
-        lambda case, arrays: float(arrays["x"]),
-    )
-    request = Request(jobs=1, keep=tmp_path)
-    assert [request.run_cases(double, (0, 1, 2), "", storage) for _ in "ab"] == [[0, 2, 4]] * 2
-    assert runs == [0, 1, 2, 0]
-    first, _ = tmp_path.iterdir()
-    first.write_bytes(b"no archive")
-    assert request.run_cases(double, (1, 2), "", storage) == [2, 4] and len(runs) == 5
-    assert Request(jobs=1).run_cases(double, (1,), "", storage) == [2] and len(runs) == 6

@@ -5,11 +5,11 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.tuning.levels import (
-    convert_levels,
+    _convert_levels,
+    _search,
     draw_drive,
     get_levels,
     run_filter,
-    search,
 )
 from sideslip.benchmarks.tuning.next_car import PARTS, main
 
@@ -28,7 +28,7 @@ def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
     assert [x.log.record.dt for x in drives] == [0.001] * 3 + [0.01] * 2
     assert all(x.facts["vehicle"] != drives[0].facts["vehicle"] for x in drives[1:])
     for drive in drives:  # the levels in use are the defaults
-        error, deviation = run_filter(drive, convert_levels(get_levels(), drive.log))
+        error, deviation = run_filter(drive, _convert_levels(get_levels(), drive.log))
         assert np.isfinite(error).all() and (deviation > 0.0).all()
 
 
@@ -42,7 +42,7 @@ def test_every_part_can_be_left_out() -> None:
 @pytest.mark.long
 def test_levels_that_are_far_off_are_left() -> None:
     start = get_levels() | {"gyro_noise": 0.1, "force_share": 0.5}
-    _, found, before = search(start, 36, 10, 1, Console(quiet=True))
+    _, found, before = _search(start, 36, 10, 1, Console(quiet=True))
     assert found < before - 0.1
 
 
