@@ -18,6 +18,7 @@ from ...envs.recordings.dialect import SENSORS, SLOW_QUANTITIES, TRUTH, find_sam
 from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
+from ...estimators.wires import SignalCalibration, apply_wires
 from .emulate import (
     COURSE,
     MIN_SPEED,
@@ -30,6 +31,7 @@ from .emulate import (
 from .identify import estimate_slips
 from .quality import (
     BLOCKER,
+    FACTOR,
     MIN_TURNING,
     OK,
     WARNING,
@@ -45,8 +47,9 @@ _DEGREES = 180.0 / math.pi
 _COLUMNS = {"gyro": "yaw_rate", "accel_y": "accel_y", "steer": "steer", "wheel_left": "speed_x"}
 _OUTAGE = 2.0  # s without a slow sample, in which the slip drifts by a gyro's bias alone
 _STANDING, _REST = 0.3, 1.0  # m/s and s of a standstill
-_LATE = 0.1  # s: receivers' stamps err by 0.05 s, and rows and tyres by as much again
-_TIMES = np.arange(-0.5, 1.2, 0.01)  # s, at which a late course is looked for
+_LATE = 0.12  # s: receivers' stamps err by 0.05 s, rows and other tyres by as much again
+_DRIFT = 0.1  # s from half to half, of which the same errors have no part
+_TIMES = np.arange(-0.5, 1.0, 0.01)  # s, at which a late course is looked for
 _STUCK, _MOVES = 1.0, 1.0  # s without change, in which others say m/s2, or m/s, of a change
 _RESOLUTION = {  # SI, noise that filters assume at least; even steps have sqrt(12) as much
     "yaw_rate": 0.002, "accel_y": 0.1, "steer": 0.002, "course": _ALLOWED["course_noise"],
@@ -73,7 +76,28 @@ class InspectedDrive:
     contradictions: Sequence[LogFinding] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.contradictions = find_contradictions(self.logs, self.car) if self.logs else ()
+        ratio = _divide_speeds(self.logs)
+        logs, findings = self.logs, list[LogFinding]()
+        if not 1.0 / FACTOR < ratio < FACTOR and not math.isnan(ratio):
+            text, cure = f"{ratio:.3g} times gps_speed: another unit?", "--map speed_x_kmh=COLUMN"
+            findings = [LogFinding("unit", BLOCKER, "speed_x", text, cure)]
+            logs = [_divide_wheels(log, ratio) for log in logs]
+        findings += find_contradictions(logs, self.car) if logs else []
+        late = self._find_lateness(logs) if any(map(_is_course, findings)) else 0.0
+        if late:  # a late course does not follow the gyro, but later it does
+            shifted = [apply_wires(log, SignalCalibration(latency={"gps": late})) for log in logs]
+            aligned = find_contradictions(shifted, self.car)
+            findings = findings if any(map(_is_course, aligned)) else aligned
+        self.contradictions = findings
+
+    def _find_lateness(self, logs: Sequence[Log]) -> float:
+        """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
+        blocks = list[Array]()
+        for log in (log for log in logs if "gps" in log.slow):
+            heading = compute_heading(log)
+            blocks += collect_fixes(log, COURSE, heading, 0.0 * heading, _TIMES)
+        late = find_latency(blocks, _TIMES, 0.0)[0] if blocks else 0.0
+        return late if 0.0 < late < _TIMES[-2] else 0.0
 
     @functools.cached_property
     def judged(self) -> list[Log]:
@@ -100,9 +124,21 @@ def _judge(
     return LogFinding(check, level if is_wrong else OK, channel, text, cure if is_wrong else "")
 
 
+def _is_course(finding: LogFinding) -> bool:
+    """Whether it says that the course does not follow the gyro."""
+    return finding.channel == "course" and finding.check in ("unrelated", "unit")
+
+
+def _divide_wheels(log: Log, ratio: float) -> Log:
+    """The log with the speed of its wheels divided."""
+    fast = log.record.fast.copy()
+    fast[:, [FAST.wheel_left, FAST.wheel_right]] /= ratio
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
+
+
 def _divide(y: Array, x: Array) -> float:
     """Scale of y over x by their spread, which noise of either lowers less than a line's slope."""
-    if len(x) < 20 or x.std() < 1e-6 or np.corrcoef(x, y)[0, 1] < 0.9:
+    if len(x) < 20 or min(x.std(), y.std()) < 1e-6 or np.corrcoef(x, y)[0, 1] < 0.9:
         return math.nan
     return float(y.std() / x.std())
 
@@ -138,22 +174,23 @@ def _check_stamps(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_gaps(drive: InspectedDrive) -> Iterator[LogFinding]:
-    time, speed = drive.values.get("time"), drive.values.get("speed_x")
-    for name, column in drive.values.items() if time is not None else ():
-        known = np.isfinite(column)
-        if name in TRUTH or known.sum() < 3 or (name in SLOW_QUANTITIES and name != "course"):
+    time, speed = drive.values["time"], np.nan_to_num(drive.values.get("speed_x", np.inf))
+    clock, moving = time, np.broadcast_to(np.abs(speed) > _STANDING, time.shape)
+    for name in ("time", *(name for name in drive.values if name != "time")):
+        column = drive.values[name]
+        known, slow = np.isfinite(column), name in SLOW_QUANTITIES
+        if name in TRUTH or known.sum() < 3 or (slow and name not in ("course", "camera_psi")):
             continue
-        stamps = time[known]
-        if name == "course" and speed is not None:  # no course at a standstill is no gap
-            moving = np.interp(time, time, np.nan_to_num(speed)) > _STANDING
-            clock = np.append(0.0, np.cumsum(np.diff(time) * moving[1:]))
-            stamps = clock[known]
-        steps = np.diff(stamps)
+        ticks = np.cumsum(np.diff(clock, prepend=clock[0]) * moving) if slow else clock
+        steps = np.diff(ticks[known])
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-        limit = max(MAX_HOLE, 1.9 * usual) if name not in SLOW_QUANTITIES else _OUTAGE + usual
+        limit = _OUTAGE + usual if slow else max(MAX_HOLE, 1.9 * usual)
         count, longest = int((steps > limit).sum()), float(steps.max())
         text = f"{count} gaps above {limit:.2g} s, the longest step {longest:.3g} s"
         yield _judge("gaps", name, count > 0, text, "the filter begins anew, or goes without")
+        if name == "time":  # others are judged beside its holes
+            row = np.minimum(np.diff(time, prepend=time[0]), 1.5 * usual)
+            clock = np.cumsum(np.maximum(row, 0.0))
 
 
 def _check_sampling(drive: InspectedDrive) -> Iterator[LogFinding]:
@@ -194,6 +231,8 @@ def _check_contradictions(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
+    if not drive.judged:
+        return
     yaw_rate, speed = drive.measure_scale()
     turning, accel, slipping = smooth_columns(drive.judged, "turning", "accel_y", "slipping")
     car = drive.car
@@ -225,6 +264,8 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     limit = 2.0 * _ALLOWED["bias_sd"]
     text = f"bias {bias * _DEGREES:.2f} deg/s {where}"
     yield _judge("bias", "yaw_rate", abs(bias) > limit, text, "subtract it from the column")
+    if not drive.judged:
+        return
     names = ("turning", "accel_y", "slipping", "speed", "steer")
     turning, accel, slipping, speed, steer = smooth_columns(drive.judged, *names)
     if len(turning) < 20:
@@ -254,10 +295,11 @@ def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
     first, last = (find_latency(x, _TIMES, 1.0) for x in (blocks[:half], blocks[half:]))
     text = f"{late[0]:.2f} +- {late[1]:.2f} s later than the gyro"
     cure = f"--latency gps={max(late[0], 0.0):.2f}" if late[0] > 0.0 else "mend its stamps"
-    yield _judge("late", "course", abs(late[0]) - late[1] > _LATE, text, cure)
+    yield _judge("late", "course", abs(late[0]) > max(_LATE, late[1]), text, cure)
     drift, margin = last[0] - first[0], math.hypot(first[1], last[1])
     text = f"its clock gains {drift:.2f} +- {margin:.2f} s from the first half to the second"
-    yield _judge("drift", "course", abs(drift) - margin > _LATE, text, "log one clock for both")
+    wrong = abs(drift) > max(_DRIFT, margin)
+    yield _judge("drift", "course", wrong, text, "log one clock for both")
 
 
 def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:

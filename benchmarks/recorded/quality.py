@@ -15,7 +15,7 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from .emulate import MIN_SPEED, compute_ground_speed, compute_heading, find_backward, find_moving
+from .emulate import compute_ground_speed, compute_heading, find_backward, find_moving
 
 BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
 """Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
@@ -49,7 +49,7 @@ _MAPPED = {  # unit in which a column of another one may be
 }  # fmt: skip
 _FEW = 10  # samples, below which nothing is judged
 _LIMITED = {"gyro": "the gyro", "accel_y": "accel_y"}
-_LARGE = {"gyro": 0.05, "accel_y": 1.0}  # rad/s and m/s2, below which nothing is a limit
+_LARGE = {"gyro": 0.02, "accel_y": 0.5}  # rad/s and m/s2, below which nothing is a limit
 _LONG, _STEPS = 5.0, 100.0  # usual runs that a gyro stays at its limit; steps up to there
 _SMOOTH = 0.2  # s
 _BESIDE = {0.05: 4, 0.5: 2}  # rad by which a fix is beside the gyro: how often it is no chance
@@ -241,7 +241,7 @@ def find_swapped(logs: Sequence[Log]) -> str:
     if "accel_y" not in present or not turn or max(turning.std(), accel_y.std()) < MIN_TURNING:
         return ""
     fits = instead and 0.5 < abs(instead.slope) < 2.0 and abs(instead.rvalue) > 0.8
-    if fits and not 0.5 < abs(turn.slope) < 2.0 and abs(instead.rvalue) > abs(turn.rvalue):
+    if fits and not 0.5 < abs(turn.slope) < 2.0 and abs(instead.rvalue) > abs(turn.rvalue) - 0.05:
         return "steering and yaw rate: speed x steering is the lateral acceleration"
     fits = across and 0.3 < abs(across.slope) < 3.0 and abs(across.rvalue) > 0.7
     if fits and abs(turn.rvalue) < 0.5:
@@ -273,12 +273,11 @@ def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
 
     Returns:
         The course before and after; the changes of course, of the integral of the gyro, and of
-        sideslip, by the truth or else by accel_y (rad), shape (5, steps).
+        sideslip by the truth, 0 without (rad), shape (5, steps).
     """
     parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
         fixes = log.record.select_packets("gps")
-        speed, dt = compute_ground_speed(log), log.record.dt
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
         good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
@@ -286,10 +285,8 @@ def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
         if len(place) < 2:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
-        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
-        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, MIN_SPEED)) * dt
-        slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
-        slip = log.truth.get("beta", slip)
+        n = max(math.ceil(lag / (usual * log.record.dt) - 1e-9), 1)
+        slip = log.truth.get("beta", np.zeros(len(log.time)))
         columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
         steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
         parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
@@ -404,7 +401,7 @@ def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
         return sentences
     zeros = [text for name in _ZEROS for text in _describe_zeros(logs, name)]
     sentences += zeros + _describe_fixes(logs)
-    used = slipping.any() | (np.abs(turning) < _MILD)
+    used = slipping.any() | (np.minimum(np.abs(turning), np.abs(accel_y)) < _MILD)
     accel = _fit_line(accel_y[used], turning[used], slipping[used])
     if np.std(turning) < MIN_TURNING and not (accel and abs(accel.rvalue) > 0.8):
         return sentences
