@@ -186,7 +186,7 @@ def _check_gaps(drive: InspectedDrive) -> Iterator[LogFinding]:
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
         limit = _OUTAGE + usual if slow else max(MAX_HOLE, 1.9 * usual)
         count, longest = int((steps > limit).sum()), float(steps.max())
-        text = f"{count} gaps above {limit:.2g} s, the longest step {longest:.3g} s"
+        text = f"{count} steps above {limit:.2g} s, the longest {longest:.3g} s"
         yield _judge("gaps", name, count > 0, text, "the filter begins anew, or goes without")
         if name == "time":  # others are judged beside its holes
             row = np.minimum(np.diff(time, prepend=time[0]), 1.5 * usual)
@@ -310,10 +310,10 @@ def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
             step, is_angle = estimate_resolution(column), name not in ("accel_y", "speed_x")
             limit = math.sqrt(12.0) * noise
             shown = (x * (_DEGREES if is_angle else 1.0) for x in (step, limit))
-            text = "steps of {:.2g}, and {:.2g} would do".format(*shown)
-            unit = {"yaw_rate": " deg/s", "accel_y": " m/s2", "speed_x": " m/s"}.get(name, " deg")
+            unit = {"yaw_rate": "deg/s", "accel_y": "m/s2", "speed_x": "m/s"}.get(name, "deg")
+            text = "steps of {:.2g} {unit}; {:.2g} would do".format(*shown, unit=unit)
             cure = "log it finer, or unrounded"
-            yield _judge("resolution", name, step > limit, text + unit, cure)
+            yield _judge("resolution", name, step > limit, text, cure)
 
 
 def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:
