@@ -55,8 +55,8 @@ _RESOLUTION = {  # SI, noise that filters assume at least; even steps have sqrt(
     "yaw_rate": 0.002, "accel_y": 0.1, "steer": 0.002, "course": _ALLOWED["course_noise"],
     "speed_x": 0.3,
 }  # fmt: skip
-_SCALES = {  # ordinary: 1 % of a gyro; 1.3 % and wear of a wheel; a roll that is not the car's
-    "yaw_rate": 0.08, "speed_x": 0.04, "accel_y": 0.15,
+_SCALES = {  # ordinary: 1 % of a gyro and other tyres; 1.3 % and wear of a wheel; another roll
+    "yaw_rate": 0.05, "speed_x": 0.04, "accel_y": 0.12,
 }  # fmt: skip
 _ADVICE = {
     "accel_y": "log accel_y: it shows tyres that slide",
@@ -77,18 +77,18 @@ class InspectedDrive:
 
     def __post_init__(self) -> None:
         ratio = _divide_speeds(self.logs)
-        logs, findings = self.logs, list[LogFinding]()
+        logs, of_speed = self.logs, list[LogFinding]()
         if not 1.0 / FACTOR < ratio < FACTOR and not math.isnan(ratio):
             text, cure = f"{ratio:.3g} times gps_speed: another unit?", "--map speed_x_kmh=COLUMN"
-            findings = [LogFinding("unit", BLOCKER, "speed_x", text, cure)]
+            of_speed = [LogFinding("unit", BLOCKER, "speed_x", text, cure)]
             logs = [_divide_wheels(log, ratio) for log in logs]
-        findings += find_contradictions(logs, self.car) if logs else []
+        findings = find_contradictions(logs, self.car) if logs else []
         late = self._find_lateness(logs) if any(map(_is_course, findings)) else 0.0
         if late:  # a late course does not follow the gyro, but later it does
             shifted = [apply_wires(log, SignalCalibration(latency={"gps": late})) for log in logs]
             aligned = find_contradictions(shifted, self.car)
             findings = findings if any(map(_is_course, aligned)) else aligned
-        self.contradictions = findings
+        self.contradictions = of_speed + findings
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
@@ -111,11 +111,6 @@ class InspectedDrive:
             for log, slip in zip(parts, slips, strict=True)
         ]
 
-    def measure_scale(self) -> tuple[float, float]:
-        """Yaw rate and speed over what course and gps_speed imply, NaN without."""
-        _, _, change, turned, slipped = compute_course_steps(self.judged, 1.0)
-        return _divide(turned + slipped, change), _divide_speeds(self.judged)
-
 
 def _judge(
     check: str, channel: str, is_wrong: bool, text: str, cure: str = "", level: str = WARNING
@@ -136,11 +131,16 @@ def _divide_wheels(log: Log, ratio: float) -> Log:
     return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
 
-def _divide(y: Array, x: Array) -> float:
-    """Scale of y over x by their spread, which noise of either lowers less than a line's slope."""
-    if len(x) < 20 or min(x.std(), y.std()) < 1e-6 or np.corrcoef(x, y)[0, 1] < 0.9:
-        return math.nan
-    return float(y.std() / x.std())
+def _divide(y: Array, x: Array) -> tuple[float, float]:
+    """Scale of y over x by their spread, which noise lowers less than a slope, and its error.
+
+    Neighbours overlap: a fifth of the rows counts. NaN where the two are hardly related.
+    """
+    if len(x) < 20 or min(x.std(), y.std()) < 1e-6:
+        return math.nan, math.nan
+    related = float(np.corrcoef(x, y)[0, 1])
+    error = 2.0 * math.sqrt((1.0 - min(related**2, 1.0)) / (len(x) / 5.0))
+    return (float(y.std() / x.std()), error) if related > 0.9 else (math.nan, math.nan)
 
 
 def _divide_speeds(logs: Sequence[Log]) -> float:
@@ -233,18 +233,24 @@ def _check_contradictions(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
     if not drive.judged:
         return
-    yaw_rate, speed = drive.measure_scale()
+    _, _, change, turned, slipped = compute_course_steps(drive.judged, 1.0)
     turning, accel, slipping = smooth_columns(drive.judged, "turning", "accel_y", "slipping")
-    car = drive.car
-    roll = car.roll_moment_arm  # N m a m/s2, which the body leans into
-    leaning = 1.0 + GRAVITY * roll / (car.roll_stiffness - GRAVITY * roll)
-    ratio = _divide(accel, turning + slipping) / leaning
-    ratio *= (1.0 if math.isnan(yaw_rate) else yaw_rate) * (1.0 if math.isnan(speed) else speed)
-    implied = {"yaw_rate": "course", "speed_x": "gps_speed", "accel_y": "speed x yaw rate and roll"}
-    for name, scale in (("yaw_rate", yaw_rate), ("speed_x", speed), ("accel_y", ratio)):
+    roll = drive.car.roll_moment_arm  # N m a m/s2, by which the body leans into gravity
+    leaning = 1.0 + GRAVITY * roll / (drive.car.roll_stiffness - GRAVITY * roll)
+    scales = {
+        "yaw_rate": ("course", *_divide(turned + slipped, change)),
+        "speed_x": ("gps_speed", _divide_speeds(drive.judged), 0.0),
+        "accel_y": ("speed x yaw rate and roll", *_divide(accel, turning + slipping)),
+    }
+    product = 1.0 / leaning  # of accel_y with the errors of both others
+    for name, (implied, scale, error) in scales.items():
+        if name == "accel_y":
+            scale *= product
+        elif not math.isnan(scale):
+            product *= scale
+        wrong = abs(scale - 1.0) > _SCALES[name] + error
+        text = f"{scale:.3f} times what {implied} implies"
         if not math.isnan(scale):
-            wrong = abs(scale - 1.0) > _SCALES[name]
-            text = f"{scale:.3f} times what {implied[name]} implies"
             yield _judge("scale", name, wrong, text, f"divide the column by {scale:.3f}")
 
 
@@ -296,7 +302,7 @@ def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
     text = f"{late[0]:.2f} +- {late[1]:.2f} s later than the gyro"
     cure = f"--latency gps={max(late[0], 0.0):.2f}" if late[0] > 0.0 else "mend its stamps"
     yield _judge("late", "course", abs(late[0]) > max(_LATE, late[1]), text, cure)
-    drift, margin = last[0] - first[0], math.hypot(first[1], last[1])
+    drift, margin = last[0] - first[0], 0.5 * math.hypot(first[1], last[1])
     text = f"its clock gains {drift:.2f} +- {margin:.2f} s from the first half to the second"
     wrong = abs(drift) > max(_DRIFT, margin)
     yield _judge("drift", "course", wrong, text, "log one clock for both")

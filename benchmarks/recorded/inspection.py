@@ -90,7 +90,11 @@ def inspect_file(
     if drive is not None:
         findings += check_drive(drive)
         if drive.logs and not any(finding.level == BLOCKER for finding in findings):
-            prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
+            try:
+                prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
+            except ValueError as error:
+                cure = "an even period of the course, or a shorter --latency"
+                findings.append(LogFinding("filter", BLOCKER, "", str(error), cure))
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     suite = Suite("inspect", f"Is it worth estimating from? {name_log(source)}", " ".join(remarks))
     suite.verdict = _compose_verdict(findings, prediction, car)
@@ -98,7 +102,8 @@ def inspect_file(
     if prediction is not None:
         suite.tables.append(_make_learnt(prediction))
     if figures and values:
-        suite.figures = _draw_figures(values, prediction)
+        drawn = _draw_figures(values, prediction)
+        suite.answers, suite.figures = drawn[:2], drawn[2:]
     return suite
 
 
@@ -217,7 +222,7 @@ def _make_channels(values: dict[str, Array]) -> ResultTable:
         Column("grain", "resolution", form=".2g"), Column("low", "from", form=".3g"),
         Column("high", "to", form=".3g"), "values",
     )  # fmt: skip
-    return ResultTable("Channels", columns, rows, keyed=False)
+    return ResultTable("Channels", columns, rows, keyed=False, opened=True)
 
 
 def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
@@ -231,8 +236,8 @@ def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
     rows = [[*dataclasses.astuple(finding)] for finding in findings]
     heads = ("check", "level", "channel", "what", "what mends it")
     complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
-    shown = [ResultTable("What is not OK", columns, cells, note, keyed=False)] if bad else []
-    return [*shown, complete]
+    shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
+    return [*([shown] if bad else []), complete]
 
 
 def _format_finding(finding: LogFinding) -> list[str]:

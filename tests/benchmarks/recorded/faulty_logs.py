@@ -97,9 +97,7 @@ def _scaled(name: str, low: float, high: float) -> Fault:
 
 
 def _added(name: str, low: float, high: float) -> Fault:
-    return lambda x, rng: x.assign(
-        **{name: x[name] + rng.uniform(low, high) * rng.choice([-1, 1])}
-    )
+    return lambda x, rng: x.assign(**{name: x[name] + rng.uniform(low, high) * rng.choice([-1, 1])})
 
 
 def _held(name: str) -> Fault:
@@ -135,7 +133,7 @@ def _outage(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     return x
 
 
-def _shift_fixes(x: pd.DataFrame, late: Array) -> pd.DataFrame:
+def shift_fixes(x: pd.DataFrame, late: Array) -> pd.DataFrame:
     """Fixes so many s later, each by its own time."""
     columns = ["course_rad", "gps_speed_mps"]
     rows = np.flatnonzero(np.isfinite(x["course_rad"]))
@@ -147,13 +145,13 @@ def _shift_fixes(x: pd.DataFrame, late: Array) -> pd.DataFrame:
 
 
 def _late(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    return _shift_fixes(x, np.full(len(x), rng.uniform(0.25, 0.8)))
+    return shift_fixes(x, np.full(len(x), rng.uniform(0.25, 0.8)))
 
 
 def _drift(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """A clock that is 1 to 2 % fast or slow."""
     rate = rng.uniform(0.01, 0.02) * rng.choice([-1, 1])
-    return _shift_fixes(x, rate * (np.arange(len(x)) - 0.5 * len(x)) * DT)
+    return shift_fixes(x, rate * (np.arange(len(x)) - 0.5 * len(x)) * DT)
 
 
 def _clipped(name: str) -> Fault:
