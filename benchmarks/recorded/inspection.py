@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from .honesty import LOST, describe_innovations
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
 
 if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
     from ...envs.recordings.tables import LogSource
 
 FILTER = "joint"
@@ -143,7 +145,7 @@ def read_drive(
 def _predict(log: Log, car: Vehicle) -> Prediction:
     """Run the filter over a part and take its own deviation."""
     options = {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
-    facts: dict[str, Any] = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt, **options}
+    facts = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt, **options}
     filter_ = call_quietly(make_estimator, FILTER, **facts)
     estimates = filter_.run(log)
     place = estimates.names.index("beta")
@@ -184,7 +186,7 @@ def _compose_verdict(
     deviation = prediction.usual * _DEGREES
     is_lost = prediction.nis > LOST
     worth = "worth little" if is_lost or prediction.usual > _USEFUL else "worth it"
-    told = [
+    also = [
         _LABELS[name] for name, (at_first, at_last) in prediction.learnt.items()
         if at_last < _LEARNT * at_first
     ]  # fmt: skip
@@ -195,7 +197,7 @@ def _compose_verdict(
     return format_verdict(
         f"This log is {worth}: {FILTER} expects its sideslip angle within {deviation:.2f} deg "
         f"(one deviation, median), if the car is like {car.name}.",
-        f"It also tells: {', '.join(told) or 'nothing else'}{unseen}.",
+        f"It also tells: {', '.join(also) or 'nothing else'}{unseen}.",
         f"{describe_innovations(nis)}{beside}".strip(),
         tally,
     )
@@ -262,7 +264,7 @@ def _make_learnt(prediction: Prediction) -> ResultTable:
 
 def _draw_figures(
     values: dict[str, Array], prediction: Prediction | None
-) -> list[tuple[str, Any, str]]:
+) -> list[tuple[str, "Figure", str]]:
     """Each channel over time, and the sideslip angle with its deviation; none without plotly."""
     try:
         from ..report.figures import draw_time_series
