@@ -286,8 +286,9 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     under = max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
     needed = (turning / speed - bias) * (car.wheelbase / speed + under * speed)
     offset, limit = float(np.median(steer - needed)), 2.0 * _ALLOWED["steer_offset_sd"]
-    text, cure = f"offset {offset * _DEGREES:.2f} deg at the wheels", -offset * _DEGREES
-    yield _judge("bias", "steer", abs(offset) > limit, text, f"--steering-offset {cure:.2f}")
+    text = f"offset {offset * _DEGREES:.2f} deg at the wheels"
+    cure = f"--steering-offset {-offset * _DEGREES:.2f}"
+    yield _judge("bias", "steer", abs(offset) > limit, text, cure)
 
 
 def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
