@@ -1,4 +1,4 @@
-"""`sideslip replay` and `identify`, of recorded drives, and `lane`, of pictures and films.
+"""`sideslip replay`, `identify`, `inspect`, of recorded drives, and `lane`, of pictures and films.
 
 cv2 is imported when a command needs it, after the limit on a picture's pixels is set.
 """
@@ -34,7 +34,9 @@ _MAX_PIXELS = 2**26  # of a picture; a small file may hold many more
 _console = Console(soft_wrap=True, highlight=False)
 
 
-def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "SignalCalibration":
+def _read_wires(
+    command: "_Replay | _Identify | _Inspect", latency: Texts = None
+) -> "SignalCalibration":
     """Read the calibration of signals from the vehicle's file, and replace what is given."""
     from ...estimators.wires import read_wires
 
@@ -163,6 +165,36 @@ class _Identify:
         if self.out is not None:
             write_vehicle(self.out, result.car, result.wires)
             print_written(console, self.out)
+
+
+@register("inspect", "Judge whether a recorded drive is worth estimating from.")
+class _Inspect:
+    """Judge a recorded drive before anything is estimated from it: channels, clocks, signs, scales,
+    biases, and what can be estimated how well. Exit status 1 where a finding is a BLOCKER."""
+
+    log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).", ...)
+    vehicle: str = take(
+        "The car that is assumed: a name or a TOML or JSON file.",
+        "passenger-car",
+        autocompletion=complete("vehicles"),
+    )
+    mapping: Texts
+    steering_ratio: float | None
+    steering_sign: int | None
+    steering_offset: float | None
+    latency: Texts = take("CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
+    html: File
+
+    def run(self) -> None:
+        from ..recorded.inspection import inspect_file
+
+        console, wires = Console(), _read_wires(self, self.latency)
+        drawn = self.html is not None
+        with use_shared_bar(console, f"inspect {self.log}"):
+            suite = inspect_file(self.log, self.vehicle, self.mapping or (), wires, drawn)
+        write_output(console, [suite], vars(self) | {"json": None, "parquet": None})
+        if suite.verdict.startswith("Do not"):
+            raise Exit(1)
 
 
 @register("lane", "Find the lane in a picture or film.")

@@ -33,8 +33,8 @@ __all__ = ["app", "main"]
 app.add_typer(tune_app, name="tune")
 console = Console()
 _ORDER = (
-    *("train", "distill", "enjoy", "export", "train-estimator", "replay", "identify", "lane"),
-    *("live", "calibrate", "list", "run", "bench"),
+    *("train", "distill", "enjoy", "export", "train-estimator", "replay", "identify", "inspect"),
+    *("lane", "live", "calibrate", "list", "run", "bench"),
 )
 
 

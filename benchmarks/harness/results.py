@@ -88,6 +88,7 @@ class ResultTable:
     note: str = ""  # meaning of the columns
     keyed: bool = True  # the first column names estimators or controllers, shown in colour
     detail: bool = False  # it stands in the report alone, too long for a screen
+    opened: bool = False  # the report shows it unfolded
 
     def split(self) -> list[tuple[Column, list[Cell]]]:
         """Split the table into columns.

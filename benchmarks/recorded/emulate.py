@@ -1,17 +1,21 @@
-"""Course, speed and path of a recorded drive, and a GPS course made of its truth and gyro."""
+"""Course, speed and path of a drive, a GPS course made of truth and gyro, a GPS's latency."""
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import FAST, Array, Log
+from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import make_packet_rows
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import COURSE_SPEED
+from ..harness.stats import margin_of_error
 
+BLOCKS = 20  # of a log, which the intervals take for independent
+COURSE, SPEED = range(2)  # places in a GPS's values
 MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
@@ -173,3 +177,100 @@ def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
     x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
     y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
     return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
+
+
+def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
+    """Compute a statistic of the sum of blocks with its interval.
+
+    Args:
+        blocks: Sums of blocks that are taken for independent, shape (count, ...).
+        statistic: Function of such sums.
+
+    Returns:
+        The statistic and half of its 95 % interval.
+    """
+    total, count = blocks.sum(axis=0), len(blocks)
+    without = np.array([statistic(total - block) for block in blocks])
+    return statistic(total), margin_of_error((count - 1.0) * without)
+
+
+def collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+    """Collect the differences of successive fixes, for a latency.
+
+    Args:
+        log: Recorded drive with a GPS.
+        value: Place in the fix's values, 0 for the course, 1 for the speed.
+        signal: Signal that the values follow, shape (rows,).
+        part: Signal of which they have a share too, shape (rows,).
+        times: Latencies (s), shape (times,).
+
+    Returns:
+        Blocks of the log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
+        less the signal's so much earlier, p of those of `part`; none for too few fixes.
+    """
+    packets = log.record.select_packets("gps")
+    packets = packets[packets[:, PACKET.quality] > 0.0]
+    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
+    earlier = rows[:, None] - times / log.record.dt
+    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
+    if value == COURSE:
+        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
+    p = np.diff(np.interp(earlier, place, part), axis=0)
+    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
+    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
+    used = usual & inside & np.isfinite(d).all(axis=1)
+    if np.count_nonzero(used) < BLOCKS:
+        return []
+    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
+    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
+    return [block.sum(axis=1) for block in np.array_split(sums, BLOCKS, axis=1)]
+
+
+def compute_remainder(sums: Array, share: float | None = None) -> Array:
+    """Compute the mean squares that are left of the differences of fixes.
+
+    Args:
+        sums: Sums of `collect_fixes`, shape (4, times).
+        share: Share of the part in the values, None: the best one.
+
+    Returns:
+        Mean squares, shape (times,).
+    """
+    square, product, part_square, count = sums
+    shares = product / np.maximum(part_square, 1e-12) if share is None else share
+    return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
+
+
+def find_latency(
+    blocks: Sequence[Array], times: Array, share: float | None = None
+) -> tuple[float, float]:
+    """Find the latency that leaves least.
+
+    Args:
+        blocks: Blocks of `collect_fixes`.
+        times: Their latencies (s), shape (times,).
+        share: Share of the part in the values, None: the one that leaves least.
+
+    Returns:
+        Latency and half of its 95 % interval (s).
+    """
+    return jackknife(np.array(blocks), lambda sums: find_minimum(times, sums, share))
+
+
+def find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
+    """Find the latency of the smallest remainder, between the samples by a parabola.
+
+    Args:
+        times: Latencies (s), shape (times,).
+        sums: Sums of `collect_fixes`, shape (4, times).
+        share: Share of the part in the values, None: the best one.
+
+    Returns:
+        Latency (s).
+    """
+    lefts = compute_remainder(sums, share)
+    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
+    left, middle, right = lefts[i - 1 : i + 2]
+    bend = left - 2.0 * middle + right
+    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+    return float(times[i] + beside * (times[1] - times[0]))

@@ -8,7 +8,7 @@ import numpy as np
 from ...envs.record import Array
 from ..harness.results import Column
 
-_LOST = 3.0  # mean squared innovation over its variance
+LOST = 3.0  # mean squared innovation over its variance
 _Z95 = 1.959964  # standard deviations of a 95 % interval
 HONESTY = (
     Column("nees", "NEES", form=".2f", interval=False),
@@ -61,7 +61,7 @@ def describe_innovations(nis: Mapping[str, float]) -> str:
     Returns:
         A sentence; "" where no filter has innovations.
     """
-    lost = [f"{name} ({mean:.1f})" for name, mean in nis.items() if mean > _LOST]
+    lost = [f"{name} ({mean:.1f})" for name, mean in nis.items() if mean > LOST]
     if not nis:
         return ""
     judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"

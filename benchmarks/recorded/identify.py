@@ -1,27 +1,43 @@
 """A car, its steering and its sensors from recorded drives, and what the drives cannot show."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ...estimators.wires import NOISES, SignalCalibration, apply_wires
 from ..harness.results import ResultTable, Suite
-from ..harness.stats import margin_of_error
 from ..harness.verdict import format_verdict
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fit, make_windows
-from .emulate import compute_ground_speed, compute_heading, find_moving
-from .quality import MIN_CORRELATION, estimate_steering_gain, find_saturated, find_swapped
+from .emulate import (
+    BLOCKS,
+    COURSE,
+    SPEED,
+    collect_fixes,
+    compute_ground_speed,
+    compute_heading,
+    compute_remainder,
+    find_latency,
+    find_minimum,
+    find_moving,
+    jackknife,
+)
+from .quality import (
+    MIN_CORRELATION,
+    MIN_TURNING,
+    estimate_steering_gain,
+    find_saturated,
+    find_swapped,
+)
 from .suite import GYRO_ONLY
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6
-_MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
 _MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
 _MAX_FRICTION_SHARE = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
 _MAX_RATIO_FACTOR = 2.5  # within this factor of the stated ratio, that one may be right
@@ -34,9 +50,7 @@ _DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
 _OF_ACCEL = ("accel_bias", "accel_gain")
 _OF_CAR = {"front": "front_stiffness", "rear": "rear_stiffness", "inertia": "yaw_inertia"}
 _WIDE = "its interval is too wide"
-_BLOCKS = 20  # of a log, which the intervals take for independent
 _LATE = (-0.2, 1.2)  # s, of the GPS
-_COURSE, _SPEED = range(2)  # places in its values
 _LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
 _NOTE = (
@@ -45,6 +59,9 @@ _NOTE = (
     "and acceleration are applied only where they lower the error on stretches that the fit has "
     "not seen: the lag of tyres looks like one."
 )
+
+
+_NO_WIRES = SignalCalibration()
 
 
 class Finding(NamedTuple):
@@ -115,8 +132,8 @@ def identify(
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
-    slips = _estimate_slips(logs, result.car, result.wires)
-    both = (_estimate_slips(logs, car, stated), slips)
+    slips = estimate_slips(logs, result.car, result.wires)
+    both = (estimate_slips(logs, car, stated), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
     findings, noise, latency = _make_sensor_findings(logs, slips)
     result.findings += findings
@@ -129,7 +146,7 @@ def _find_reason(w: Windows, related: float) -> str:
     if len(w.starts) < _MIN_WINDOWS:
         return f"{len(w.starts)} of {_MIN_WINDOWS} windows of 5 s are fast enough and whole"
     turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
-    if np.std(turns) < _MIN_TURNING:
+    if np.std(turns) < MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
     if abs(related) < MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
@@ -262,8 +279,19 @@ def _make_car_findings(
     return findings
 
 
-def _estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
-    """Sideslip angle (rad) of each log by the gyro alone."""
+def estimate_slips(
+    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration = _NO_WIRES
+) -> list[Array]:
+    """Estimate the sideslip angle of drives by the gyro alone.
+
+    Args:
+        logs: Recorded drives, at least one.
+        car: Car that is assumed.
+        wires: Calibration of the steering.
+
+    Returns:
+        Sideslip angle (rad) of each, shape (rows,).
+    """
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
     steered = wires._replace(latency={})
@@ -281,13 +309,6 @@ def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
 
 
-def _jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
-    """Compute a statistic of the sum of blocks, (count, ...), and half of its 95 % interval."""
-    total, count = blocks.sum(axis=0), len(blocks)
-    without = np.array([statistic(total - block) for block in blocks])
-    return statistic(total), margin_of_error((count - 1.0) * without)
-
-
 def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
     """Estimate standard deviation and half interval of a channel's white noise.
 
@@ -297,49 +318,9 @@ def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
     for values in parts:
         new = np.concatenate([[True], np.diff(values) != 0.0])
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
-        blocks += [
-            np.array([block @ block, len(block)]) for block in np.array_split(third, _BLOCKS)
-        ]
+        blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
     # each block: sum of squares and count
-    return _jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
-
-
-def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
-    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each."""
-    # d: differences of two fixes' values less the signal's so much earlier; p: those of `part`
-    packets = log.record.select_packets("gps")
-    packets = packets[packets[:, PACKET.quality] > 0.0]
-    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
-    earlier = rows[:, None] - times / log.record.dt
-    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
-    if value == _COURSE:
-        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
-    p = np.diff(np.interp(earlier, place, part), axis=0)
-    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
-    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
-    used = usual & inside & np.isfinite(d).all(axis=1)
-    if np.count_nonzero(used) < _BLOCKS:
-        return []
-    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
-    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
-    return [block.sum(axis=1) for block in np.array_split(sums, _BLOCKS, axis=1)]
-
-
-def _compute_remainder(sums: Array, share: float | None = None) -> Array:
-    """Mean squares that a fraction of the part leaves, None: the best one; shape (times,)."""
-    square, product, part_square, count = sums
-    shares = product / np.maximum(part_square, 1e-12) if share is None else share
-    return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
-
-
-def _find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
-    """Time of the smallest remainder (s), between the samples by a parabola."""
-    lefts = _compute_remainder(sums, share)
-    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
-    left, middle, right = lefts[i - 1 : i + 2]
-    bend = left - 2.0 * middle + right
-    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(times[i] + beside * (times[1] - times[0]))
+    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
 
 
 def _make_sensor_findings(
@@ -364,13 +345,13 @@ def _make_sensor_findings(
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
     courses, speeds = list[Array](), list[Array]()
     for log, slip in pairs:
-        courses += _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
+        courses += collect_fixes(log, COURSE, compute_heading(log), slip, times)
         speed, none = compute_ground_speed(log), 0.0 * log.time
-        speeds += _collect_fixes(log, _SPEED, speed, none, times)
+        speeds += collect_fixes(log, SPEED, speed, none, times)
     if not courses:
         return findings, noise, {}
-    late, half = _jackknife(np.array(courses), lambda sums: _find_minimum(times, sums))
-    with_slip = _find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
+    late, half = find_latency(courses, times)
+    with_slip = find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
     half = math.hypot(half, late - with_slip)
     is_determined = half < _LATE_WITHIN
     pays = is_determined and late > half
@@ -381,8 +362,8 @@ def _make_sensor_findings(
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
         if blocks:  # a difference has twice the variance
-            sd, half = _jackknife(
-                np.array(blocks), lambda sums: math.sqrt(0.5 * _compute_remainder(sums)[at])
+            sd, half = jackknife(
+                np.array(blocks), lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at])
             )
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
             findings, noise = [*findings, row], noise | {NOISES[name]: sd}

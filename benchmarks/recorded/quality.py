@@ -5,6 +5,7 @@ Intervals are jackknives over blocks of the log.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,16 +15,41 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from .emulate import MIN_SPEED, compute_ground_speed, compute_heading, find_backward, find_moving
+from .emulate import compute_ground_speed, compute_heading, find_backward, find_moving
+
+BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
+"""Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
+
+
+@dataclass(frozen=True)
+class LogFinding:
+    """What a check says of a channel."""
+
+    check: str  # name of the check
+    level: str  # one of `LEVELS`
+    channel: str  # quantity of the log, "" for all
+    text: str  # sentence without a full stop, with number and unit
+    cure: str = ""  # option or column that mends it
+
 
 MIN_CORRELATION = 0.5  # correlation, below which steering and yaw rate have nothing in common
 TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
 COMPASS = "degrees from north, clockwise? --map course_degnorth=COLUMN reads it"
 FACTOR = 1.8  # by which a column may differ from what the others imply
 _SURE = 3.0  # standard errors beyond it
-_TURNING = 0.3  # m/s2 RMS, below which nothing is judged
+MIN_TURNING = 0.3  # m/s2 RMS, below which nothing is judged
 _MILD = 5.0  # m/s2, up to which tyres are linear
+_QUANTITIES = {
+    "speed": "speed_x", "gyro": "yaw_rate", "the yaw rate": "yaw_rate", "steering": "steer",
+    "the change of the course": "course", TRUTH: "sideslip",
+}  # fmt: skip
+_MAPPED = {  # unit in which a column of another one may be
+    "speed_x": "kmh", "yaw_rate": "degps", "accel_y": "g", "steer": "deg", "course": "deg",
+    "sideslip": "deg",
+}  # fmt: skip
 _FEW = 10  # samples, below which nothing is judged
+_LIMITED = {"gyro": "the gyro", "accel_y": "accel_y"}
+_LARGE = {"gyro": 0.02, "accel_y": 0.5}  # rad/s and m/s2, below which nothing is a limit
 _LONG, _STEPS = 5.0, 100.0  # usual runs that a gyro stays at its limit; steps up to there
 _SMOOTH = 0.2  # s
 _BESIDE = {0.05: 4, 0.5: 2}  # rad by which a fix is beside the gyro: how often it is no chance
@@ -39,6 +65,7 @@ _UNITS = {
     1.0 / GRAVITY: "g in a column of m/s2?",
     1.0 / 3.6: "the speed in km/h?",
 }
+_WRONG = ("swapped", "unrelated", "sign", "unit", "ratio")  # checks that no estimate survives
 _GUESSES = {  # a ratio of steering angles, and what it looks like from there on
     300.0: "degrees of the steering wheel in a column of radians?",
     35.0: "degrees in a column of radians?",
@@ -74,8 +101,17 @@ def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
     return np.asarray(jumps)
 
 
-def _smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
-    """Smoothed columns of undisturbed rows; also speed x yaw rate, change of speed x truth."""
+def smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
+    """Smooth the columns of undisturbed rows.
+
+    Args:
+        logs: Parts of the log.
+        names: Columns; also "turning", speed x yaw rate, and "slipping", the change of speed x
+            truth (m/s2).
+
+    Returns:
+        Each column, shape (rows,), zeros for one that was not logged.
+    """
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
         dt, raw = log.record.dt, _get_columns(log)
@@ -101,24 +137,38 @@ def _fit_line(y: Array, x: Array, *beside: Array) -> Any:
     return linregress(x, y) if min(x.std(), y.std()) > 1e-9 else None
 
 
+def _make_finding(check: str, name: str, text: str, cure: str = "") -> LogFinding:
+    """A finding on a column by the name that sentences have for it; no estimate reads the truth."""
+    quantity = _QUANTITIES.get(name, name)
+    level = BLOCKER if check in _WRONG and name != TRUTH else WARNING
+    return LogFinding(check, level, quantity, text, cure or f"--map {quantity}_UNIT=COLUMN")
+
+
 def _describe_contradiction(
     line: Any, column: str, implied: str, inverse: bool = False, factor: float = FACTOR
-) -> list[str]:
-    """A sentence if a line's slope, or its inverse, is surely not within a factor of 1."""
+) -> list[LogFinding]:
+    """A finding if a line's slope, or its inverse, is surely not within a factor of 1."""
     margin = _SURE * line.stderr if line else math.inf
     if not line or 1.0 / factor - margin < line.slope < factor + margin:
         return []
     if abs(line.rvalue) < MIN_CORRELATION:
-        return [f"{column} and {implied} are unrelated (correlation {line.rvalue:.2f})"]
+        text = f"{column} and {implied} are unrelated (correlation {line.rvalue:.2f})"
+        return [_make_finding("unrelated", column, text, "--map names another column")]
     factor = 1.0 / line.slope if inverse else line.slope
     guess = "its sign?" if factor < 0.0 else "another unit?"
     guess = next((text for x, text in _UNITS.items() if 0.8 < x / factor < 1.25), guess)
-    return [f"{column} is {factor:.3g} times {implied}: {guess}"]
+    text = f"{column} is {factor:.3g} times {implied}: {guess}"
+    if factor < 0.0:
+        return [_make_finding("sign", column, text, "turn the column's sign")]
+    column = "speed" if "the speed" in guess else column
+    quantity = _QUANTITIES.get(column, column)
+    cure = f"--map {quantity}_{_MAPPED.get(quantity, 'UNIT')}=COLUMN"
+    return [_make_finding("unit", column, text, cure)]
 
 
 def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
     """Line of the linear car's steering for its yaw rate over the logged one; tyres 0: neutral."""
-    speed, gyro, steer, accel_y = _smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
+    speed, gyro, steer, accel_y = smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
     slides = np.abs(accel_y - speed * gyro) > (1.0 if accel_y.any() else math.inf)
@@ -141,29 +191,37 @@ def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, fl
     return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
-def _estimate_resolution(log: Log) -> float:
-    """Estimate the step between the values of the gyro (rad/s), 0 for one too fine to be seen."""
-    steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
-    step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
+def estimate_resolution(values: Array) -> float:
+    """Estimate the step between the values of a column.
+
+    Args:
+        values: Values, shape (n,).
+
+    Returns:
+        Step in their unit, 0 for one too fine to be seen.
+    """
+    steps = np.diff(np.unique(values))
+    step = float(np.median(steps)) if 2 <= len(steps) < len(values) / 3 else math.inf
     even = np.abs(steps / step - np.rint(steps / step)).max(initial=0.0) < 0.1
     return step if even and math.isfinite(step) and steps.min() > 0.5 * step else 0.0
 
 
-def find_saturated(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark rows in which the gyro stays at its limit: long, and many steps of its resolution.
+def find_saturated(log: Log, name: str = "gyro") -> npt.NDArray[np.bool_]:
+    """Mark rows in which a column stays at its limit: long, and many steps of its resolution.
 
     Args:
         log: Recorded drive.
+        name: Column, "gyro" or "accel_y".
 
     Returns:
         Mask, shape (rows,).
     """
-    gyro = log.record.fast[:, FAST.gyro]
-    runs = np.cumsum(np.diff(gyro, prepend=gyro[0]) != 0.0)
+    x = log.record.fast[:, getattr(FAST, name)]
+    runs = np.cumsum(np.diff(x, prepend=x[0]) != 0.0)
     length = np.bincount(runs)
     long = (length >= _LONG * np.percentile(length, 95))[runs]
-    is_large = np.abs(gyro) > max(0.05, _STEPS * _estimate_resolution(log))
-    return np.asarray(long & is_large & ((gyro == gyro.max()) | (gyro == gyro.min())))
+    is_large = np.abs(x) > max(_LARGE[name], _STEPS * estimate_resolution(x))
+    return np.asarray(long & is_large & ((x == x.max()) | (x == x.min())))
 
 
 def find_swapped(logs: Sequence[Log]) -> str:
@@ -177,13 +235,13 @@ def find_swapped(logs: Sequence[Log]) -> str:
     """
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
-    speed, turning, accel_y, accel_x, steer = _smooth_columns(logs, *names)
+    speed, turning, accel_y, accel_x, steer = smooth_columns(logs, *names)
     turn, instead = _fit_line(accel_y, turning), _fit_line(accel_y, speed * steer)
     across = _fit_line(accel_x, turning)
-    if "accel_y" not in present or not turn or max(turning.std(), accel_y.std()) < _TURNING:
+    if "accel_y" not in present or not turn or max(turning.std(), accel_y.std()) < MIN_TURNING:
         return ""
     fits = instead and 0.5 < abs(instead.slope) < 2.0 and abs(instead.rvalue) > 0.8
-    if fits and not 0.5 < abs(turn.slope) < 2.0 and abs(instead.rvalue) > abs(turn.rvalue):
+    if fits and not 0.5 < abs(turn.slope) < 2.0 and abs(instead.rvalue) > abs(turn.rvalue) - 0.05:
         return "steering and yaw rate: speed x steering is the lateral acceleration"
     fits = across and 0.3 < abs(across.slope) < 3.0 and abs(across.rvalue) > 0.7
     if fits and abs(turn.rvalue) < 0.5:
@@ -191,8 +249,8 @@ def find_swapped(logs: Sequence[Log]) -> str:
     return ""
 
 
-def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
-    """A sentence if a column is filled with zeros where the car turns."""
+def _describe_zeros(logs: Sequence[Log], name: str) -> list[LogFinding]:
+    """A finding if a column is filled with zeros where the car turns."""
     x, moves = [np.zeros(0)], sum(find_moving(log).sum() for log in logs)
     for log in (log for log in logs if name in _get_columns(log)):
         columns = _get_columns(log)
@@ -202,19 +260,24 @@ def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
     zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
     if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
         return []
-    return [f"{name} is 0 in {zeros} of {counts.sum()} rows in which the car turns"]
+    text = f"{name} is 0 in {zeros} of {counts.sum()} rows in which the car turns"
+    return [_make_finding("stuck", name, text, "log it, or leave the column out")]
 
 
-def _compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
-    """Compute steps between fixes at least `lag` (s) apart, in rad, shape (5, steps).
+def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
+    """Compute the steps between fixes.
 
-    The course before and after; the changes of course, of the integral of the gyro, and of
-    sideslip, by the truth or else by accel_y.
+    Args:
+        logs: Parts of the log.
+        lag: Time between them at least (s).
+
+    Returns:
+        The course before and after; the changes of course, of the integral of the gyro, and of
+        sideslip by the truth, 0 without (rad), shape (5, steps).
     """
     parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
         fixes = log.record.select_packets("gps")
-        speed, dt = compute_ground_speed(log), log.record.dt
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
         good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
@@ -222,23 +285,22 @@ def _compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
         if len(place) < 2:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
-        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
-        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, MIN_SPEED)) * dt
-        slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
-        slip = log.truth.get("beta", slip)
+        n = max(math.ceil(lag / (usual * log.record.dt) - 1e-9), 1)
+        slip = log.truth.get("beta", np.zeros(len(log.time)))
         columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
         steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
         parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
     return np.concatenate(parts, axis=1)
 
 
-def _describe_fixes(logs: Sequence[Log]) -> list[str]:
-    """Sentences on a course that is held while the gyro turns, or jumps for a fix or two."""
-    before, after, change, turned, _ = _compute_course_steps(logs, 0.0)
+def _describe_fixes(logs: Sequence[Log]) -> list[LogFinding]:
+    """Findings on a course that is held while the gyro turns, or jumps for a fix or two."""
+    before, after, change, turned, _ = compute_course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
     if held.any():
-        return [f"the course stands still in {held.sum()} fixes while the gyro turns"]
+        text = f"the course stands still in {held.sum()} fixes while the gyro turns"
+        return [_make_finding("stuck", "course", text, "--map course_UNIT_held=COLUMN")]
     beside = np.angle(np.exp(1j * (change - turned)))
     for min_angle, few in _BESIDE.items():
         out = np.abs(beside) > min_angle
@@ -246,12 +308,13 @@ def _describe_fixes(logs: Sequence[Log]) -> list[str]:
         back = abs(beside[out].sum()) < 0.2 * np.abs(beside[out]).sum()
         if back and counts.max() >= max(few, 0.8 * np.count_nonzero(out)):
             value = math.degrees(values[counts.argmax()])
-            return [f"the course jumps to {value:.3g} deg and back: where it is not known?"]
+            text = f"the course jumps to {value:.3g} deg and back: where it is not known?"
+            return [_make_finding("jumps", "course", text, "leave these rows empty")]
     return []
 
 
-def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
-    """Sentences on the steering, by steady turns and all rows, by these and other tyres."""
+def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[LogFinding]:
+    """Findings on the steering, by steady turns and all rows, by these and other tyres."""
     line, *lines = (_fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     sentences = _describe_contradiction(line, "steering", "yaw rate")
     if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
@@ -260,23 +323,27 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
         return sentences
     ratio, sentences = 1.0 / abs(line.slope), []
     if line.slope < 0.0:
-        sentences.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
+        text = "steering and yaw rate differ in sign (--steering-sign -1 turns it)"
+        sentences.append(_make_finding("sign", "steering", text, "--steering-sign -1"))
     if not 0.5 < ratio < 2.0:
         guess = next(text for min_ratio, text in _GUESSES.items() if ratio >= min_ratio)
         text = f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess}"
-        sentences.append(f"{text} (--steering-ratio {ratio:.3g} divides it)")
+        cure = f"--steering-ratio {ratio:.3g}"
+        sentences.append(_make_finding("ratio", "steering", f"{text} ({cure} divides it)", cure))
     return sentences
 
 
-def _describe_course(line: Any, turned: Array) -> list[str]:
-    """Sentences on the course, by its change over the integral of the gyro."""
+def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
+    """Findings on the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0
     if abs(related) < MIN_CORRELATION:
-        return [f"the course does not follow the gyro (correlation {related:.2f})"]
+        text = f"the course does not follow the gyro (correlation {related:.2f})"
+        return [_make_finding("unrelated", "course", text)]
     if -FACTOR < line.slope < -1.0 / FACTOR:
-        return [f"the course turns against the gyro (correlation {related:.2f}): {COMPASS}"]
+        text = f"the course turns against the gyro (correlation {related:.2f}): {COMPASS}"
+        return [_make_finding("sign", "course", text, "--map course_degnorth=COLUMN")]
     return _describe_contradiction(line, "the change of the course", "the integral of the gyro")
 
 
@@ -289,7 +356,7 @@ def make_remarks(logs: Sequence[Log]) -> list[str]:
     Returns:
         Sentences.
     """
-    step = math.degrees(max(map(_estimate_resolution, logs)))
+    step = math.degrees(max(estimate_resolution(log.record.fast[:, FAST.gyro]) for log in logs))
     return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
 
 
@@ -303,23 +370,42 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     Returns:
         A sentence each.
     """
-    sentences = [f"columns seem to be swapped, {what}"] if (what := find_swapped(logs)) else []
-    if count := sum(find_saturated(log).sum() for log in logs):
-        sentences.append(f"the gyro is at its limit in {count} rows")
+    return [finding.text for finding in find_contradictions(logs, car)]
+
+
+def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
+    """Find what does not fit together in a drive.
+
+    Args:
+        logs: Parts of the log.
+        car: The car that is assumed.
+
+    Returns:
+        Findings, none of them OK.
+    """
+    sentences: list[LogFinding] = []
+    if what := find_swapped(logs):
+        text, channel = f"columns seem to be swapped, {what}", what.split()[0]
+        sentences.append(_make_finding("swapped", channel, text, "--map exchanges them"))
+    for name, sensor in _LIMITED.items():
+        if count := sum(find_saturated(log, name).sum() for log in logs):
+            text, cure = f"{sensor} is at its limit in {count} rows", "a sensor of a wider range"
+            sentences.append(_make_finding("saturation", name, text, cure))
     for name in _JUMPS:
         if count := sum(_find_jumps(log, name).sum() for log in logs if name in _get_columns(log)):
-            sentences.append(f"{name} jumps as in no car, in {count} rows")
+            text = f"{name} jumps as in no car, in {count} rows"
+            sentences.append(_make_finding("jumps", name, text, "leave these rows empty"))
     judged = [log for log in logs if "beta" in log.truth] or logs
-    turning, accel_y, slipping = _smooth_columns(judged, "turning", "accel_y", "slipping")
-    if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < _TURNING:
+    turning, accel_y, slipping = smooth_columns(judged, "turning", "accel_y", "slipping")
+    if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < MIN_TURNING:
         return sentences
     zeros = [text for name in _ZEROS for text in _describe_zeros(logs, name)]
     sentences += zeros + _describe_fixes(logs)
-    used = slipping.any() | (np.abs(turning) < _MILD)
+    used = slipping.any() | (np.minimum(np.abs(turning), np.abs(accel_y)) < _MILD)
     accel = _fit_line(accel_y[used], turning[used], slipping[used])
-    if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
+    if np.std(turning) < MIN_TURNING and not (accel and abs(accel.rvalue) > 0.8):
         return sentences
-    _, _, change, turned, slipped = _compute_course_steps(logs, 1.0)
+    _, _, change, turned, slipped = compute_course_steps(logs, 1.0)
     course, wrong, unit = _fit_line(change, turned, slipped), [], accel.slope if accel else 1.0
     if accel and course and 0.67 < accel.slope / course.slope < 1.5:
         implied = "what accel_y and course imply"
@@ -340,5 +426,6 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     implied = "what gyro, accel_y and speed imply"
     sentences += _describe_contradiction(line, TRUTH, implied, True)
     if course and in_course and in_course.slope < 1.0 / FACTOR - _SURE * in_course.stderr:
-        sentences += [] if sentences else ["the course shows no sideslip: is it the heading?"]
+        text = "the course shows no sideslip: is it the heading?"
+        sentences += [] if sentences else [_make_finding("unrelated", "course", text)]
     return sentences

@@ -48,7 +48,7 @@ def _format_table(table: ResultTable) -> str:
     title = escape(table.title)
     note = f'\n<p class="note">{_mark_code(table.note)}</p>' if table.note else ""
     return (
-        f"<details><summary>{title}</summary>\n"
+        f"<details{' open' * table.opened}><summary>{title}</summary>\n"
         f'<div class="scroll" role="region" tabindex="0" aria-label="{title}">\n'
         f'<table class="sortable" aria-label="{title}">\n'
         f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>{note}</details>"

@@ -1,4 +1,4 @@
-"""Files of loggers as tables: MATLAB, MDF, CAN traces, ROS bags and MCAP, VBOX.
+"""Files of loggers as tables: MATLAB, MDF, CAN traces, ROS 2 bags and MCAP, VBOX.
 
 Each channel keeps the stamps that it has: rows stand at the stamps of all, NaN where one has none.
 Nothing is interpolated or held here.
@@ -21,6 +21,7 @@ from .dialect import find_unit, to_metres
 if TYPE_CHECKING:
     import pandas as pd
     from cantools.database.can import Database
+    from rosbags.interfaces import Connection
 
 _TRACES = {  # reader of python-can, by what its files begin with
     "BLFReader": rb"LOGG",
@@ -28,7 +29,8 @@ _TRACES = {  # reader of python-can, by what its files begin with
     "CanutilsLogReader": rb"\s*\(\d+\.\d+\) +\S+ +[0-9A-Fa-f]+#",
     "TRCReader": rb";\$FILEVERSION",
 }
-_BAG = re.compile(rb"\x89MCAP|SQLite format 3|#ROSBAG")
+_BAG = re.compile(rb"\x89MCAP|SQLite format 3")
+_LONGEST_LATENCY = 5.0  # s; beyond it a bag's log has another clock than its headers
 DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
 _DBC_NEEDED = "a CAN trace needs its description: --map dbc=FILE"
 
@@ -74,7 +76,7 @@ def _join_channels(
 
 
 def is_bag(path: Path, head: bytes) -> bool:
-    """Check whether a path is a ROS bag, or the folder of one.
+    """Check whether a path is a ROS 2 bag, or the folder of one.
 
     Args:
         path: File or folder.
@@ -270,10 +272,11 @@ def _load_database(dbc: str) -> "Database":
 
 
 def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], str]) -> LogTable:
-    """Read the mapped fields of a ROS 1 or ROS 2 bag or an MCAP file.
+    """Read the mapped fields of a ROS 2 bag, a folder or a file, or of MCAP with ROS 2 messages.
 
     A field is /TOPIC:FIELD.PART, as /imu:angular_velocity.z. A sample is captured at its header's
-    stamp and arrives at the log's time, where there is a header; else both are the log's.
+    stamp and arrives at the log's time, where there is a header; else both are the log's. rosbags
+    hands out bytes alone: its own decoder runs text that it makes of the file's definitions.
 
     Args:
         path: File, or folder of a ROS 2 bag.
@@ -286,9 +289,9 @@ def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], 
     Raises:
         ValueError: A topic or a field is not there, or messages are of an unknown kind.
     """
-    with require_extra("bags", "reading a bag needs rosbags"):
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+    with require_extra("bags", "reading a bag needs rosbags and mcap-ros2-support"):
+        import mcap_ros2.decoder  # noqa: F401
+        from rosbags.rosbag2 import Reader
 
     mapping = {name: label for name, label in mapping.items() if name != DBC}
     channels = {label: _Channel.make() for label in mapping.values()}
@@ -296,13 +299,16 @@ def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], 
     for label in channels:
         topic, _, field = label.partition(":")
         fields.setdefault(topic, []).append(field)
-    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+    decoders: dict[int, Callable[[bytes], Any]] = {}
+    with Reader(path) as reader:
         topics = sorted({connection.topic for connection in reader.connections})
         if missing := [topic for topic in fields if topic not in topics]:
             raise ValueError(f"no topic {missing[0]!r}; the bag has {join_names(topics)}")
         used = [connection for connection in reader.connections if connection.topic in fields]
-        for connection, logged, raw in reader.messages(used):
-            message = reader.deserialize(raw, connection.msgtype)
+        for connection, logged, data in reader.messages(used) if used else ():
+            if connection.id not in decoders:
+                decoders[connection.id] = _make_decoder(connection)
+            message = decoders[connection.id](data)
             captured = _read_stamp(message) or logged
             for field in fields[connection.topic]:
                 channel = channels[f"{connection.topic}:{field}"]
@@ -310,12 +316,34 @@ def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], 
                 channel.stamps.append(1e-9 * captured)
                 channel.late.append(1e-9 * (logged - captured))
     columns = {label: (x.stamps, x.values) for label, x in channels.items()}
+    longest = max((max(map(abs, x.late)) for x in channels.values() if x.late), default=0.0)
     for name, label in mapping.items():
-        if (sensor := sensor_of(name)) and any(channels[label].late):
-            stamps, _, late = channels[label]
+        stamps, _, late = channels[label]
+        if (sensor := sensor_of(name)) and any(late) and longest <= _LONGEST_LATENCY:
             columns.setdefault(f"{sensor}_latency_s", (stamps, late))
-    names = [f"{topic}:..." for topic in topics]
-    return _join_channels(columns, {}, names)
+    table = _join_channels(columns, {}, [f"{topic}:..." for topic in topics])
+    if longest <= _LONGEST_LATENCY:
+        return table
+    remark = f"The log's time is up to {longest:.6g} s beside the headers': samples are punctual."
+    return table._replace(remarks=[remark])
+
+
+def _make_decoder(connection: "Connection") -> Callable[[bytes], Any]:
+    """Make the decoder of a topic from the bag's definition, or ROS 2's of a common type."""
+    from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_typestore
+
+    kind, text = connection.msgtype, connection.msgdef.data
+    if connection.msgdef.format == MessageDefinitionFormat.NONE:
+        text = get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(kind, ros_version=2)[0]
+    elif connection.msgdef.format == MessageDefinitionFormat.IDL:
+        raise ValueError(f"{kind} is defined in IDL; expected msg")
+    schema = Schema(id=1, name=kind, encoding="ros2msg", data=text.encode())
+    decoder = DecoderFactory().decoder_for("cdr", schema)
+    assert decoder is not None  # of this encoding there is one
+    return decoder
 
 
 def _read_stamp(message: object) -> int:
@@ -331,7 +359,7 @@ def _read_field(message: object, topic: str, field: str) -> float:
         try:
             value = value[int(part)] if part.isdecimal() else getattr(value, part)
         except (AttributeError, IndexError, TypeError):
-            parts = [x for x in getattr(value, "__dataclass_fields__", ()) if not x.startswith("_")]
+            parts = [x for x in getattr(value, "__slots__", ()) if not x.startswith("_")]
             text = f"{topic} has no field {field!r}: {part!r} is none of {join_names(parts)}"
             raise ValueError(text) from None
     try:

@@ -238,6 +238,22 @@ def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[st
     return remarks
 
 
+def find_sampling(values: Array) -> tuple[str, float]:
+    """Find whether a column repeats slower samples or draws lines between them.
+
+    Args:
+        values: Values in SI units without gaps, shape (n,).
+
+    Returns:
+        "held", "interpolated" or "", and the period of the samples (rows), 0 for "".
+    """
+    for kind, places in (("held", np.flatnonzero(np.diff(values))), ("interpolated", None)):
+        places = _find_knots(values) if places is None else places
+        if period := _find_period(np.diff(places)):
+            return kind, period
+    return "", 0.0
+
+
 def _find_knots(values: Array) -> npt.NDArray[np.int64]:
     """Find where an angle's slope changes by more than rounding; +-180 deg are one."""
     gaps, scale = np.diff(np.unique(values)), float(np.abs(values).max())

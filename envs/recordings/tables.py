@@ -200,30 +200,25 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
     return mapping
 
 
-def read_quantities(
-    source: "LogSource",
-    mapping: Mapping[str, str],
-    needed: Sequence[str],
-    gaps: Collection[str] | None,
-) -> tuple[dict[str, Array], list[str]]:
-    """Read a log's known quantities in SI units, and describe how they were read.
+def read_columns(
+    source: "LogSource", mapping: Mapping[str, str], needed: Sequence[str]
+) -> tuple[dict[str, Array], dict[str, str], list[str]]:
+    """Read a log's known columns in SI units as they stand: rows unsorted, NaN where empty.
 
-    An empty column counts as absent. A file that `_read_table` refuses raises its errors. Rows in
-    messages count from 1 below the header.
+    An empty column counts as absent. A file that `_read_table` refuses raises its errors.
 
     Args:
         source: Path of the table, or the table itself.
         mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
-        gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
-            shuffled rows are sorted.
 
     Returns:
-        Quantities by name, shape (n,) each, and sentences on how they were read.
+        Quantities by name, shape (n,) each, the kinds of samples that names tell, and sentences
+        on how they were read.
 
     Raises:
-        ValueError: For a missing column, one given twice, a value that is no finite number, NaN,
-            and fewer than two rows.
+        ValueError: For a missing column, one given twice, a value that is no finite number, a time
+            that is NaN, and fewer than two rows.
     """
     columns_mapped = {name: column for name, column in mapping.items() if name != DBC}
     wanted = {*COLUMNS, *map(str.casefold, columns_mapped.values())}
@@ -254,8 +249,37 @@ def read_quantities(
             if quantity in needed or not np.isnan(column).all():
                 values[quantity] = column
         _check_complete(values, ["time"])
-        kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
-        kinds = {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}
+    except ValueError as error:
+        raise ValueError(f"{name_log(source)}: {error}") from None
+    kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
+    return values, {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}, remarks
+
+
+def read_quantities(
+    source: "LogSource",
+    mapping: Mapping[str, str],
+    needed: Sequence[str],
+    gaps: Collection[str] | None,
+) -> tuple[dict[str, Array], list[str]]:
+    """Read a log's known quantities in SI units, and describe how they were read.
+
+    Rows in messages count from 1 below the header.
+
+    Args:
+        source: Path of the table, or the table itself.
+        mapping: Our column names, unit included, to the log's; other columns are ignored.
+        needed: Quantities that must be present.
+        gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
+            shuffled rows are sorted.
+
+    Returns:
+        Quantities by name, shape (n,) each, and sentences on how they were read.
+
+    Raises:
+        ValueError: For NaN in a quantity without gaps, and for all that `read_columns` refuses.
+    """
+    values, kinds, remarks = read_columns(source, mapping, needed)
+    try:
         remarks += find_samples(values, needed, kinds, gaps is not None)
         if gaps is not None:
             _check_complete(values, [name for name in values if name not in gaps])

@@ -94,6 +94,9 @@ CASES = [
          ("--gyro-bias 0.6", "settings.gyro_bias_degps", 0.6)),
     *_of("identify log.csv", "benchmarks.recorded.replay.identify_file", *LOGGED,
          ("--tyres fiala", "tyres", "fiala")),
+    *_of("inspect log.csv", "benchmarks.recorded.inspection.inspect_file",
+         *(row for row in LOGGED if row[1] != "until"),
+         ("--latency gps=0.2", "wires.latency.gps", 0.2)),
     *_of("identify log.csv", "estimators.wires.write_vehicle",
          ("--out car.toml", "path", Path("car.toml"))),
     *_of("live exact-kf --port 0", f"{CLI}.live.make_driver",
@@ -177,6 +180,10 @@ RETURNED: dict[str, dict[str, Any]] = {
         f"{CLI}.main.use_engine": nullcontext(),
         f"{CLI}.main.run_suites": [],
         f"{CLI}.main.write_output": None,
+    },
+    "inspect": {
+        "benchmarks.recorded.inspection.inspect_file": NOTHING,
+        f"{CLI}.data.write_output": None,
     },
     "identify": {
         "benchmarks.recorded.replay.identify_file": (NOTHING, None),

@@ -46,6 +46,7 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("enjoy", VISION, "--parquet", "rows.txt"), "a file that ends in .parquet"),
     (("replay", "nowhere.csv", "--parquet", "rows.txt"), "a file that ends in .parquet"),
     (("replay", "nowhere.csv"), "nowhere.csv"),
+    (("inspect", "nowhere.csv", "--html", "page.txt"), "a file that ends in .html"),
     (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),
     (("replay", "nowhere.csv", "--kml", "a.kml"), "--kml are for a receiver's log"),
     (("calibrate", "--contest", "moon"), "unknown contest 'moon'"),

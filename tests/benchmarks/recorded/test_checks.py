@@ -19,7 +19,7 @@ from sideslip.benchmarks.recorded.emulate import compute_heading, find_backward
 from sideslip.benchmarks.recorded.quality import (
     COMPASS,
     TRUTH,
-    _estimate_resolution,
+    estimate_resolution,
     find_saturated,
     make_remarks,
     make_warnings,
@@ -206,7 +206,10 @@ def test_a_gyro_of_coarse_steps_is_not_at_its_limit() -> None:
     coarse = changed(clean(), {"gyro": lambda x: step * np.rint(x / step)})
     assert not find_saturated(coarse).any() and make_warnings([coarse], PASSENGER_CAR) == []
     assert make_remarks([coarse]) == ["The gyro's resolution is 1.28 deg/s."]
-    assert _estimate_resolution(clean()) == 0.0 and make_remarks([clean()]) == []
+    assert (
+        estimate_resolution(clean().record.fast[:, FAST.gyro]) == 0.0
+        and make_remarks([clean()]) == []
+    )
     held = changed(clean(), {"gyro": lambda x: x[::10].repeat(10)[: len(x)]})
     assert not find_saturated(held).any()
     clipped = changed(clean(), {"gyro": lambda x: np.clip(x, -0.5 * x.max(), 0.5 * x.max())})

@@ -22,6 +22,7 @@ cantools = pytest.importorskip("cantools")
 asammdf = pytest.importorskip("asammdf")
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("rosbags")
+pytest.importorskip("mcap_ros2")
 
 DBC = """VERSION ""
 NS_ :
@@ -239,6 +240,14 @@ def test_a_header_says_when_a_sample_was_taken_and_the_log_when_it_came(tmp_path
     frame.to_csv(tmp_path / "late.csv", index=False)
     (same,), _ = read_parts(tmp_path / "late.csv")
     np.testing.assert_array_equal(same.record.packets, log.record.packets)
+
+
+def test_a_bag_that_was_recorded_again_has_punctual_samples(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "SQLITE3", late=900.0)
+    (log,), remarks = read_parts(path, BAG)
+    packets = log.record.packets
+    np.testing.assert_array_equal(packets[:, PACKET.captured], packets[:, PACKET.arrived])
+    assert any("up to 900 s beside the headers'" in text for text in remarks)
 
 
 def test_a_vbox_has_its_own_names_and_units(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.recorded.bicycle_fit import Theta, compute_residual, fit, make_windows
+from sideslip.benchmarks.recorded.emulate import jackknife
 from sideslip.benchmarks.recorded.identify import (
     Finding,
     IdentificationResult,
     _estimate_white_noise,
-    _jackknife,
     identify,
     make_suite,
 )
@@ -87,7 +87,7 @@ def test_the_fit_is_exact_on_the_plant_itself() -> None:
 def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
     values = np.random.default_rng(0).normal(size=50)
     blocks = np.stack([values, np.ones(50)], axis=1)
-    value, half = _jackknife(blocks, lambda sums: float(sums[0] / sums[1]))
+    value, half = jackknife(blocks, lambda sums: float(sums[0] / sums[1]))
     assert value == pytest.approx(values.mean())
     assert half == pytest.approx(2.0096 * values.std(ddof=1) / math.sqrt(50), rel=1e-4)
 

@@ -1,0 +1,286 @@
+"""`sideslip inspect`: whether a log is worth estimating from, on one page."""
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...envs.record import Array, Log
+from ...envs.recordings.dialect import SLOW_QUANTITIES, find_sampling
+from ...envs.recordings.log_file import NEEDED, read_parts
+from ...envs.recordings.sources import is_nmea
+from ...envs.recordings.tables import COLUMNS, name_log, parse_mapping, read_columns
+from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
+from ...estimators.design.models import MEASUREMENTS
+from ...estimators.make import make_estimator
+from ...estimators.wires import SignalCalibration, apply_wires
+from ..harness.drives import SETTLED, call_quietly
+from ..harness.results import Column, ResultTable, Suite
+from ..harness.verdict import format_verdict
+from .checks import InspectedDrive, check_drive
+from .emulate import find_moving
+from .honesty import LOST, describe_innovations
+from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+    from ...envs.recordings.tables import LogSource
+
+FILTER = "joint"
+_SCREEN_ROWS = 12  # findings on the screen; all are in the report
+_DEGREES = 180.0 / math.pi
+_PLOTTED = ("speed_x", "yaw_rate", "accel_y", "steer", "course")
+_SHOWN_UNITS = {"rad": ("deg", _DEGREES), "radps": ("deg/s", _DEGREES), "mps": ("m/s", 1.0),
+                "mps2": ("m/s2", 1.0)}  # fmt: skip
+_LABELS = {
+    "bias": "gyro bias", "accel_bias": "accel_y bias", "steer_offset": "steering offset",
+    "front_tyres": "front tyre stiffness", "rear_tyres": "rear tyre stiffness", "bank": "bank",
+    "accel_scale": "accel_y scale", "inverse_friction": "1 / friction",
+}  # fmt: skip
+_RELATIVE = ("front_tyres", "rear_tyres", "accel_scale", "inverse_friction")
+_LEARNT = 0.7  # of the deviation at the start, below which the log tells a number
+_USEFUL = math.radians(1.0)  # of deviation, below which a slip of 2 deg is surely one
+
+
+class Prediction(NamedTuple):
+    """What the filter expects of its own estimate on the longest part."""
+
+    time: Array  # s, shape (n,)
+    beta: Array  # sideslip angle (rad), shape (n,)
+    deviation: Array  # its standard deviation (rad), shape (n,)
+    usual: float  # median of the deviation where the car moves (rad)
+    nis: float  # mean squared innovation over its variance, NaN without slow samples
+    learnt: dict[str, tuple[float, float]]  # deviation of each constant, at start and end
+    unseen: tuple[str, ...]  # what its sensors cannot see
+    error: float  # RMS beside the log's own sideslip angle (rad), NaN without
+
+
+def inspect_file(
+    source: "LogSource",
+    vehicle: VehicleSource,
+    mapping: Sequence[str] = (),
+    wires: SignalCalibration | None = None,
+    figures: bool = True,
+) -> Suite:
+    """Read a drive and judge whether it is worth estimating from.
+
+    Args:
+        source: Table, or its file.
+        vehicle: Vehicle that is assumed, as for `make_vehicle`.
+        mapping: Texts such as "steer_rad=Delta".
+        wires: Calibration of the signals.
+        figures: Whether to draw.
+
+    Returns:
+        Suite with the verdict, channels, findings, and what can be estimated.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: A column's name or calibration is none, or it is a receiver's log (NMEA).
+    """
+    if isinstance(source, str | Path) and is_nmea(source):
+        text = "a receiver's log (NMEA) has no gyro and no steering; `sideslip replay` filters it"
+        raise ValueError(f"{source}: {text}")
+    names, car = parse_mapping(mapping), make_vehicle(vehicle)
+    values, drive, remarks, findings = read_drive(source, names, car, wires)
+    prediction = None
+    if drive is not None:
+        findings += check_drive(drive)
+        if drive.logs and not any(finding.level == BLOCKER for finding in findings):
+            try:
+                prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
+            except ValueError as error:
+                cure = "an even period of the course, or a shorter --latency"
+                findings.append(LogFinding("filter", BLOCKER, "", str(error), cure))
+    findings.sort(key=lambda finding: LEVELS.index(finding.level))
+    suite = Suite("inspect", f"Is it worth estimating from? {name_log(source)}", " ".join(remarks))
+    suite.verdict = _compose_verdict(findings, prediction, car)
+    suite.tables = [_make_channels(values), *_make_findings(findings)]
+    if prediction is not None:
+        suite.tables.append(_make_learnt(prediction))
+    if figures and values:
+        drawn = _draw_figures(values, prediction)
+        suite.answers, suite.figures = drawn[:2], drawn[2:]
+    return suite
+
+
+def read_drive(
+    source: "LogSource",
+    names: dict[str, str],
+    car: Vehicle,
+    wires: SignalCalibration | None = None,
+) -> tuple[dict[str, Array], InspectedDrive | None, list[str], list[LogFinding]]:
+    """Read a drive as it stands and as estimators get it; a file that is refused is a finding.
+
+    Args:
+        source: Table, or its file.
+        names: Our column names to the log's.
+        car: Car that is assumed.
+        wires: Calibration of the signals.
+
+    Returns:
+        Columns, the drive (None for a refused file), the reader's remarks, and refusals.
+    """
+    wires, values, remarks = wires or SignalCalibration(), dict[str, Array](), list[str]()
+    try:
+        values, kinds, _ = read_columns(source, names, ("time",))
+        logs = list[Log]()
+        if set(NEEDED) <= values.keys():
+            logs, remarks = read_parts(source, names)
+            logs = [apply_wires(log, wires) for log in logs]
+        drive = InspectedDrive(values, kinds, logs, car, abs(wires.gain))
+    except FileNotFoundError:
+        raise
+    except ValueError as error:
+        text = str(error).removeprefix(f"{name_log(source)}: ")
+        return values, None, remarks, [LogFinding("reading", BLOCKER, "", text, "mend the file")]
+    return values, drive, remarks, []
+
+
+def _predict(log: Log, car: Vehicle) -> Prediction:
+    """Run the filter over a part and take its own deviation."""
+    options = {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
+    facts = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt, **options}
+    filter_ = call_quietly(make_estimator, FILTER, **facts)
+    estimates = filter_.run(log)
+    place = estimates.names.index("beta")
+    deviation = estimates.std[:, place]
+    moving = find_moving(log) & (log.time >= log.time[0] + SETTLED)
+    usual = float(np.median(deviation[moving])) if moving.any() else math.nan
+    has_nis = np.isfinite(estimates.nis).any()
+    learnt = {
+        name: (float(estimates.std[0, i]), float(estimates.std[-1, i]))
+        for i, name in enumerate(estimates.names)
+        if name in _LABELS
+    }
+    values = sum(len(MEASUREMENTS[sensor].rows) for sensor in log.slow) / max(len(log.slow), 1)
+    nis = float(np.nanmean(estimates.nis)) / values if has_nis else math.nan
+    beta = estimates.x[:, place]
+    wrong = (beta - log.truth.get("beta", np.full(len(beta), np.nan)))[moving]
+    known = wrong[np.isfinite(wrong)]
+    error = float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+    return Prediction(log.time, beta, deviation, usual, nis, learnt, filter_.unobservable, error)
+
+
+def _compose_verdict(
+    findings: Sequence[LogFinding], prediction: Prediction | None, car: Vehicle
+) -> str:
+    """Compose the verdict: what can be estimated, how well, and what stands against it."""
+    counts = Counter(finding.level for finding in findings)
+    blockers = [finding for finding in findings if finding.level == BLOCKER]
+    tally = f"{counts[BLOCKER]} BLOCKER, {counts[WARNING]} WARNING, {counts[OK]} OK."
+    if blockers or prediction is None:
+        first = blockers[0] if blockers else findings[0]
+        cure = f" ({first.cure})" if first.cure and first.cure not in first.text else ""
+        what = f"{first.channel}: " if first.channel else ""
+        return format_verdict(
+            "Do not estimate from this log before it is mended.",
+            f"First: {what}{first.text}{cure}.",
+            tally,
+        )
+    deviation = prediction.usual * _DEGREES
+    is_lost = prediction.nis > LOST
+    worth = "worth little" if is_lost or prediction.usual > _USEFUL else "worth it"
+    also = [
+        _LABELS[name] for name, (at_first, at_last) in prediction.learnt.items()
+        if at_last < _LEARNT * at_first
+    ]  # fmt: skip
+    unseen = f"; it cannot see {', '.join(prediction.unseen)}" if prediction.unseen else ""
+    beside = f" Beside the log's own angle it errs {prediction.error * _DEGREES:.2f} deg RMS."
+    beside = "" if math.isnan(prediction.error) else beside
+    nis = {} if math.isnan(prediction.nis) else {FILTER: prediction.nis}
+    return format_verdict(
+        f"This log is {worth}: {FILTER} expects its sideslip angle within {deviation:.2f} deg "
+        f"(one deviation, median), if the car is like {car.name}.",
+        f"It also tells: {', '.join(also) or 'nothing else'}{unseen}.",
+        f"{describe_innovations(nis)}{beside}".strip(),
+        tally,
+    )
+
+
+def _make_channels(values: dict[str, Array]) -> ResultTable:
+    """Make the table of channels: unit, rate, longest step, resolution, range."""
+    rows, time = [], values.get("time", np.zeros(0))
+    for name, column in values.items():
+        known = np.isfinite(column)
+        if name == "time" or not known.any():
+            continue
+        unit, scale = _SHOWN_UNITS.get(first := next(iter(COLUMNS[name])), (first, 1.0))
+        x, steps = column[known] * scale, np.diff(time[known])
+        usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
+        kind, period = find_sampling(column[known])
+        rows.append([
+            name, unit, 1.0 / (usual * (period or 1.0)), steps.max(initial=0.0),
+            estimate_resolution(x) or "fine", float(x.min()), float(x.max()),
+            kind or ("samples" if name in SLOW_QUANTITIES else "each row"),
+        ])  # fmt: skip
+    columns = (
+        "channel", "unit", Column("rate", "Hz", form=".3g"), Column("step", "gap / s", form=".3g"),
+        Column("grain", "resolution", form=".2g"), Column("low", "from", form=".3g"),
+        Column("high", "to", form=".3g"), "values",
+    )  # fmt: skip
+    return ResultTable("Channels", columns, rows, keyed=False, opened=True)
+
+
+def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
+    """Make the table of what is not OK, and one of all for the report."""
+    columns = ("level", "channel", "what, and what mends it")
+    bad = [finding for finding in findings if finding.level != OK]
+    cells = [_format_finding(finding) for finding in bad[:_SCREEN_ROWS]]
+    more = len(bad) - len(cells)
+    note = f"{more} more are in the report (--html). " if more > 0 else ""
+    note += f"{len(findings) - len(bad)} findings are OK."
+    rows = [[*dataclasses.astuple(finding)] for finding in findings]
+    heads = ("check", "level", "channel", "what", "what mends it")
+    complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
+    shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
+    return [*([shown] if bad else []), complete]
+
+
+def _format_finding(finding: LogFinding) -> list[str]:
+    """Texts of a finding's cells on the screen."""
+    stop = "" if finding.text.endswith("?") else "."
+    text = f"{finding.text}{stop} -> {finding.cure}"
+    return [finding.level, finding.channel, f"{finding.check}: {text}"]
+
+
+def _make_learnt(prediction: Prediction) -> ResultTable:
+    """Make the table of constants and of how much the log tells of them."""
+    rows = []
+    for name, (first, last) in prediction.learnt.items():
+        scale = 1.0 if name in _RELATIVE or name == "accel_bias" else _DEGREES
+        unit = {"bias": "deg/s", "accel_bias": "m/s2"}.get(name, "-" if scale == 1.0 else "deg")
+        rows.append([_LABELS[name], unit, first * scale, last * scale])
+    columns = (
+        "deviation of", "unit", Column("before", form=".2g"), Column("after", form=".2g"),
+    )  # fmt: skip
+    return ResultTable("What else it tells", columns, rows, keyed=False)
+
+
+def _draw_figures(
+    values: dict[str, Array], prediction: Prediction | None
+) -> list[tuple[str, "Figure", str]]:
+    """Each channel over time, and the sideslip angle with its deviation; none without plotly."""
+    try:
+        from ..report.figures import draw_time_series
+    except ModuleNotFoundError:
+        return []
+    shown = []
+    if prediction is not None:
+        beta, margin = prediction.beta * _DEGREES, 1.96 * prediction.deviation * _DEGREES
+        lines = {FILTER: beta, "95 % from": beta - margin, "95 % to": beta + margin}
+        figure = draw_time_series(prediction.time, lines, "sideslip angle / deg", zero_line=True)
+        shown.append(("The sideslip angle that this log gives", figure, "Longest part."))
+    for name in _PLOTTED:
+        if name in values and np.isfinite(values[name]).any():
+            unit, scale = _SHOWN_UNITS.get(first := next(iter(COLUMNS[name])), (first, 1.0))
+            dots = (name,) if name in SLOW_QUANTITIES else ()
+            column = {name: scale * values[name]}
+            figure = draw_time_series(values["time"], column, f"{name} / {unit}", dots=dots)
+            shown.append((name, figure, "As it stands in the file."))
+    return shown
