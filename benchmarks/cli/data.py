@@ -145,6 +145,11 @@ class _Identify:
         "linear: as stiff as in this drive; fiala: as at small slips; default: what predicts "
         "better."
     )
+    validate: bool = take(
+        "Also identify from half of the blocks, and drive that car through the others.",
+        False,
+        "--validate",
+    )
     steering_ratio: float | None
     steering_sign: int | None
     steering_offset: float | None
@@ -156,7 +161,8 @@ class _Identify:
         console, stated = Console(), (self.vehicle, self.mapping or ())
         wires = _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            result, suite = identify_file(self.log, *stated, wires, self.tyres, self.until)
+            chosen = wires, self.tyres, self.until, self.validate
+            result, suite = identify_file(self.log, *stated, *chosen)
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)

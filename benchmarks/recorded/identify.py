@@ -21,7 +21,7 @@ from .suite import GYRO_ONLY
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6
-_MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
+MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
 _MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
 _MAX_FRICTION_SHARE = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
 _MAX_RATIO_FACTOR = 2.5  # within this factor of the stated ratio, that one may be right
@@ -69,6 +69,8 @@ class IdentificationResult:
     rates: tuple[float, ...] = ()  # RMS of yaw rate's residual (rad/s): stated, fitted, held out
     slips: tuple[float, ...] = ()  # RMS beside the log's sideslip (rad): stated, fitted
     reason: str = ""  # why nothing is known of the car
+    theta: Theta | None = None  # all that was fitted to the car's motion, where it was
+    tyres: str = TYRES[0]  # their law in that fit
     remarks: list[str] = field(default_factory=list)
 
 
@@ -129,7 +131,7 @@ def _find_reason(w: Windows, related: float) -> str:
     if len(w.starts) < _MIN_WINDOWS:
         return f"{len(w.starts)} of {_MIN_WINDOWS} windows of 5 s are fast enough and whole"
     turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
-    if np.std(turns) < _MIN_TURNING:
+    if np.std(turns) < MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
     if abs(related) < MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
@@ -180,7 +182,7 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
             row._replace(is_determined=False, remark=result.reason) for row in result.findings
         ]
         return
-    result.car = fitted
+    result.car, result.theta, result.tyres = fitted, theta, w.tyres
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
     result.wires = SignalCalibration(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
     first = Theta(gain=stated.gain, offset=stated.offset)
@@ -419,10 +421,23 @@ def make_suite(result: IdentificationResult, name: str) -> Suite:
         f"Not told by this log: {', '.join(missing) or 'nothing'}.",
         "Not covered: the mass, which scales all; drives beside the part that was used.",
     )
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, result.findings))
-    suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
+    suite.tables = [make_findings_table(result.findings, _NOTE)]
     return suite
+
+
+def make_findings_table(findings: Sequence[Finding], note: str) -> ResultTable:
+    """Make the table of findings.
+
+    Args:
+        findings: What a log shows.
+        note: Note below the table.
+
+    Returns:
+        The table.
+    """
+    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
+    cells = list(map(_format_cells, findings))
+    return ResultTable("What the log shows", header, cells, note, keyed=False)
 
 
 def _format_cells(row: Finding) -> list[str]:
