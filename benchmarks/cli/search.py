@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from typer import Typer
+from typer import Exit, Typer
 
 from ...envs.validation import check_choice
 from ..harness.parallel import use_engine
@@ -41,11 +41,16 @@ def _parse_range(text: str) -> tuple[str, tuple[float, float] | None]:
 class _TuneEstimator:
     """Find an estimator's Q, and R if asked to, on training seeds; report on test seeds.
 
-    A stopped search goes on where it was when the same command runs again.
+    A stopped search goes on where it was when the same command runs again. With --log it is R and
+    the slow sensors' latency, from half of a recorded drive without truth; exit status 1 where the
+    log is too poor for that.
     """
 
-    name: str = take_argument("An estimator's name.", ...)
-    scenario: list[str] = take("A scenario's name; repeatable: each counts alike.", ...)
+    name: str = take_argument("An estimator's name.", "joint")
+    scenario: Texts = take("A scenario's name; repeatable: each counts alike.")
+    log: File = take("A recorded drive to take noise and latency from, without scenarios.")
+    vehicle: str = take("The car of --log: a name or a file.", "passenger-car")
+    mapping: Texts
     env: str = take("An environment's id; default: one that fits.", "")
     target: str = take("The state whose error counts.", "beta")
     option: Texts = take("NAME=VALUE, held; repeatable.")
@@ -58,11 +63,18 @@ class _TuneEstimator:
     seed: int
     storage: Text
     jobs: int | None
-    out: File = take("Write the entry to a tunings file.", ends=".toml")
+    out: File = take(
+        "Write the entry to a tunings file; with --log, the car and its wires.", ends=".toml"
+    )
     write: bool = take("Make it the shipped tuning.", False, "--write")
     note: str = take("A note for the entry.", "")
 
     def run(self) -> None:
+        if self.log is not None:
+            self._tune_from_log(self.log)
+            return
+        if not self.scenario:
+            raise ValueError("expected --scenario NAME or --log DRIVE")
         from ...estimators.design import options
         from ..tuning.estimator import STORAGE, SearchOptions, make_estimator_tuning, update
         from ..tuning.study import make_entry, run
@@ -88,6 +100,29 @@ class _TuneEstimator:
         for path in files:
             update(path, made)
             print_written(console, path)
+
+    def _tune_from_log(self, path: Path) -> None:
+        """Find noise and latency from a log."""
+        from ...envs.recordings.log_file import read_parts
+        from ...envs.recordings.tables import parse_mapping
+        from ...envs.vehicle.parameters import make_vehicle
+        from ...estimators.wires import read_wires, write_vehicle
+        from ..tuning.likelihood import tune
+
+        if self.scenario or self.search or self.noise or self.write:
+            raise ValueError("--log goes without --scenario, --search, --noise and --write")
+        parts, remarks = read_parts(path, parse_mapping(self.mapping or ()))
+        longest = max(parts, key=lambda part: len(part.time))
+        car, wires = make_vehicle(self.vehicle), read_wires(self.vehicle)
+        suite, wires, numbers = tune(self.name, longest, car, parse_options(self.option), wires)
+        suite.text = " ".join(remarks)
+        console = Console()
+        print_suite(console, suite)
+        if not numbers:
+            raise Exit(1)
+        if self.out is not None:
+            write_vehicle(self.out, car, wires)
+            print_written(console, self.out)
 
 
 @register("controller", to=tune_app)

@@ -32,7 +32,7 @@ _MOST_LATE = 0.5  # s
 _BLOCKS = 20  # of the searched half, which the intervals take for independent
 _SWEEPS = 2
 _COARSE = 0.05  # s
-_WIDEST = {"noise": math.log(2.0), "latency": 0.05}  # half of the widest interval: of ln, in s
+_WIDEST = {"noise": math.log(2.0), "latency": 0.125}  # half of the widest interval: of ln, in s
 _STEP = 0.15  # of ln(noise), of slopes
 _NOTE = (
     "The most likely numbers of the first half of the log; intervals by a jackknife over 20 blocks "
