@@ -147,6 +147,7 @@ class _Bench:
     suites: Texts = take_argument("Suites; default: all.", None, autocompletion=complete("suites"))
     quick: bool = take("Few seeds: a first look in minutes.", False, "--quick")
     log: File = take("Replay this recorded drive too.")
+    data: File = take("The folder of downloaded drives that the suite logs reads.")
     vehicle: Text
     mapping: Texts
     html: File
@@ -189,8 +190,9 @@ class _Bench:
 
             done.append(replay_file(self.log, self.vehicle, mapping=self.mapping))
         request = Request(
-            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.salt
-        )
+            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant,
+            data=self.data, salt=self.salt,
+        )  # fmt: skip
         how = "the same command" if self.keep else "add --keep FOLDER, which keeps finished cases"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
             done += run_suites(names, request, comparison)

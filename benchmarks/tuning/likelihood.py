@@ -27,7 +27,7 @@ from ..recorded.emulate import compute_ground_speed
 from ..recorded.identify import MIN_TURNING, Finding, make_findings_table
 from ..recorded.validate import cut
 
-_RANGE = 30.0  # times the default noise and as much below it
+_RANGE = 30.0  # times the default noise, at most; a default also covers what the model lacks
 _MOST_LATE = 0.5  # s
 _BLOCKS = 20  # of the searched half, which the intervals take for independent
 _SWEEPS = 2
@@ -78,10 +78,8 @@ class LogTuning:
         width, of_filter = math.log(_RANGE), default.config.noise
         starts = {key: math.log(of_filter[key.removesuffix("_noise")]) for key in noises}
         self.parameters = [
-            Parameter(key, True, at, at - width, at + width) for key, at in starts.items()
+            Parameter(key, True, at, at, at + width) for key, at in starts.items()
         ]
-        if default.config.noise_time > 0.0:  # it would find them anew as it drives
-            self.options["noise_time"] = 0.0
         for sensor in default.sensors:
             late = wires.latency.get(sensor, 0.0)
             self.parameters.append(Parameter(sensor, False, late, 0.0, max(_MOST_LATE, late)))
@@ -133,17 +131,19 @@ class LogTuning:
         np.add.at(fast, np.clip(arrived, 0, len(fast) - 1), packets)
         return np.array([part.sum() for part in np.array_split(fast[_count_settled(log) :], _BLOCKS)])
 
-    def search(self, cost: Callable[[Array], float]) -> Array:
+    def search(self, cost: Callable[[Array], float], is_free: Array | None = None) -> Array:
         """Search the parameters one after the other, twice.
 
         Args:
             cost: Function of their values, to be made small.
+            is_free: Mask of the searched ones, None for all; the others stay where they start.
 
         Returns:
             Values of the parameters.
         """
         x, dt = np.array([p.start for p in self.parameters]), self.log.record.dt
-        order = sorted(range(len(x)), key=lambda i: self.parameters[i].is_noise)  # latency first
+        free = np.arange(len(x)) if is_free is None else np.flatnonzero(is_free)
+        order = sorted(free.tolist(), key=lambda i: self.parameters[i].is_noise)  # latency first
 
         def vary(i: int, value: float) -> float:
             y = x.copy()
@@ -256,14 +256,25 @@ def tune(
     tuning = LogTuning(name, first, car, options or {}, stated)
     start = np.array([p.start for p in tuning.parameters])
     turning = float(np.std(compute_ground_speed(first) * first.record.fast[:, FAST.gyro]))
+
+    def cost(v: Array) -> float:
+        return -float(tuning.compute_blocks(first, v).sum())
+
     reason, x, halves = "", start, np.full(len(start), math.inf)
     if turning < MIN_TURNING:
         reason = f"no excitation, speed x yaw rate has {turning:.2g} m/s2 RMS"
     else:
-        x = tuning.search(lambda v: -float(tuning.compute_blocks(first, v).sum()))
+        x = tuning.search(cost)
         halves = tuning.compute_intervals(first, x)
-    findings = [_make_finding(*row, reason) for row in zip(tuning.parameters, x, halves, strict=True)]
+    findings = _make_findings(tuning, x, halves, reason)
     is_determined = np.array([finding.is_determined for finding in findings])
+    if is_determined.any() and not is_determined.all():  # the others' best is now another
+        x = tuning.search(cost, is_determined)
+        halves = tuning.compute_intervals(first, x)
+        again = _make_findings(tuning, x, halves, "")
+        findings = [new if old.is_determined else old
+                    for new, old in zip(again, findings, strict=True)]  # fmt: skip
+        is_determined = np.array([finding.is_determined for finding in findings])
     x = np.where(is_determined, x, start)
     rows = [_score(tuning, second, "stated", start, True), _score(tuning, second, "found", x)]
     gain = rows[1]["density"] - rows[0]["density"]
@@ -281,10 +292,15 @@ def tune(
         latency={**stated.latency, **late},
         noise={**stated.noise, **{k: v for k, v in noise.items() if k in NOISES.values()}},
     )
-    chosen = {key: tuning.options[key] for key in ("noise_time",) if key in tuning.options} | noise
     words = [f"--latency {key}={value:g}" for key, value in late.items()]
-    words += [f"--estimator-option {name}.{key}={value:g}" for key, value in chosen.items()]
-    return _make_suite(name, log, findings, rows, "", " ".join(words)), calibration, chosen
+    words += [f"--estimator-option {name}.{key}={value:g}" for key, value in noise.items()]
+    return _make_suite(name, log, findings, rows, "", " ".join(words)), calibration, noise | late
+
+
+def _make_findings(tuning: LogTuning, x: Array, halves: Array, reason: str) -> list[Finding]:
+    """Rows of the table."""
+    rows = zip(tuning.parameters, x, halves, strict=True)
+    return [_make_finding(*row, reason) for row in rows]
 
 
 def _make_finding(p: Parameter, value: float, half: float, reason: str) -> Finding:
