@@ -41,7 +41,7 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
         files = sorted(request.data.glob(preset["pattern"])) if request.data else []
         if not files:
             absent.append(
-                f"{preset['name']}: {preset['address']}. Licence: {preset['licence']}. Save as "
+                f"{preset['name']} is not there: {preset['address']}. Licence: {preset['licence']}. Save as "
                 f"{preset['pattern']} in the folder of --data: {preset['prepare']}."
             )
         for path in files:
@@ -78,12 +78,12 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
 
 
 def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -> None:
-    """Add rows and the table, and the instructions as text."""
+    """Add rows and the table, and the instructions above the verdict."""
     records, absent = results
     for record in records:
         numbers = {key: value for key, value in record.items() if key != "drive"}
         suite.add_rows([numbers], scenario=record["drive"])
-    suite.text = "\n\n".join([suite.text, *absent])
+    suite.warnings = [text.removesuffix(".") for text in absent]
     if records:
         note = "Absolute errors of the sideslip angle from 2 s on, driven forward."
         suite.tables = [ResultTable("Recorded drives", _COLUMNS, records, note)]
@@ -93,13 +93,13 @@ def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
     """Say the medians over the drives, or that there is none."""
     records, absent = results
     if not records:
-        return format_verdict("No drive was read: the text says where to get each, and how.")
+        return format_verdict("No drive was read: the lines above say where to get each.")
     ours = [record for record in records if record["estimator"] == _NAME]
     median, p95 = (_DEG * float(np.median([r[key] for r in ours])) for key in ("median", "p95"))
     return format_verdict(
         f"{_NAME} errs {median:.2f} deg (95th percentile {p95:.2f}), medians over the drives: "
         f"{len(ours)}.",
-        f"Not scored or not there: {len(absent)}; the text names each." if absent else "",
+        f"Not scored or not there: {len(absent)}; the lines above name each." if absent else "",
     )
 
 

@@ -27,7 +27,7 @@ from ..recorded.emulate import compute_ground_speed
 from ..recorded.identify import MIN_TURNING, Finding, make_findings_table
 from ..recorded.validate import cut
 
-_RANGE = 30.0  # times the default noise, at most; a default also covers what the model lacks
+_RANGE = 30.0  # times the default noise and as much below it
 _MOST_LATE = 0.5  # s
 _BLOCKS = 20  # of the searched half, which the intervals take for independent
 _SWEEPS = 2
@@ -36,7 +36,8 @@ _WIDEST = {"noise": math.log(2.0), "latency": 0.125}  # half of the widest inter
 _STEP = 0.15  # of ln(noise), of slopes
 _NOTE = (
     "The most likely numbers of the first half of the log; intervals by a jackknife over 20 blocks "
-    "of it. What is not told stays as stated."
+    "of it. What is not told stays as stated. A filter's noise is raised, never lowered: it also "
+    "covers what the model lacks."
 )
 
 
@@ -78,7 +79,7 @@ class LogTuning:
         width, of_filter = math.log(_RANGE), default.config.noise
         starts = {key: math.log(of_filter[key.removesuffix("_noise")]) for key in noises}
         self.parameters = [
-            Parameter(key, True, at, at, at + width) for key, at in starts.items()
+            Parameter(key, True, at, at - width, at + width) for key, at in starts.items()
         ]
         for sensor in default.sensors:
             late = wires.latency.get(sensor, 0.0)
@@ -275,6 +276,8 @@ def tune(
         findings = [new if old.is_determined else old
                     for new, old in zip(again, findings, strict=True)]  # fmt: skip
         is_determined = np.array([finding.is_determined for finding in findings])
+    # a filter's own noise also covers what its model lacks: it is raised, never lowered
+    x = np.where([p.is_noise for p in tuning.parameters], np.maximum(x, start), x)
     x = np.where(is_determined, x, start)
     rows = [_score(tuning, second, "stated", start, True), _score(tuning, second, "found", x)]
     gain = rows[1]["density"] - rows[0]["density"]
