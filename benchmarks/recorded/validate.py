@@ -1,6 +1,7 @@
 """Whether an identified car stays near held-out parts of its log, driven by steering and speed."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -66,7 +67,7 @@ def split_blocks(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
     for log in logs:
         count = int(np.clip(len(log.time) * log.record.dt / _BLOCK, 1, _MOST_BLOCKS))
         ends = np.linspace(0, len(log.time), count + 1).astype(int).tolist()
-        blocks += [cut(log, *pair) for pair in zip(ends, ends[1:], strict=False)]
+        blocks += [cut(log, *pair) for pair in itertools.pairwise(ends)]
     return blocks[::2], blocks[1::2]
 
 

@@ -4,7 +4,6 @@ Half of the log is searched; the other half says whether the numbers predict its
 than the defaults. Intervals are a jackknife over blocks of the searched half.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -130,7 +129,9 @@ class LogTuning:
             return np.full(_BLOCKS, -math.inf)
         arrived = (record.packets[:, PACKET.arrived] - record.first).astype(int)
         np.add.at(fast, np.clip(arrived, 0, len(fast) - 1), packets)
-        return np.array([part.sum() for part in np.array_split(fast[_count_settled(log) :], _BLOCKS)])
+        return np.array(
+            [part.sum() for part in np.array_split(fast[_count_settled(log) :], _BLOCKS)]
+        )
 
     def search(self, cost: Callable[[Array], float], is_free: Array | None = None) -> Array:
         """Search the parameters one after the other, twice.
@@ -309,7 +310,7 @@ def _make_findings(tuning: LogTuning, x: Array, halves: Array, reason: str) -> l
 def _make_finding(p: Parameter, value: float, half: float, reason: str) -> Finding:
     """A row of the table; the interval of a noise is that of its logarithm, to first order."""
     widest = _WIDEST["noise" if p.is_noise else "latency"]
-    at_end = min(value - p.low, p.high - value) < widest and p.is_noise or value >= p.high
+    at_end = (min(value - p.low, p.high - value) < widest and p.is_noise) or value >= p.high
     remark = reason or ("at the end of its range" if at_end else "")
     remark = remark or ("" if half <= widest else "its interval is too wide")
     numbers = (p.start, value, half)
@@ -353,7 +354,9 @@ def _make_suite(
     missing = [finding.name for finding in findings if not finding.is_determined]
     answer = f"Too poor a log: {reason}. All stays as stated."
     suite.verdict = format_verdict(
-        answer if reason else f"{name}'s log density of the next samples rises on the second half, "
+        answer
+        if reason
+        else f"{name}'s log density of the next samples rises on the second half, "
         f"{rows[0]['density']:.3f} to {rows[1]['density']:.3f} a row.",
         f"Not told by this log: {', '.join(missing) or 'nothing'}.",
         "Not covered: process noise; errors that stand still, which no innovation shows.",

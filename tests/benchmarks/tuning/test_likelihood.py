@@ -20,7 +20,7 @@ from tests.benchmarks.recorded.simulated import as_table
 
 @cache
 def drive(seed: int) -> tuple[Log, Vehicle, float]:
-    """A log as a user has it, with the truth that only the judge reads; its car, and its latency."""
+    """A log as a user has it, with the truth that only the judge reads; its car, its latency."""
     drawn = drawn_car(seed, 80.0, 5.0)
     table = as_table(drawn.log).assign(sideslip_rad=drawn.log.truth["beta"])
     return read_parts(table)[0][0], drawn.car, drawn.late
@@ -32,9 +32,9 @@ def compute_rms(tuning: LogTuning, log: Log, x: Array) -> float:
     return float(np.sqrt(np.mean(error[200:] ** 2)))
 
 
-@pytest.mark.parametrize("seed", [4])
-def test_error_on_the_other_half_is_near_that_of_tuning_with_truth(seed: int) -> None:
-    log, car, late = drive(seed)
+def test_on_a_late_gps_the_other_half_errs_little_more_than_with_truth() -> None:
+    """One drive; docs/identify.md has others, on which it errs more."""
+    log, car, late = drive(4)
     blind = dataclasses.replace(log, truth={})
     suite, wires, found = tune("joint", blind, car)
     assert abs(wires.latency["gps"] - late) < 0.05
