@@ -41,8 +41,8 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
         files = sorted(request.data.glob(preset["pattern"])) if request.data else []
         if not files:
             absent.append(
-                f"{preset['name']} is not there: {preset['address']}. Licence: {preset['licence']}. Save as "
-                f"{preset['pattern']} in the folder of --data: {preset['prepare']}."
+                f"{preset['name']} is not there: {preset['address']}. Licence: "
+                f"{preset['licence']}. Save as {preset['pattern']} in the folder of --data: {preset['prepare']}."
             )
         for path in files:
             beside = path.with_name("vehicle.toml")
