@@ -42,7 +42,8 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
         if not files:
             absent.append(
                 f"{preset['name']} is not there: {preset['address']}. Licence: "
-                f"{preset['licence']}. Save as {preset['pattern']} in the folder of --data: {preset['prepare']}."
+                f"{preset['licence']}. Save as {preset['pattern']} in the folder "
+                f"of --data: {preset['prepare']}."
             )
         for path in files:
             beside = path.with_name("vehicle.toml")
