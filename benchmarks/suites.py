@@ -23,6 +23,7 @@ SUITES = {
     "recovery": ".studies.recovery_region",
     "procedures": ".procedures.suite",
     "speed": ".speed.suite",
+    "logs": ".studies.logs",
 }
 """The module of each suite, whose `STUDY` it is."""
 

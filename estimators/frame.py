@@ -65,8 +65,8 @@ def _run_joint(log: "Log", car: Vehicle) -> "pd.DataFrame":
     import pandas as pd
 
     dt = log.record.dt
-    options = {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
-    filter_ = make_estimator("joint", vehicle=car, sensors=log.slow, dt=dt, **options)
+    present = log.record.present
+    filter_ = make_estimator("joint", vehicle=car, sensors=log.slow, dt=dt, present=present)
     record = filter_.prepare_record(log)
     fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
     X, S = np.empty((2, len(fast), len(filter_.names)))

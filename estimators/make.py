@@ -3,7 +3,7 @@
 import functools
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, overload
 
 from ..envs.sensors.link import SlowSensor
@@ -36,6 +36,7 @@ def make_estimator(
     sensors: Mapping[str, SlowSensor] | None = None,
     dt: float = TICK,
     speed: float | None = None,
+    present: Collection[str] | None = None,
     **options: Any,
 ) -> Estimator | ForeignEstimator:
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
@@ -49,6 +50,8 @@ def make_estimator(
         sensors: Available slow sensors by name ("camera", "gps").
         dt: Tick (s).
         speed: Speed (m/s) if it is held; None measures it with the front wheels.
+        present: Columns that the record carries, as `Record.present`; None: all. A filter of
+            `FILTERS` does without absent fast sensors, unless `fast` names them.
         **options: Options of a filter of `FILTERS`, which `FilterOptions` lists, or of the factory.
 
     Returns:
@@ -70,6 +73,9 @@ def make_estimator(
         return ForeignEstimator(built, label, dt, available)
     if speed is not None and not 0.0 <= speed < math.inf:
         raise ValueError(f"{name}: speed is in m/s and not negative, got {speed!r}")
+    fast = dict(FILTERS[name].options).get("fast", ())
+    if present is not None and not {*fast} <= {"gyro", *present}:
+        options = {"fast": tuple(x for x in fast if x in {"gyro", *present})} | options
     config = parse_config(name, FILTERS[name], available, options)
     car = make_vehicle(vehicle)
     layers, schedules = assemble(config, car, dt, speed)

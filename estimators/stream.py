@@ -108,9 +108,8 @@ class Stream:
             for name, values in SENSORS.items()
             if values[0] in quantities
         }
-        options = {} if "accel_y" in quantities else {"fast": ("gyro",)}
         self._filter = make_estimator(
-            "joint", vehicle=make_vehicle(vehicle), sensors=sensors, dt=dt, **options
+            "joint", vehicle=make_vehicle(vehicle), sensors=sensors, dt=dt, present=quantities
         )
 
     def _begin(self, tick: int) -> None:

@@ -147,6 +147,11 @@ class _Identify:
         "linear: as stiff as in this drive; fiala: as at small slips; default: what predicts "
         "better."
     )
+    validate: bool = take(
+        "Also identify from half of the blocks, and drive that car through the others.",
+        False,
+        "--validate",
+    )
     steering_ratio: float | None
     steering_sign: int | None
     steering_offset: float | None
@@ -155,10 +160,17 @@ class _Identify:
         from ...estimators.wires import write_vehicle
         from ..recorded.replay import identify_file
 
-        console, stated = Console(), (self.vehicle, self.mapping or ())
-        wires = _read_wires(self)
+        console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            result, suite = identify_file(self.log, *stated, wires, self.tyres, self.until)
+            result, suite = identify_file(
+                self.log,
+                self.vehicle,
+                self.mapping or (),
+                wires,
+                self.tyres,
+                self.until,
+                self.validate,
+            )
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)

@@ -146,6 +146,7 @@ class _Bench:
 
     suites: Texts = take_argument("Suites; default: all.", None, autocompletion=complete("suites"))
     quick: bool = take("Few seeds: a first look in minutes.", False, "--quick")
+    data: File = take("The folder of downloaded drives, for the suite logs.")
     vehicle: Text
     html: File
     json: File
@@ -176,14 +177,16 @@ class _Bench:
             comparison = self._make_comparison(self.agent or [], self.estimator or [])
         elif self.scenario or self.env_id or self.fresh:
             raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
-        names = self.suites or (["control"] if comparison else list(SUITES))
+        everything = [name for name in SUITES if name != "logs" or self.data]
+        names = self.suites or (["control"] if comparison else everything)
         for name in names:
             check_choice("suite", name, SUITES)
         check_salt(self.salt, names)
         check_page(self.page, names)
         request = Request(
-            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.salt
-        )
+            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.data,
+            self.salt,
+        )  # fmt: skip
         how = "the same command" if self.keep else "add --keep FOLDER, which keeps finished cases"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
             done = run_suites(names, request, comparison)

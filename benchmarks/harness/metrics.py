@@ -118,7 +118,7 @@ EPISODE = (
 """Metrics of an episode."""
 
 _OTHERS = {
-    "rad": "rmse static_slip drift course_prediction_error",
+    "rad": "median p95 worst rmse static_slip drift course_prediction_error",
     "m": "offset prediction_error",
     "m/s": "speed",
     "s": "cpu_seconds response_time healthy_after",

@@ -186,6 +186,31 @@ def _simulate_windows(
             out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
 
+def simulate_windows(car: Vehicle, theta: Theta, w: Windows) -> Array:
+    """Drive the model through each window with the logged speed and steering.
+
+    Args:
+        car: Stated car.
+        theta: Parameters.
+        w: Windows.
+
+    Returns:
+        Yaw rate (rad/s), lateral specific force (m/s2) and sideslip angle of the antenna (rad) from
+        the row behind each start on, shape (3, windows, rows).
+    """
+    rows = sum(round(seconds / w.dt) for seconds in (_BURN, _WINDOW, _MARGIN))
+    out = np.empty((3, len(w.starts), rows))
+    fixed = np.array([
+        car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
+        car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
+        car.roll_moment_arm, car.roll_inertia, car.roll_stiffness, car.roll_damping,
+        car.gravity_height, car.antenna_ahead,
+    ])  # fmt: skip
+    law = TYRE_LAWS.index(w.tyres)
+    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, w.dt, out)
+    return out
+
+
 def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
     """Compute measured less predicted channels.
 
@@ -199,15 +224,7 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
         each window and is 0 in rows without a fix, shape (windows, channels, rows).
     """
     first, count = round(_BURN / w.dt), round(_WINDOW / w.dt)
-    out = np.empty((3, len(w.starts), first + count + round(_MARGIN / w.dt)))
-    fixed = np.array([
-        car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
-        car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
-        car.roll_moment_arm, car.roll_inertia, car.roll_stiffness, car.roll_damping,
-        car.gravity_height, car.antenna_ahead,
-    ])  # fmt: skip
-    law = TYRE_LAWS.index(w.tyres)
-    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, w.dt, out)
+    out = simulate_windows(car, theta, w)
 
     def interpolate_late(values: Array, delay: float) -> Array:
         places = np.arange(first, first + count) - delay / w.dt

@@ -86,6 +86,8 @@ class IdentificationResult:
     rates: tuple[float, ...] = ()  # RMS of yaw rate's residual (rad/s): stated, fitted, held out
     slips: tuple[float, ...] = ()  # RMS beside the log's sideslip (rad): stated, fitted
     reason: str = ""  # why nothing is known of the car
+    theta: Theta | None = None  # all that was fitted to the car's motion, where it was
+    tyres: str = TYRES[0]  # their law in that fit
     remarks: list[str] = field(default_factory=list)
 
 
@@ -197,7 +199,7 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
             row._replace(is_determined=False, remark=result.reason) for row in result.findings
         ]
         return
-    result.car = fitted
+    result.car, result.theta, result.tyres = fitted, theta, w.tyres
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
     steering = 1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset
     result.wires = SignalCalibration(*steering, late, at=stated.at)
@@ -401,10 +403,23 @@ def make_suite(result: IdentificationResult, name: str) -> Suite:
         f"Not told by this log: {', '.join(missing) or 'nothing'}.",
         "Not covered: the mass, which scales all; drives beside the part that was used.",
     )
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, result.findings))
-    suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
+    suite.tables = [make_findings_table(result.findings, _NOTE)]
     return suite
+
+
+def make_findings_table(findings: Sequence[Finding], note: str) -> ResultTable:
+    """Make the table of findings.
+
+    Args:
+        findings: What a log shows.
+        note: Note below the table.
+
+    Returns:
+        The table.
+    """
+    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
+    cells = list(map(_format_cells, findings))
+    return ResultTable("What the log shows", header, cells, note, keyed=False)
 
 
 def _format_cells(row: Finding) -> list[str]:

@@ -14,6 +14,7 @@ from ..harness.results import Suite
 from .identify import IdentificationResult, identify, make_suite
 from .quality import TRUTH, make_remarks, make_warnings
 from .suite import corners, replay
+from .validate import make_validation_table
 
 _FITTED, _NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
 _FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
@@ -34,6 +35,7 @@ def identify_file(
     wires: SignalCalibration | None = None,
     tyres: str | None = None,
     until: float | None = None,
+    validate: bool = False,
 ) -> tuple[IdentificationResult, Suite]:
     """Read a drive and identify its car.
 
@@ -44,6 +46,7 @@ def identify_file(
         wires: Stated calibration of the signals.
         tyres: Law of the tyres, as for `identify`.
         until: End of the part that is used (s), None for all.
+        validate: Whether to say how well a car from half of the log drives the other half.
 
     Returns:
         Identified car and calibration, and their suite.
@@ -55,6 +58,8 @@ def identify_file(
     result.remarks = [*remarks, *make_remarks(logs), *result.remarks]
     suite = make_suite(result, logs[0].name)
     suite.warnings = urgent + make_warnings(logs, car)
+    if validate:
+        suite.tables.append(make_validation_table(logs, car, wires, tyres))
     return result, suite
 
 

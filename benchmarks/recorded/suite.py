@@ -155,7 +155,8 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
         if settings.estimators is not None and name not in (GYRO_ONLY, *settings.estimators):
             continue
         slow = next((sensor for sensor in serves if sensor in log.slow), None)
-        if serves and slow is None and name != _OWN_NOISE:  # which inertial sensors serve too
+        inertial = name == _OWN_NOISE and "accel_y" in log.record.present
+        if serves and slow is None and not inertial:
             result.remarks[name] = f"left out: needs {' or '.join(serves)}"
             continue
         try:
@@ -211,10 +212,9 @@ def _make_estimator(
         options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
     if "gyro_noise" in settings.noise and name != _OWN_NOISE:
         options["gyro_noise"] = max(settings.noise["gyro_noise"], _MIN_GYRO_NOISE)
-    if name == _OWN_NOISE and slow is not None and "accel_y" not in log.record.present:
-        options["fast"] = ("gyro",)
     options |= settings.options.get(name, {})
-    facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
+    facts = {"vehicle": vehicle, "sensors": sensors}
+    facts |= {"dt": log.record.dt, "present": log.record.present}
     return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
 
 

@@ -115,6 +115,9 @@ def test_bench_without_a_name_runs_all_suites(run: Run, monkeypatch: Any) -> Non
 
     monkeypatch.setattr(cli, "run_suites", run_suites)
     status, _, _ = run("bench", "--quick")
+    assert status == 0 and {*SUITES} - {*names} == {"logs"}  # nothing was downloaded
+    names.clear()
+    status, _, _ = run("bench", "--quick", "--data", ".")
     assert status == 0 and names == list(SUITES)
 
 

@@ -93,7 +93,7 @@ CASES = [
          ("--course-bias 0.4", "settings.bias_deg", 0.4),
          ("--gyro-bias 0.6", "settings.gyro_bias_degps", 0.6)),
     *_of("identify log.csv", "benchmarks.recorded.replay.identify_file", *LOGGED,
-         ("--tyres fiala", "tyres", "fiala")),
+         ("--tyres fiala", "tyres", "fiala"), ("--validate", "validate", True)),
     *_of("inspect log.csv", "benchmarks.recorded.inspection.inspect_file",
          *(row for row in LOGGED if row[1] != "until"),
          ("--latency gps=0.2", "wires.latency.gps", 0.2)),

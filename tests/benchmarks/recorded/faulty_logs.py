@@ -140,7 +140,7 @@ def shift_fixes(x: pd.DataFrame, late: Array) -> pd.DataFrame:
     to = rows + np.rint(late[rows] / DT).astype(int)
     inside = (to >= 0) & (to < len(x))
     values, x = x[columns].to_numpy()[rows[inside]], x.assign(**dict.fromkeys(columns, np.nan))
-    x.iloc[to[inside], [x.columns.get_loc(name) for name in columns]] = values
+    x.loc[x.index[to[inside]], columns] = values
     return x
 
 

@@ -1,0 +1,115 @@
+"""The suite `logs`: `joint`, with one setting, on every recorded drive that the user downloaded."""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...envs.record import Array, Log
+from ...envs.recordings.log_file import read_parts
+from ...envs.recordings.tables import parse_mapping
+from ...envs.vehicle.parameters import VehicleSource, make_vehicle
+from ...estimators.analysis.smoother import smooth
+from ...estimators.make import make_estimator
+from ...estimators.wires import apply_wires, read_wires
+from ..harness.drives import SETTLED, call_quietly
+from ..harness.results import Column, ResultTable, Suite
+from ..harness.verdict import format_verdict
+from ..recorded.emulate import find_backward
+from ..recorded.honesty import HONESTY, compute_honesty
+from ..report.study import Request, Study
+
+_FILE = Path(__file__).with_suffix(".toml")
+_NAME = "joint"
+_DEG = math.degrees(1.0)
+_COLUMNS = (
+    "drive", "estimator", Column("n", "rows", form=".0f", interval=False),
+    Column("median", "median / deg", _DEG, ".2f", interval=False),
+    Column("p95", "95th / deg", _DEG, ".2f", interval=False),
+    Column("worst", "worst / deg", _DEG, ".2f", interval=False), *HONESTY,
+)  # fmt: skip
+
+
+def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
+    """Records of all drives in the folder, and a line for what is not there or not scored."""
+    records, absent = list[dict[str, Any]](), list[str]()
+    if request.data is not None and not request.data.is_dir():
+        raise FileNotFoundError(f"{request.data}: there is no such folder")
+    for preset in tomllib.loads(_FILE.read_text(encoding="utf-8"))["preset"]:
+        files = sorted(request.data.glob(preset["pattern"])) if request.data else []
+        if not files:
+            absent.append(
+                f"{preset['name']} is not there: {preset['address']}. Licence: "
+                f"{preset['licence']}. Save as {preset['pattern']} in the folder "
+                f"of --data: {preset['prepare']}."
+            )
+        for path in files:
+            beside = path.with_name("vehicle.toml")
+            vehicle: VehicleSource = beside if beside.exists() else preset["vehicle"]
+            wires = read_wires(vehicle)
+            for part in read_parts(path, parse_mapping(preset["mapping"]))[0]:
+                log = apply_wires(part, wires)
+                if "beta" in log.truth and log.time[-1] - log.time[0] >= SETTLED:
+                    records += _score(log, vehicle)
+                else:
+                    absent.append(f"{log.name}: without a true sideslip angle it is not scored.")
+    return records, absent
+
+
+def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
+    """Records of a drive: the filter, and the smoother, which knows one second more."""
+    facts = {"sensors": log.slow, "dt": log.record.dt, "present": log.record.present}
+    filter_ = call_quietly(make_estimator, _NAME, vehicle=make_vehicle(vehicle), **facts)
+    truth, records = log.truth["beta"], []
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log) & np.isfinite(truth)
+    for label, estimates in (
+        (_NAME, filter_.run(log)),
+        ("its smoother, 1 s", call_quietly(smooth, filter_, log)),
+    ):
+        place = estimates.names.index("beta")
+        error: Array = (estimates.x[:, place] - truth)[counts]
+        median, p95, worst = np.quantile(np.abs(error), (0.5, 0.95, 1.0)).tolist()
+        record = {"drive": log.name, "estimator": label, "n": len(error)}
+        honesty = compute_honesty(error, estimates.std[counts, place])
+        record |= {"median": median, "p95": p95, "worst": worst}
+        records.append(record | {c.key: v for c, v in zip(HONESTY, honesty, strict=True)})
+    return records
+
+
+def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -> None:
+    """Add rows and the table, and the instructions above the verdict."""
+    records, absent = results
+    for record in records:
+        numbers = {key: value for key, value in record.items() if key != "drive"}
+        suite.add_rows([numbers], scenario=record["drive"])
+    suite.warnings = [text.removesuffix(".") for text in absent]
+    if records:
+        note = "Absolute errors of the sideslip angle from 2 s on, driven forward."
+        suite.tables = [ResultTable("Recorded drives", _COLUMNS, records, note)]
+
+
+def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
+    """Say the medians over the drives, or that there is none."""
+    records, absent = results
+    if not records:
+        return format_verdict("No drive was read: the lines above say where to get each.")
+    scored = [record for record in records if record["estimator"] == _NAME]
+    median, p95 = (_DEG * float(np.median([r[key] for r in scored])) for key in ("median", "p95"))
+    return format_verdict(
+        f"{_NAME} errs {median:.2f} deg (95th percentile {p95:.2f}), medians over the drives: "
+        f"{len(scored)}.",
+        f"Not scored or not there: {len(absent)}; the lines above name each." if absent else "",
+    )
+
+
+STUDY = Study(
+    "logs",
+    "How far off is one setting on recorded drives?",
+    "`joint` without options, its car from the preset or from vehicle.toml beside the drive.",
+    (1, 1),
+    _measure,
+    _add_tables,
+    _compose_verdict,
+)
