@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FLOORS = ("envs", "estimators", "agents", "benchmarks")
 PLACE = re.compile(rf"`((?:{'|'.join((*FLOORS, 'tests', 'docs'))})/[\w/.-]*)`")
 NAME = re.compile(r"`sideslip((?:\.\w+)+)")
@@ -76,7 +76,7 @@ def test_readmes_example_runs(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_slope_finds_tyres_and_gains(tmp_path: Path) -> None:
     """The page's own lines: 17 and 23 kN/rad behind noise, and nearly the cost of LQR's gains."""
-    blocks = [code for _, _, code in FENCE.findall((ROOT / "docs" / "gradients.md").read_text())]
+    blocks = [code for _, _, code in FENCE.findall((ROOT / "docs" / "howto" / "gradients.md").read_text())]
     tyres, costs = run("\n".join(blocks), tmp_path / "empty", ROOT / "src").splitlines()[-2:]
     assert literal_eval(tyres) == pytest.approx([17e3, 23e3], rel=0.02)
     start, found, lqr = literal_eval(costs)
