@@ -38,7 +38,9 @@ def read_prose(path: Path) -> tuple[str, ...]:
     text = re.sub(r"^\s*(?:[-*]|\d+\.)\s", "\n", text, flags=re.MULTILINE)
     text = re.sub(r"^\|.*$", lambda row: "\n\n" + row[0].replace("|", "\n\n") + "\n\n", text,
                   flags=re.MULTILINE)  # fmt: skip
-    return tuple(" ".join(part.split()) for part in re.split(r"\n\s*\n", text) if part.strip(" -\n"))
+    return tuple(
+        " ".join(part.split()) for part in re.split(r"\n\s*\n", text) if part.strip(" -\n")
+    )
 
 
 def list_sentences(path: Path) -> list[str]:
@@ -62,7 +64,9 @@ def measure() -> dict[str, float]:
         "median-sentence": median(len(sentence.split()) for sentence in sentences),
         "long-sentences": sum(len(sentence.split()) > 25 for sentence in sentences),
         "crowded-sentences": sum(len(NUMBER.findall(sentence)) > 2 for sentence in sentences),
-        "banned-words": sum(len(BANNED.findall(part)) for path in PAGES for part in read_prose(path)),
+        "banned-words": sum(
+            len(BANNED.findall(part)) for path in PAGES for part in read_prose(path)
+        ),
     }
 
 
@@ -77,7 +81,8 @@ def test_a_fault_is_counted(tmp_path: Path) -> None:
     """Code, links and tables are no sentences; a long, a crowded and a banned one are."""
     page = tmp_path / "page.md"
     page.write_text(
-        "# A ladder\n\n    a ladder of code\n\n```python\nrungs = 1\n```\n\n| a cell | 5 |\n|---|---|\n\n"
+        "# A ladder\n\n    a ladder of code\n\n```python\nrungs = 1\n```\n\n"
+        + "| a cell | 5 |\n|---|---|\n\n"
         + "One of 3 or 4 [words](ladder.md), `rungs` and 5 more. "
         + f"It is a contest {'so ' * 25}long.\n\n- An item that ends\n"
     )
