@@ -29,8 +29,9 @@ def name_page(path: Path) -> str:
 
 @cache
 def read_prose(path: Path) -> tuple[str, ...]:
-    """Paragraphs, list items and cells of a page, without code, formulas and targets of links."""
+    """Paragraphs, items and cells of a page, without code, formulas, links' targets, made tables."""
     text = re.sub(r"\A---\n.*?\n---\n", "", path.read_text(), flags=re.DOTALL)
+    text = re.sub(r"^<!-- tables of .*?^<!-- end -->$", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(`{3,}|\$\$).*?^\1\s*?$", "\n", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(?: {4}|!\[|<!--|#).*$", "\n", text, flags=re.MULTILINE)
     text = re.sub(r"\{[\w-]+\}`[^`]*`|`[^`]*`|\$[^$]+\$", "code", text)
