@@ -1,5 +1,11 @@
-"""The block diagram and the sensors' timing, docs/_static/*.svg: `python docs/pictures.py`."""
+"""The block diagram and the sensors' timing, docs/_static/*.svg: `python docs/pictures.py`.
 
+`python docs/pictures.py films` drives each id for the gallery, docs/_static/film-*.gif.
+"""
+
+import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
@@ -145,7 +151,53 @@ def draw_timing(until: float = 0.45) -> str:
 
 
 PICTURES = {"blocks": draw_blocks, "timing": draw_timing}
+FILMS = {
+    "YawVision-v1": ["lqr", "joint", "--scenario", "small-car-double-lane-change"],
+    "YawVisionUneven-v1": ["lqr", "joint", "--scenario", "small-car-sine-with-dwell"],
+    "YawGps-v1": ["lqr", "joint", "--scenario", "small-car-random"],
+    "YawFusion-v1": ["lqr", "joint", "--scenario", "road-slalom", "--vehicle", "passenger-car"],
+    "AfsYawFusion-v1": ["adaptive-lqr", "joint", "--scenario", "limit-friction-split"],
+    "LinearYawVision-v0": ["feedforward", "exact-kf"],
+    "LinearYawGps-v0": ["feedforward", "exact-kf"],
+    "Highway-v0": ["lqr", "exact-kf", "--seed", "16"],
+    "Outside-v0": ["lqr", "exact-kf"],
+}
+"""Agent, estimator and further options by id."""
+FILM_SECONDS, FILM_STARTS = 3.0, {"Highway-v0": 2.0}
+_FILM_SIZE, _FILM_COLOURS = (560, 315), 40
+
+
+def write_film(name: str) -> None:
+    """Drive an id and write three seconds of its film.
+
+    Args:
+        name: Key of `FILMS`.
+    """
+    from PIL import Image, ImageSequence
+
+    agent, estimator, *more = FILMS[name]
+    options = ["--agent", agent, "--estimator", estimator, "--beside", "none", *more]
+    with tempfile.TemporaryDirectory() as folder:
+        whole = f"{folder}/whole.gif"
+        command = [sys.executable, "-m", "sideslip", "run", f"sideslip/{name}", *options]
+        subprocess.run([*command, "--video", whole], check=True)
+        with Image.open(whole) as film:
+            step = film.info["duration"]  # ms
+            first = round(1e3 * FILM_STARTS.get(name, 1.0) / step)
+            last = first + round(1e3 * FILM_SECONDS / step)
+            frames = [
+                frame.convert("RGB").resize(_FILM_SIZE).quantize(_FILM_COLOURS, dither=0)
+                for i, frame in enumerate(ImageSequence.Iterator(film))
+                if first <= i < last and (i - first) % 2 == 0
+            ]
+    file = FOLDER / f"film-{name}.gif"
+    frames[0].save(
+        file, save_all=True, append_images=frames[1:], duration=2 * step, loop=0, optimize=True
+    )
+
 
 if __name__ == "__main__":
     for name, draw in PICTURES.items():
         (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")
+    for name in FILMS if "films" in sys.argv else ():
+        write_film(name)
