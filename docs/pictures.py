@@ -157,8 +157,8 @@ FILMS = {
     "YawGps-v1": ["lqr", "joint", "--scenario", "small-car-random"],
     "YawFusion-v1": ["lqr", "joint", "--scenario", "road-slalom", "--vehicle", "passenger-car"],
     "AfsYawFusion-v1": ["adaptive-lqr", "joint", "--scenario", "limit-friction-split"],
-    "LinearYawVision-v0": ["feedforward", "exact-kf"],
-    "LinearYawGps-v0": ["feedforward", "exact-kf"],
+    "LinearYawVision-v0": ["none", "exact-kf"],
+    "LinearYawGps-v0": ["none", "exact-kf"],
     "Highway-v0": ["lqr", "exact-kf", "--seed", "16"],
     "Outside-v0": ["lqr", "exact-kf"],
 }

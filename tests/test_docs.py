@@ -3,6 +3,7 @@
 import os
 import re
 import runpy
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+
+from sideslip.benchmarks.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -153,6 +157,24 @@ def test_a_page_names_every_public_name(module: str) -> None:
     text = "\n".join(path.read_text() for path in DOCUMENTS)
     for name in set(import_module(f"sideslip{module}").__all__) - {"__version__"}:
         assert re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), f"{name} stands on no page"
+
+
+COMMAND = re.compile(r"^ {4}(?:\S+=\S+ )*sideslip ((?:.*\\\n)*.*)$", re.MULTILINE)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_and_their_options_exist(document: Path) -> None:
+    for line in COMMAND.findall(document.read_text()):
+        command: Any = typer.main.get_command(app)
+        words = shlex.split(line.replace("\\\n", " ").replace("...", ""), comments=True)
+        while words and hasattr(command, "commands"):
+            if words[0].startswith("-"):
+                break
+            assert words[0] in command.commands, f"sideslip {line}"
+            command = command.commands[words.pop(0)]
+        known = {name for option in command.params for name in option.opts}
+        options = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert options <= known | {"--help"}, f"sideslip {line}: {options - known}"
 
 
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))

