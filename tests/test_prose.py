@@ -77,6 +77,12 @@ def test_numbers_on_file_only_fall(name: str) -> None:
     assert now <= limit, f"{name} was {limit} and is {now}: CONVENTIONS.md, Prose, says what to do"
 
 
+@pytest.mark.parametrize("page", sorted((ROOT / "docs/explanation").glob("*.md")), ids=name_page)
+def test_an_explanation_begins_with_a_figure(page: Path) -> None:
+    head = page.read_text().split("\n## ")[0]
+    assert "{image}" in head or "plt.subplots" in head
+
+
 def test_a_fault_is_counted(tmp_path: Path) -> None:
     """Code, links and tables are no sentences; a long, a crowded and a banned one are."""
     page = tmp_path / "page.md"
