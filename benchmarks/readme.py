@@ -1,4 +1,4 @@
-"""The tables of results in README.md and docs/benchmark.md, and README's sentences with numbers.
+"""The tables of results in README.md and docs/results/benchmark.md, and README's sentences.
 
 `python -m sideslip.benchmarks.readme` drives README's entries in every contest with steering, and
 writes the rows to docs/first.json and both tables. The columns of transfer are those of
@@ -35,7 +35,7 @@ from .control.tasks import (
 from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 
-README, PAGE = Path("README.md"), Path("docs/benchmark.md")
+README, PAGE = Path("README.md"), Path("docs/results/benchmark.md")
 ROWS, TRANSFER = Path("docs/first.json"), Path("docs/procedures.json")
 METRICS = ("cost_vs_nominal", "failure_rate", "score")
 SPEEDS = dict(zip(TITLES, ("18-28 km/h", "60-90 km/h", "70-110 km/h"), strict=True))

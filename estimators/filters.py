@@ -162,6 +162,6 @@ FILTERS: dict[str, FilterDefinition] = {
         gains="covariance",
         disturbances="forces",
         options=_JOINT,
-        source="docs/estimators.md, beyond the papers",
+        source="docs/explanation/estimation.md, beyond the papers",
     ),
 }

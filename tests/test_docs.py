@@ -3,6 +3,7 @@
 import os
 import re
 import runpy
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+
+from sideslip.benchmarks.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FLOORS = ("envs", "estimators", "agents", "benchmarks")
 PLACE = re.compile(rf"`((?:{'|'.join((*FLOORS, 'tests', 'docs'))})/[\w/.-]*)`")
 NAME = re.compile(r"`sideslip((?:\.\w+)+)")
@@ -76,7 +80,9 @@ def test_readmes_example_runs(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_slope_finds_tyres_and_gains(tmp_path: Path) -> None:
     """The page's own lines: 17 and 23 kN/rad behind noise, and nearly the cost of LQR's gains."""
-    blocks = [code for _, _, code in FENCE.findall((ROOT / "docs" / "gradients.md").read_text())]
+    blocks = [
+        code for _, _, code in FENCE.findall((ROOT / "docs" / "howto" / "gradients.md").read_text())
+    ]
     tyres, costs = run("\n".join(blocks), tmp_path / "empty", ROOT / "src").splitlines()[-2:]
     assert literal_eval(tyres) == pytest.approx([17e3, 23e3], rel=0.02)
     start, found, lqr = literal_eval(costs)
@@ -138,3 +144,55 @@ def test_a_path_is_drawn_as_the_code_goes(name: str) -> None:
         called |= paths["find_names"](step.file, step.function)
     picture = (ROOT / "docs" / "_static" / f"path-{name}.svg").read_text()
     assert picture == paths["draw_path"](name), "run python docs/paths.py"
+
+
+@pytest.mark.parametrize("name", ["blocks", "timing"])
+def test_a_picture_is_what_its_script_draws(name: str) -> None:
+    draw = runpy.run_path(str(ROOT / "docs" / "pictures.py"))["PICTURES"][name]
+    assert (ROOT / f"docs/_static/{name}.svg").read_text() == draw(), "run python docs/pictures.py"
+
+
+@pytest.mark.parametrize("module", ["", ".envs", ".estimators", ".agents"])
+def test_a_page_names_every_public_name(module: str) -> None:
+    text = "\n".join(path.read_text() for path in DOCUMENTS)
+    for name in set(import_module(f"sideslip{module}").__all__) - {"__version__"}:
+        assert re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), f"{name} stands on no page"
+
+
+COMMAND = re.compile(r"^ {4}(?:\S+=\S+ )*sideslip ((?:.*\\\n)*.*)$", re.MULTILINE)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_and_their_options_exist(document: Path) -> None:
+    for line in COMMAND.findall(document.read_text()):
+        command: Any = typer.main.get_command(app)
+        words = shlex.split(line.replace("\\\n", " ").replace("...", ""), comments=True)
+        while words and hasattr(command, "commands"):
+            if words[0].startswith("-"):
+                break
+            assert words[0] in command.commands, f"sideslip {line}"
+            command = command.commands[words.pop(0)]
+        known = {name for option in command.params for name in option.opts}
+        options = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert options <= known | {"--help"}, f"sideslip {line}: {options - known}"
+
+
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+CELL = re.compile(r"^```\{code-cell\}\n(?::tags: \[(.*?)\]\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_the_check_of_an_exercise_fails_without_an_answer(tutorial: Path, tmp_path: Path) -> None:
+    """The documentation's build runs them with the hidden solution."""
+    cells = CELL.findall(tutorial.read_text())
+    tags = [set(tag.split(", ")) for tag, _ in cells]
+    *before, check = [
+        code for tag, (_, code) in zip(tags, cells, strict=True) if "solution" not in tag
+    ]
+    assert sum("solution" in tag for tag in tags) == 1 and "check" in tags[-1]
+    code = (
+        "\n".join(before)
+        + f"\ntry:\n    exec({check!r})\nexcept AssertionError:\n    print('refused')"
+    )
+    assert run(code, tmp_path / "empty", ROOT / "src").splitlines()[-1] == "refused"

@@ -366,7 +366,7 @@ def kutta3(
     motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
     car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
 ) -> Motion:  # fmt: skip
-    """Integrate the plant over h seconds by Kutta's third-order rule (errors: docs/physics.md).
+    """Integrate the plant over h seconds by Kutta's third-order rule.
 
     Args:
         motion: `Motion` at the start.

@@ -1,4 +1,4 @@
-"""The tables and numbers of README and docs/benchmark.md are those of their files."""
+"""The tables and numbers of README and docs/results/benchmark.md are those of their files."""
 
 import re
 from dataclasses import replace

@@ -32,7 +32,7 @@ from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.slow import SLOW
 from tests.agents.live.both_ends import camera, encode, inertial
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "live.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "howto" / "live.md"
 NUMBER = st.floats(-LIMIT, LIMIT)
 SOUND = inertial(7).data
 
