@@ -47,8 +47,8 @@ class SearchNumber(NamedTuple):
     steering: bool = False  # it means something only where the action steers
 
 
-_TIME = SearchNumber("disturbance_time", 0.3, 0.03, 3.0)  # s
-_GRIP = SearchNumber("grip", GRIP, 0.3, 1.0)
+_TIME = SearchNumber("disturbance_time", 0.3, 0.03, 30.0)  # s
+_GRIP = SearchNumber("grip", GRIP, 0.1, 1.0)
 _STEER = SearchNumber("steer_weight", STEER_WEIGHT, 0.3, 1e3, steering=True)
 _LQG = (_TIME, _GRIP, _STEER)
 _NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _TIME, _GRIP, _STEER._replace(start=10.0))  # s
