@@ -21,8 +21,8 @@ sideslip/YawVision-v1
 sideslip/YawVisionUneven-v0
 sideslip/YawVisionUneven-v1
 
-`rollout`, `score`, `make_agent`, `make_estimator`, `register_agent`, `register_estimator` and the
-subpackages are loaded when first asked for.
+`Stream`, `estimate`, `rollout`, `score`, `make_agent`, `make_estimator`, `register_agent`,
+`register_estimator` and the subpackages are loaded when first asked for.
 """
 
 from importlib import import_module
@@ -35,10 +35,14 @@ if TYPE_CHECKING:
     from .agents import make_agent, register_agent
     from .agents.rollout import rollout
     from .estimators import make_estimator, register_estimator
+    from .estimators.frame import estimate
+    from .estimators.stream import Stream
 
 __version__ = "0.2.0"
 __all__ = [
+    "Stream",
     "__version__",
+    "estimate",
     "make_agent",
     "make_estimator",
     "register_agent",
@@ -48,6 +52,8 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Stream": ".estimators.stream",
+    "estimate": ".estimators.frame",
     "make_agent": ".agents",
     "make_estimator": ".estimators",
     "register_agent": ".agents",

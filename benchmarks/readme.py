@@ -76,7 +76,7 @@ def _measure_entries(
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, EPISODES)
     results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
-    _check_driven(results)
+    check_driven(results)
     suite = Suite("control", "", "")
     for tier in TITLES:
         for standing in rank_entries(results, tier):
@@ -84,8 +84,12 @@ def _measure_entries(
     return [row for row in suite.rows if row.metric in METRICS]
 
 
-def _check_driven(results: Results) -> None:
-    """Raise ValueError for an entry that could not drive."""
+def check_driven(results: Results) -> None:
+    """Raise ValueError for an entry that could not drive.
+
+    Args:
+        results: Episodes.
+    """
     for (task, entry), result in results.items():
         if result.error:
             raise ValueError(f"{entry.label} in {task.name}: {result.error}")
@@ -139,7 +143,7 @@ def make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
             line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)
     tiers = (f"{tier}, {SPEEDS[tier]}" for tier in TITLES)
-    return _format_table(lines, [*tiers, *_TRANSFER])
+    return format_table(lines, [*tiers, *_TRANSFER])
 
 
 def make_task_table(rows: Sequence[ResultRow]) -> str:
@@ -157,10 +161,19 @@ def make_task_table(rows: Sequence[ResultRow]) -> str:
         [task.scenario, *(cells.format(task.name, pairs, True) for pairs in ENTRIES.values())]
         for task in tasks
     ]
-    return _format_table(lines, list(ENTRIES))
+    return format_table(lines, list(ENTRIES))
 
 
-def _format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
+def format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
+    """Format a table whose first column has no head.
+
+    Args:
+        lines: Cells.
+        heads: Heads of the other columns.
+
+    Returns:
+        Markdown.
+    """
     body = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([f"| | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|", *body])
 

@@ -29,13 +29,13 @@ from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control.tasks import TaskMeasurement, read_tasks
 from sideslip.benchmarks.entrants.baselines import read_baselines
 from sideslip.benchmarks.harness.results import ResultRow, read_json
-from sideslip.benchmarks.recorded.wires import SignalCalibration, read_wires
 from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, WIRE_TABLES, Vehicle, make_vehicle
 from sideslip.estimators import EstimateObservation
+from sideslip.estimators.wires import SignalCalibration, read_wires
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 OLD = Path(__file__).parent / "files/old"

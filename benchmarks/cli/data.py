@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
     from ...envs.sensors.camera.pictures import Film
     from ...envs.sensors.camera.pinhole import Pinhole
-    from ..recorded.wires import SignalCalibration
+    from ...estimators.wires import SignalCalibration
 
 _MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
 _MAX_PIXELS = 2**26  # of a picture; a small file may hold many more
@@ -36,7 +36,7 @@ _console = Console(soft_wrap=True, highlight=False)
 
 def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "SignalCalibration":
     """Read the calibration of signals from the vehicle's file, and replace what is given."""
-    from ..recorded.wires import read_wires
+    from ...estimators.wires import read_wires
 
     known, degrees = read_wires(command.vehicle), command.steering_offset
     offset = None if degrees is None else math.radians(degrees)
@@ -150,8 +150,8 @@ class _Identify:
     steering_offset: float | None
 
     def run(self) -> None:
+        from ...estimators.wires import write_vehicle
         from ..recorded.replay import identify_file
-        from ..recorded.wires import write_vehicle
 
         console, stated = Console(), (self.vehicle, self.mapping or ())
         wires = _read_wires(self)

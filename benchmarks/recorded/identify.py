@@ -10,6 +10,7 @@ import numpy as np
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
+from ...estimators.wires import NOISES, SignalCalibration, apply_wires
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import margin_of_error
 from ..harness.verdict import format_verdict
@@ -17,7 +18,6 @@ from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fi
 from .emulate import compute_ground_speed, compute_heading, find_moving
 from .quality import MIN_CORRELATION, estimate_steering_gain, find_saturated, find_swapped
 from .suite import GYRO_ONLY
-from .wires import NOISES, SignalCalibration, apply_wires
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6

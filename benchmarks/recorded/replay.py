@@ -8,12 +8,12 @@ from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import VehicleSource, make_vehicle
+from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED
 from ..harness.results import Suite
 from .identify import IdentificationResult, identify, make_suite
 from .quality import TRUTH, make_remarks, make_warnings
 from .suite import corners, replay
-from .wires import SignalCalibration, apply_wires
 
 _FITTED, _NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
 _FACTOR = 0.7  # of the fitted tyres, where no vehicle is named

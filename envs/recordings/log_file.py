@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +13,12 @@ from ..sensors.link import SlowSensor
 from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
 from ..ticks import TICK
 from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
-from .tables import read_quantities
+from .tables import name_log, read_quantities
 
-_NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
+if TYPE_CHECKING:
+    from .tables import LogSource
+
+NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
 _SAMPLED = {  # column of the record: quantity of the log
     "gyro": "yaw_rate",
     **{name: name for name in ("accel_y", "accel_x", "roll_rate", "wheel_left", "wheel_right")},
@@ -27,19 +31,18 @@ _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
-def _make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
+def _make_log(values: dict[str, Array], name: str, dt: float | None = None) -> Log:
     """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
 
     Its first tick is that of the first row, 0 where time starts below 0: ticks are never negative.
     A logged input (steering, torque, command) acts from its row to the next, so it stands one row
-    later in the record. The name is the file's with its folder's.
+    later in the record.
     """
     dt = find_step(values["time"]) if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
-    fast, present = _make_fast_rows(values)
-    packets, slow = _make_packets(values, first, dt)
+    fast, present = make_fast_rows(values)
+    packets, slow = make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
-    name = f"{source.resolve().parent.name}/{source.stem}"
     return Log(record, slow, _compute_truth(values), name)
 
 
@@ -103,8 +106,15 @@ def find_step(time: Array) -> float:
     return dt
 
 
-def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
-    """Make the record's fast rows and the names of their columns that carry something."""
+def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
+    """Make the record's fast rows and the names of their columns that carry something.
+
+    Args:
+        values: Quantities in SI units, shape (n,) each.
+
+    Returns:
+        Fast rows, shape (n, FAST_WIDTH), and the names.
+    """
     fast = np.zeros((len(values["time"]), FAST_WIDTH))
     if not {"wheel_left", "wheel_right"} <= values.keys():
         values = values | {"wheel_left": values["speed_x"], "wheel_right": values["speed_x"]}
@@ -121,10 +131,19 @@ def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     return fast, tuple(name for name in Fast._fields if name in present)
 
 
-def _make_packets(
+def make_packets(
     values: dict[str, Array], first: int, dt: float
 ) -> tuple[Array, dict[str, SlowSensor]]:
-    """Make the packets of all slow sensors and their clocks."""
+    """Make the packets of all slow sensors and their clocks.
+
+    Args:
+        values: Quantities in SI units, shape (n,) each; NaN where a slow sensor has no sample.
+        first: Tick of the first row.
+        dt: Tick (s).
+
+    Returns:
+        Packets, shape (count, PACKET_WIDTH), and slow sensors by name.
+    """
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     for sensor, names in SENSORS.items():
         if not np.isfinite(values.get(names[0], np.nan)).any():
@@ -159,18 +178,18 @@ def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
 
 
 WARNING_PREFIX = "WARNING: "  # begins a remark that concerns the result
-_MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
+MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
 _MIN_PART = 2.0  # s, of a part
 _SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
 
 def read_parts(
-    path: str | Path,
+    source: "LogSource",
     mapping: Mapping[str, str] | None = None,
     start: float = 0.0,
     end: float | None = None,
 ) -> tuple[list[Log], list[str]]:
-    """Read a recorded drive from a table: CSV, Parquet, MATLAB or MDF (needs the extra `report`).
+    """Read a recorded drive from a table (needs the extra `report`).
 
     Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
     between their samples. One is captured and arrives in its row, and the sensor's period is the
@@ -180,13 +199,14 @@ def read_parts(
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
-    irregular places is refused. Holes up to `_MAX_HOLE` s are filled by interpolation on an even
+    irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
     clock; longer ones, and a clock that is set back by more, divide the log, and parts under
     `_MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
     sample lacks the sensor.
 
     Args:
-        path: Table with columns named as in `tables.COLUMNS`; unknown ones are ignored.
+        source: Table, or its file (CSV, Parquet, MATLAB, MDF). Columns are named as in
+            `tables.COLUMNS`; unknown ones are ignored.
         mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
             `tables.parse_mapping` makes it.
         start: Time after the first row from which it is read (s).
@@ -199,8 +219,10 @@ def read_parts(
         ValueError: For a file that is no table, a missing column, a value that is no number, and
             where no part is left. Rows in messages count from 1 below the header.
     """
-    source = Path(path)
-    values, remarks = read_quantities(source, mapping or {}, _NEEDED, None)
+    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
+    label = title = name_log(source)
+    if isinstance(source, str | Path):  # the file's with its folder's
+        title = f"{Path(source).resolve().parent.name}/{Path(source).stem}"
     gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
     known = ~np.any(list(gaps.values()), axis=0)
     elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
@@ -223,9 +245,9 @@ def read_parts(
         if len(pieces) > 1:
             dt = find_step(max((piece["time"] for piece in pieces), key=len))
             pieces = [_resample_evenly(piece, dt, _SAME_STEP) for piece in pieces]
-        logs = [_make_log(piece, source, dt) for piece in pieces]
+        logs = [_make_log(piece, title, dt) for piece in pieces]
     except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+        raise ValueError(f"{label}: {error}") from None
     remarks += [f"{count} {text}." for count, text in [*done, (count, drop_reason)] if count]
     sensors = set[str]().union(*(log.slow for log in logs))
     for i, log in enumerate(logs if len(logs) > 1 else ()):
@@ -241,8 +263,8 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     if not (steps > 0.0).any():
         raise ValueError(f"time stands still at row 2: {time[1]:.12g} s after {time[0]:.12g} s")
     typical = float(np.median(steps[steps > 0.0]))
-    is_backward = steps < -_MAX_HOLE
-    ends = np.flatnonzero(is_backward | (steps > _MAX_HOLE + typical)) + 1
+    is_backward = steps < -MAX_HOLE
+    ends = np.flatnonzero(is_backward | (steps > MAX_HOLE + typical)) + 1
     for rows in np.split(np.arange(len(time)), ends):
         newest = np.maximum.accumulate(time[rows])
         is_later = np.append(True, time[rows][1:] > newest[:-1] + 1e-3 * typical)
@@ -257,13 +279,13 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
         rows_text = f"{dropped} of {len(time)} rows: have its stamps lost digits?"
         raise ValueError(f"time stands still or steps back in {rows_text}")
     if not pieces:
-        hole = f"a hole of {_MAX_HOLE:g} s"
+        hole = f"a hole of {MAX_HOLE:g} s"
         raise ValueError(f"no part of the log lasts {_MIN_PART:g} s without {hole}")
     n_backward = int(np.count_nonzero(is_backward))
     return pieces, [
         (dropped, "rows whose time steps back or stands still were dropped"),
         (n_backward, "times the clock was set back: the log is divided there"),
-        (holes, f"holes up to {_MAX_HOLE:g} s were filled by interpolation"),
+        (holes, f"holes up to {MAX_HOLE:g} s were filled by interpolation"),
         (len(pieces) if len(pieces) > 1 else 0, "parts, between which rows are missing"),
         (short, f"parts under {_MIN_PART:g} s were left out"),
     ]

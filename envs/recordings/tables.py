@@ -19,6 +19,9 @@ from .dialect import KINDS, find_samples, find_unit, read_text
 if TYPE_CHECKING:
     import pandas as pd
 
+    LogSource = str | Path | pd.DataFrame
+    """File of a recorded drive, or its table in memory."""
+
 
 class _LogTable(NamedTuple):
     """A file's columns as they stand there."""
@@ -147,14 +150,36 @@ def _make_column_name(quantity: str) -> str:
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
-def _parse_column_name(name: str) -> tuple[str, float]:
-    """Parse a name in lower case to quantity and factor to SI; ValueError if it is none of ours."""
+def parse_column_name(name: str) -> tuple[str, float]:
+    """Parse a column's name.
+
+    Args:
+        name: Name in lower case, unit included.
+
+    Returns:
+        Quantity and factor to SI units.
+
+    Raises:
+        ValueError: The name is none of ours.
+    """
     if name in _NAMES:
         return _NAMES[name]
     known = [_make_column_name(q) for q in COLUMNS]
     if near := next((q for q in (name, name.rpartition("_")[0]) if q in COLUMNS), None):
         known = [f"{near}_{u}" for u in COLUMNS[near]]
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
+
+
+def find_offset(name: str) -> float:
+    """Find what is added to a column's values in SI units.
+
+    Args:
+        name: Name in lower case, unit included.
+
+    Returns:
+        pi / 2 for a course from north (rad), 0 for all others.
+    """
+    return np.pi / 2.0 if name.startswith("course_degnorth") else 0.0
 
 
 def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
@@ -176,22 +201,25 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
         if name in mapping:
             raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
-        _parse_column_name(name)
+        parse_column_name(name)
         mapping[name] = column
     return mapping
 
 
 def read_quantities(
-    path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
+    source: "LogSource",
+    mapping: Mapping[str, str],
+    needed: Sequence[str],
+    gaps: Collection[str] | None,
 ) -> tuple[dict[str, Array], list[str]]:
-    """Read the file's known quantities in SI units, and describe how they were read.
+    """Read a log's known quantities in SI units, and describe how they were read.
 
     An empty column counts as absent. A file that `_read_table` refuses raises its errors. Rows in
     messages count from 1 below the header.
 
     Args:
-        path: Path of the table.
-        mapping: Our column names, unit included, to the file's; other columns are ignored.
+        source: Path of the table, or the table itself.
+        mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
         gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
             shuffled rows are sorted.
@@ -204,9 +232,13 @@ def read_quantities(
             and fewer than two rows.
     """
     wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
-    table = _read_table(
-        path, lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
-    )
+    if isinstance(source, str | Path):
+        table = _read_table(
+            Path(source), lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
+        )
+    else:
+        names = [str(name).strip() for name in source.columns]
+        table = _LogTable(source.set_axis(names, axis=1), [""] * len(names), names, [])
     remarks = [*table.remarks]
     try:
         columns = _find_columns(table, mapping, remarks)
@@ -231,8 +263,20 @@ def read_quantities(
         if gaps is not None:
             _check_complete(values, [name for name in values if name not in gaps])
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{name_log(source)}: {error}") from None
     return values, remarks
+
+
+def name_log(source: "LogSource") -> str:
+    """Name a log in messages.
+
+    Args:
+        source: Path of the table, or the table itself.
+
+    Returns:
+        The path, or "the frame".
+    """
+    return str(source) if isinstance(source, str | Path) else "the frame"
 
 
 def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
@@ -261,7 +305,7 @@ def _find_columns(
             raise ValueError(
                 f"no column {column!r} for {name}; the log has {join_names(table.names)}"
             )
-        quantity = _parse_column_name(name)[0]
+        quantity = parse_column_name(name)[0]
         if quantity in quantities:
             raise ValueError(f"{quantity} is mapped twice")
         quantities.add(quantity)
@@ -270,7 +314,7 @@ def _find_columns(
         match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = _parse_column_name(name)[0] if name else ""
+            quantity = parse_column_name(name)[0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -318,15 +362,15 @@ def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str])
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    quantity, factor = _parse_column_name(name)
+    quantity, factor = parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:
         for unit, scale in COLUMNS["time"].items():
             if 3e8 < values[0] * scale < 4e9:
                 factor = scale
                 remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
     values *= factor
-    if name.startswith("course_degnorth"):
-        values += np.pi / 2.0  # the course towards north
+    if offset := find_offset(name):
+        values += offset
     is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
     if (bad := is_none | (np.abs(values) > _LARGEST)).any():
         row = int(np.argmax(bad))

@@ -96,7 +96,7 @@ CASES = [
          ("--gyro-bias 0.6", "settings.gyro_bias_degps", 0.6)),
     *_of("identify log.csv", "benchmarks.recorded.replay.identify_file", *LOGGED,
          ("--tyres fiala", "tyres", "fiala")),
-    *_of("identify log.csv", "benchmarks.recorded.wires.write_vehicle",
+    *_of("identify log.csv", "estimators.wires.write_vehicle",
          ("--out car.toml", "path", Path("car.toml"))),
     *_of("live exact-kf --port 0", f"{CLI}.live.make_driver",
          ("--vehicle coms", "setup.options.vehicle", "coms"),

@@ -18,9 +18,9 @@ from sideslip.benchmarks.recorded.identify import (
     make_suite,
 )
 from sideslip.benchmarks.recorded.quality import find_saturated, find_swapped, make_warnings
-from sideslip.benchmarks.recorded.wires import SignalCalibration
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR
+from sideslip.estimators.wires import SignalCalibration
 
 from .simulated import drive
 

@@ -29,9 +29,9 @@ from sideslip.benchmarks.recorded.identify import (
 )
 from sideslip.benchmarks.recorded.quality import find_saturated
 from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
-from sideslip.benchmarks.recorded.wires import SignalCalibration, apply_wires
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
+from sideslip.estimators.wires import SignalCalibration, apply_wires
 
 from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, steering_trace, without
 from .simulated import as_table

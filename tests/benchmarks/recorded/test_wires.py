@@ -10,14 +10,14 @@ from typer.testing import CliRunner
 from sideslip.benchmarks.cli.data import _parse_estimator_options
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.recorded.replay import replay_file
-from sideslip.benchmarks.recorded.wires import (
+from sideslip.envs.record import FAST, PACKET
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
+from sideslip.estimators.wires import (
     SignalCalibration,
     apply_wires,
     read_wires,
     write_vehicle,
 )
-from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 
 from .simulated import as_table, drive
 from .slalom import columns, saved

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from sideslip.envs.record import Log
-from sideslip.envs.recordings.log_file import _GAPS, _NEEDED, _make_log
+from sideslip.envs.recordings.log_file import _GAPS, NEEDED, _make_log
 from sideslip.envs.recordings.tables import read_quantities
 
 
@@ -35,8 +35,8 @@ def saved(table: pd.DataFrame, folder: Path, name: str = "drive.csv", sep: str =
 
 def read_log(path: Path, mapping: Mapping[str, str] | None = None) -> Log:
     """The drive of a table that `read_parts` would leave whole."""
-    values, _ = read_quantities(path, mapping or {}, _NEEDED, _GAPS)
+    values, _ = read_quantities(path, mapping or {}, NEEDED, _GAPS)
     try:
-        return _make_log(values, path)
+        return _make_log(values, f"{path.resolve().parent.name}/{path.stem}")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

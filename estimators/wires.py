@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.io import is_document, read_document, write_document
-from ...envs.record import FAST, PACKET, Log
-from ...envs.sensors.slow import SLOW_NAMES
-from ...envs.validation import check_choice, is_finite, short_repr
-from ...envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
-from ...estimators.design.options import FAST_CHANNELS
+from ..envs.io import is_document, read_document, write_document
+from ..envs.record import FAST, PACKET, Log
+from ..envs.sensors.slow import SLOW_NAMES
+from ..envs.validation import check_choice, is_finite, short_repr
+from ..envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
+from .design.options import FAST_CHANNELS
 
 _CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)  # that may be late
 _MAX_LATENCY = 5.0  # s

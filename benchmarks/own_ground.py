@@ -1,0 +1,221 @@
+"""Each of the five papers' systems on its own ground, beside the benchmark's common score.
+
+`python -m sideslip.benchmarks.own_ground` drives them in their papers' simulations and in the small
+car's contests, and writes docs/own_ground.json and the table in docs/PAPERS.md.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from ..agents.baselines import FILTER
+from ..envs.record import Array
+from .control.entries import JOINT, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
+from .control.run import NUMBERS, measure
+from .control.score import rank_entries
+from .control.tasks import (
+    NOMINAL,
+    STEERING,
+    TIERS,
+    ControlTask,
+    list_scored_tasks,
+    make_salt,
+    make_salted_seeds,
+    make_task_seeds,
+)
+from .harness.parallel import report_user_errors
+from .harness.results import ResultRow, Suite, read_json, write_json, write_text
+from .harness.stats import interval, ratio_of_roots
+from .papers import dakf_stability, double_layer, dual_rate, tie_vision_control, uneven_delay
+from .papers.ledger import PaperFilter
+from .papers.manoeuvres import EstimationSimulation
+from .readme import EPISODES, check_driven, format_table, replace_table
+
+PAGE, ROWS = Path("docs/PAPERS.md"), Path("docs/own_ground.json")
+_TIER = next(iter(TIERS))  # of the papers' car
+_HEADS = ("the paper's", "ours", "the paper's / %", "ours / %", "its cost / %", "our cost / %")
+_RATIO, _COST = "ratio", "cost_vs_nominal"
+_RECOMMENDED = PaperFilter(JOINT, JOINT)
+_INFORMED = PaperFilter("informed", FILTER, vehicle="true")
+"""The filter against which those of papers without a controller stand: it knows the true car."""
+
+
+@dataclass(frozen=True)
+class System:
+    """A paper's system, where it was shown and what counts there.
+
+    Attributes:
+        paper: Short name of the paper.
+        entry: Its controller on its filter; LQR on the filter of a paper without a controller.
+        ours: What this project recommends instead.
+        task: The paper's simulation, with its sensors and its reference.
+        metric: Metric of an episode, or estimate of the filter, whose root mean square counts.
+        criterion: The metric in words.
+        simulations: Drives of a paper without a controller, with its filters.
+        label: The paper's filter among them.
+        contestant: Who drives the contests where its own filter takes no lost or uneven frames.
+    """
+
+    paper: str
+    entry: Entry
+    ours: Entry
+    task: ControlTask
+    metric: str
+    criterion: str
+    simulations: Sequence[EstimationSimulation] = ()
+    label: str = ""
+    contestant: Entry | None = None
+
+    @property
+    def rival(self) -> Entry:
+        """LQG with the same sensors, as the benchmark tuned it."""
+        sensor = "camera" if "Vision" in self.task.env_id else "gps"
+        return Entry(REFERENCE_CONTROLLER, f"{FILTER}, {sensor}")
+
+    @property
+    def scenario(self) -> str:
+        """Name of its rows."""
+        return f"{self.task.scenario}, {self.criterion}"
+
+    def measure(self, seeds: Sequence[int], jobs: int | None) -> tuple[Array, Array, Array]:
+        """Measure the paper's system, ours and the rival on the same seeds.
+
+        Args:
+            seeds: Seeds of the noise.
+            jobs: Processes.
+
+        Returns:
+            Root mean squares, shape (n,) each.
+        """
+        entries = (self.entry, self.ours, self.rival)
+        if self.metric in NUMBERS:
+            driven = measure([(self.task, entry) for entry in entries], seeds, jobs=jobs)
+            own, ours, rival = (driven[self.task, entry][self.metric] for entry in entries)
+            return own, ours, rival
+        (drives,) = (x for x in self.simulations if x.name == self.task.scenario)
+        paper_filters = [x for x in drives.filters if x.label == self.label]
+        filters = (*paper_filters, _RECOMMENDED, _INFORMED)
+        numbers = replace(drives, filters=filters).measure(tuple(seeds)).numbers
+        own, ours, rival = (numbers[x.label, self.metric] for x in filters)
+        return own, ours, rival
+
+
+def _make_task(sensors: str, scenario: str, reference: str = "", **changes: object) -> ControlTask:
+    return ControlTask("", f"sideslip/{sensors}-v0", "coms", reference, scenario, changes=changes)
+
+
+_SLIP, _OURS = "error of the sideslip angle", Entry("adaptive-lqr", JOINT)
+_FOLLOWING = (
+    dakf_stability.PAPER,
+    Entry("model-following", dakf_stability.DAKF),
+    _OURS,
+    _make_task("YawGps", dakf_stability.FIG7, steering=True, control_period=1),
+)
+_FIG5, _FIG9, _FIG4 = uneven_delay.FIG5, double_layer.FIG9, dual_rate.FIG4
+_OFFSET = "error of the lateral offset"
+_FILTERS = (
+    (uneven_delay, "uneven-delay-kf", "YawVision", _FIG5, uneven_delay.PROPOSED, ("y_l", _OFFSET)),
+    (double_layer, "double-layer", "YawGps", _FIG9, double_layer.PROPOSED, ("beta", _SLIP)),
+    (dual_rate, "dual-rate", "YawGps", _FIG4, dual_rate.PSEUDO, ("beta", _SLIP)),
+)
+SYSTEMS = (
+    System(
+        "tie-vision",
+        Entry("two-dof", "multirate-residual-kf"),
+        _OURS,
+        _make_task("YawVision", tie_vision_control.FIG8, "zero-slip", control_period=1),
+        "rms_slip",
+        "sideslip angle",
+        contestant=Entry("two-dof", REFERENCE_FILTER),
+    ),
+    System(*_FOLLOWING, "rms_slip_error", _SLIP),
+    System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
+    *(
+        System(
+            module.PAPER,
+            Entry(REFERENCE_CONTROLLER, name),
+            Entry(REFERENCE_CONTROLLER, JOINT),
+            _make_task(sensors, scenario),
+            *criterion,
+            module.SIMULATIONS,
+            label,
+        )
+        for module, name, sensors, scenario, label, criterion in _FILTERS
+    ),
+)
+
+
+def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[ResultRow]:
+    """Drive every system on its own ground and, beside nominal, in the small car's contests."""
+    suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, EPISODES)
+    for system in SYSTEMS:
+        own, ours, rival = (x**2 for x in system.measure(seeds, jobs))
+        for entry, squares in ((system.entry, own), (system.ours, ours)):
+            suite.add_rows(
+                [{_RATIO: interval(squares, ratio_of_roots, rival)}],
+                system.task.env_id,
+                scenario=system.scenario,
+                estimator=entry.estimator,
+                controller=entry.agent,
+                n=EPISODES,
+                salt=salt,
+                paper=system.paper,
+            )
+    tasks = [x for x in list_scored_tasks() if (x.tier, x.env_id) == (_TIER, STEERING)]
+    systems = [x for system in SYSTEMS for x in (system.contestant or system.entry, system.ours)]
+    pairs = [(task, entry) for task in tasks for entry in dict.fromkeys((Entry(NOMINAL), *systems))]
+    common = measure(pairs, make_task_seeds(salt, EPISODES), jobs=jobs, console=console)
+    check_driven(common)
+    for standing in rank_entries(common, _TIER):
+        standing.add_rows(suite, salt)
+    names = {_COST: f"tier {_TIER}"}
+    return [row for row in suite.rows if row.scenario == names.get(row.metric, row.scenario)]
+
+
+def make_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table: a line a system and criterion.
+
+    Args:
+        rows: Rows of the systems.
+
+    Returns:
+        Markdown.
+    """
+    cells = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
+
+    def format_cell(scenario: str, entry: Entry, metric: str) -> str:
+        row = cells[scenario, entry.agent, entry.estimator, metric]
+        value, low, high = (100.0 * x for x in (row.value, row.low, row.high))
+        return f"{value:.0f} [{low:.0f}, {high:.0f}]"
+
+    lines = []
+    for system in SYSTEMS:
+        both = (system.entry, system.ours)
+        ground = [format_cell(system.scenario, entry, _RATIO) for entry in both]
+        contestants = (system.contestant or system.entry, system.ours)
+        common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in contestants]
+        names = [f"`{x.agent}` on `{x.estimator}`" for x in both]
+        lines.append([f"{system.paper}, {system.scenario}", *names, *ground, *common])
+    return format_table(lines, _HEADS)
+
+
+def _main(
+    salt: Annotated[str, typer.Option(help="Of the seeds, hexadecimal.")] = "",
+    jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
+    driven: Annotated[bool, typer.Option("--driven", help="Make the table of old rows.")] = False,
+) -> None:
+    """Drive the systems and write their rows and their table."""
+    console = Console(stderr=True)
+    rows = read_json(ROWS) if driven else _measure_systems(salt or make_salt(), jobs, console)
+    text = replace_table(PAGE.read_text(encoding="utf-8"), make_table(rows))
+    write_json(ROWS, rows)
+    write_text(PAGE, text)
+
+
+if __name__ == "__main__":
+    with report_user_errors():
+        typer.run(_main)

@@ -1,0 +1,230 @@
+"""A sideslip angle from samples that come one by one, in any order and late: for a CAN loop.
+
+The last second stands in a buffer. A sample is written where it was taken, and the filter runs anew
+from the oldest row that changed. So any order of samples gives the numbers of the sorted order.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..envs.record import FAST, PACKET, Array
+from ..envs.recordings.dialect import SENSORS, SLOW_QUANTITIES
+from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
+from ..envs.recordings.tables import find_offset, parse_column_name
+from ..envs.sensors.link import SlowSensor
+from ..envs.vehicle.parameters import VehicleSource, make_vehicle
+from .core.record import FilterRecords
+from .design.options import FAST_CHANNELS
+from .make import make_estimator
+from .wires import read_wires
+
+_SNAPSHOT_ROWS = 16
+_ROOM = 4  # memories that the buffer holds
+_PATIENCE = 10  # successive samples outside the memory, after which the clock has jumped
+
+
+class SideslipEstimate(NamedTuple):
+    """The estimate at the newest sample's stamp."""
+
+    time: float  # s
+    sideslip: float  # rad
+    sideslip_sd: float  # rad
+    yaw_rate: float  # rad/s
+    healthy: bool  # False too where a fast channel has been silent for `MAX_HOLE`
+
+
+def _find_wire(quantity: str) -> str:
+    """Find the channel of a vehicle's file whose latency a quantity has."""
+    for sensor, names in SENSORS.items():
+        if quantity in names:
+            return sensor
+    column = {"yaw_rate": "gyro", "speed_x": "wheel_left"}.get(quantity, quantity)
+    place = getattr(FAST, column, -1)
+    return next((name for name, columns in FAST_CHANNELS.items() if place in columns), "")
+
+
+class Stream:
+    """A filter `joint` that takes samples by name, as a CAN bus brings them.
+
+    Args:
+        vehicle: Vehicle as for `make_vehicle`. A file brings along the steering's ratio, sign and
+            offset, and latencies.
+        channels: Names with units, such as "yaw_rate_degps", that will come; speed_x, yaw_rate and
+            steer must be among them.
+        dt: Time from one yaw rate to the next (s).
+        memory: Time back to which a late sample is used (s).
+
+    Attributes:
+        counts: Samples ignored: "outside" the memory.
+
+    Raises:
+        ValueError: An unknown or missing channel, one given twice, or a time out of range.
+    """
+
+    def __init__(
+        self,
+        vehicle: VehicleSource,
+        channels: Sequence[str],
+        *,
+        dt: float = 0.01,
+        memory: float = 1.0,
+    ) -> None:
+        parsed = {name: parse_column_name(name.casefold()) for name in channels}
+        quantities = [quantity for quantity, _ in parsed.values()]
+        if missing := [name for name in NEEDED[1:] if name not in quantities]:
+            raise ValueError(f"no channel of {', '.join(missing)} among {', '.join(channels)}")
+        if twice := [name for name in dict.fromkeys(quantities) if quantities.count(name) > 1]:
+            raise ValueError(f"{', '.join(twice)} comes twice among {', '.join(channels)}")
+        if not (0.0 < dt <= MAX_HOLE and dt < memory < math.inf):
+            raise ValueError(f"expected 0 < dt <= {MAX_HOLE} s < memory, got {dt}, {memory}")
+        wires = read_wires(vehicle)
+        self._channels: dict[str, tuple[int, float, float, float]] = {}
+        for place, (name, (quantity, factor)) in enumerate(parsed.items()):
+            shift = find_offset(name.casefold())
+            if quantity == "steer":
+                factor, shift = factor * wires.gain, wires.offset
+            latency = wires.latency.get(_find_wire(quantity), 0.0)
+            self._channels[name] = place, factor, shift, latency
+        self.dt, self.counts = dt, {"outside": 0}
+        self._places = {name: place for place, name in enumerate(quantities)}
+        self._is_fast = np.array([name not in SLOW_QUANTITIES for name in quantities])
+        self._memory, self._hole = round(memory / dt), round(MAX_HOLE / dt)
+        capacity = _ROOM * self._memory + self._hole + 2 * _SNAPSHOT_ROWS
+        self._rows = np.empty((capacity, len(quantities)))  # NaN where nothing came
+        self._filled = np.empty_like(self._rows)  # the last value held
+        self._latest = np.empty(len(quantities))  # ticks of the newest samples
+        self._x: Array
+        self._sd: Array
+        self._strange = 0
+        self._begin(0)
+        sensors = {
+            name: SlowSensor(period=dt, phase=0.0)
+            for name, values in SENSORS.items()
+            if values[0] in quantities
+        }
+        options = {} if "accel_y" in quantities else {"fast": ("gyro",)}
+        self._filter = make_estimator(
+            "joint", vehicle=make_vehicle(vehicle), sensors=sensors, dt=dt, **options
+        )
+
+    def _begin(self, tick: int) -> None:
+        """Forget everything; `tick` is that of the buffer's first row."""
+        self._base, self._newest, self._first = tick, tick - 1, -1  # ticks; -1: not all have come
+        self._changed = self._done = tick  # from which on rows changed, or are not filtered yet
+        self._snapshots: dict[int, FilterRecords] = {}  # of the filter before a tick's row
+        self._rows.fill(np.nan)
+        self._filled.fill(np.nan)
+        self._latest.fill(-np.inf)
+
+    def push(self, channel: str, stamp: float, value: float) -> None:
+        """Take a sample.
+
+        Args:
+            channel: Name of the channel, one of those of the construction.
+            stamp: Time at which it was taken, or, if the vehicle's file has the channel's latency,
+                at which it came (s).
+            value: Value in the channel's unit.
+
+        Raises:
+            ValueError: An unknown channel, or a number that is not finite.
+        """
+        if channel not in self._channels:
+            raise ValueError(f"unknown channel {channel!r}; known: {', '.join(self._channels)}")
+        place, factor, shift, latency = self._channels[channel]
+        if not (math.isfinite(stamp) and math.isfinite(value)):
+            raise ValueError(f"{channel}: expected finite numbers, got {stamp} s, {value}")
+        tick = round((stamp - latency) / self.dt)
+        if self._newest < self._base or self._strange > _PATIENCE:
+            self._begin(tick - self._memory)
+        oldest = max(self._newest - self._memory, self._base)
+        if not oldest <= tick <= max(self._newest, self._base + self._memory) + self._hole:
+            self._strange += 1
+            self.counts["outside"] += 1
+            return
+        self._strange = 0
+        if tick - self._base >= len(self._rows):
+            self._shift()
+        self._rows[tick - self._base, place] = factor * value + shift
+        self._newest, self._changed = max(tick, self._newest), min(tick, self._changed)
+        self._latest[place] = max(tick, self._latest[place])
+
+    def _shift(self) -> None:
+        """Move the buffer, so that it begins with what can still change and the row before."""
+        self.estimate()  # whoever asks seldom still has every row filtered
+        rows = self._newest - self._base + 1
+        drop = rows - self._memory - _SNAPSHOT_ROWS - 2
+        for buffer in (self._rows, self._filled):
+            buffer[: rows - drop] = buffer[drop:rows].copy()
+            buffer[rows - drop :] = np.nan
+        self._base += drop
+
+    def estimate(self) -> SideslipEstimate | None:
+        """Estimate the sideslip angle at the newest sample.
+
+        Returns:
+            The estimate; None as long as a channel that is no slow sensor's has not come.
+        """
+        end = self._newest + 1
+        self._fill(self._changed, end)
+        if not self._restart():
+            return None
+        if self._done < end:
+            self._run(self._done, end)
+        x, sd, names = self._x, self._sd, self._filter.names
+        beta, gamma = names.index("beta"), names.index("gamma")
+        silence = self._newest - self._latest[self._is_fast].min()
+        healthy = self._filter.is_healthy and bool(silence <= self._hole)
+        time = self._newest * self.dt
+        return SideslipEstimate(time, float(x[beta]), float(sd[beta]), float(x[gamma]), healthy)
+
+    def _fill(self, start: int, end: int) -> None:
+        """Hold the last values of the fast channels from a tick on."""
+        for row in range(start - self._base, end - self._base):
+            new = self._rows[row]
+            self._filled[row] = np.where(np.isnan(new), self._filled[row - 1], new) if row else new
+
+    def _restart(self) -> bool:
+        """Take the filter back to the oldest changed row; False if it cannot begin yet."""
+        changed, self._changed = self._changed, self._newest + 1
+        if self._first < 0 or changed <= self._first:
+            fast = self._filled[: self._newest + 1 - self._base, self._is_fast]
+            complete = np.isfinite(fast).all(axis=1)
+            if not complete.any():
+                return False
+            self._first = self._done = self._base + int(np.argmax(complete))
+            self._snapshots.clear()
+            self._filter.reset(first=self._first)
+        elif changed < self._done:
+            self._done = max(tick for tick in self._snapshots if tick <= changed)
+            self._filter.set_state(self._snapshots[self._done])
+        return True
+
+    def _run(self, start: int, end: int) -> None:
+        """Filter the rows of the ticks from start to end."""
+        before = start - (start > self._first)  # an input acts from its row to the next
+        rows = slice(before - self._base, end - self._base)
+        values: dict[str, Array] = {"time": np.arange(before, end, dtype=np.float64) * self.dt}
+        for name, place in self._places.items():
+            source = self._rows if name in SLOW_QUANTITIES else self._filled
+            values[name] = source[rows, place]
+        fast = make_fast_rows(values)[0][start - before :]
+        packets = make_packets(values, before, self.dt)[0]
+        packets = packets[packets[:, PACKET.captured] >= start]
+        self._snapshots = {
+            tick: state
+            for tick, state in self._snapshots.items()
+            if end - self._memory - 2 * _SNAPSHOT_ROWS <= tick <= start
+        }
+        while start < end:
+            if start == self._first or start % _SNAPSHOT_ROWS == 0:
+                self._snapshots.setdefault(start, self._filter.get_state())
+            stop = min(end, (start // _SNAPSHOT_ROWS + 1) * _SNAPSHOT_ROWS)
+            now, fast = fast[: stop - start], fast[stop - start :]
+            count = int(np.searchsorted(packets[:, PACKET.arrived], stop))
+            X, S = np.empty((2, len(now), len(self._filter.names)))
+            self._filter.take(now, len(now), packets[:count], count, X, S)
+            packets, start, self._x, self._sd = packets[count:], stop, X[-1], S[-1]
+        self._done = end

@@ -1,0 +1,151 @@
+"""`Stream`: in any order, samples give the numbers of the whole record."""
+
+import math
+import re
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip import estimate
+from sideslip.estimators.stream import SideslipEstimate, Stream
+from tests.estimators.test_frame import drive
+
+Sample = tuple[str, float, float]
+
+
+def samples(end: float = math.inf) -> list[Sample]:
+    """Samples of the drive by time of capture."""
+    table = drive()[0]
+    names = [name for name in table.columns if name != "time_s"]
+    rows = table[table.time_s < end].to_dict("records")
+    return [
+        (name, float(row["time_s"]), float(row[name]))
+        for row in rows
+        for name in names
+        if math.isfinite(row[name])
+    ]
+
+
+def make_stream(**options: Any) -> Stream:
+    table, _, car = drive()
+    return Stream(car, [name for name in table.columns if name != "time_s"], **options)
+
+
+def run(arrivals: Iterable[Sample]) -> SideslipEstimate:
+    """The last estimate; the filter is asked at every yaw rate."""
+    stream, last = make_stream(), None
+    for name, stamp, value in arrivals:
+        stream.push(name, stamp, value)
+        if name == "yaw_rate_radps":
+            last = stream.estimate()
+    assert stream.counts == {"outside": 0}
+    last = stream.estimate()
+    assert last is not None
+    return last
+
+
+def test_punctual_samples_equal_the_table() -> None:
+    table, _, car = drive()
+    expected = estimate(table, car).iloc[-1]
+    last = run(samples())
+    assert last.time == pytest.approx(expected.time_s)
+    assert last.sideslip == expected.sideslip_rad
+    assert last.sideslip_sd == expected.sideslip_sd_rad
+    assert last.yaw_rate == expected.yaw_rate_radps
+    assert last.healthy
+
+
+@pytest.mark.parametrize("late", [{"course_rad": 0.35}, {"accel_y_mps2": 0.07, "steer_rad": 0.02}])
+def test_late_samples_change_nothing(late: dict[str, float]) -> None:
+    punctual = samples(20.0)
+    assert run(sorted(punctual, key=lambda x: x[1] + late.get(x[0], 0.0))) == run(punctual)
+
+
+def test_any_order_within_the_memory_changes_nothing() -> None:
+    punctual = samples(12.0)
+    rng = np.random.default_rng(0)
+    order = sorted(punctual, key=lambda x: x[1] + 0.4 * rng.random())
+    assert order != punctual
+    assert run(order) == run(punctual)
+
+
+@pytest.mark.parametrize("memory", [0.02, 1.0])
+def test_it_does_not_matter_how_often_one_asks(memory: float) -> None:
+    asked, unasked = make_stream(memory=memory), make_stream(memory=memory)
+    for sample in samples(18.0):
+        asked.push(*sample)
+        unasked.push(*sample)
+        asked.estimate()
+    assert unasked.estimate() == asked.estimate()
+    assert asked.counts == {"outside": 0}
+
+
+def test_a_channel_that_falls_silent_is_said() -> None:
+    stream = make_stream()
+    for name, stamp, value in samples(8.0):
+        if name != "steer_rad" or stamp < 6.0:
+            stream.push(name, stamp, value)
+            now = stream.estimate() if name == "yaw_rate_radps" else None
+            assert now is None or now.healthy == (now.time <= 6.24)
+
+
+def test_none_before_every_fast_channel_has_come() -> None:
+    stream = make_stream()
+    assert stream.estimate() is None
+    for name, stamp, value in samples(2.0):
+        if name != "steer_rad":
+            stream.push(name, stamp, value)
+    assert stream.estimate() is None
+    stream.push("steer_rad", 1.9, 0.0)
+    assert stream.estimate() is not None
+
+
+def test_a_wild_stamp_is_ignored_and_a_clock_set_anew_is_followed() -> None:
+    stream = make_stream()
+    for sample in samples(5.0):
+        stream.push(*sample)
+    before = stream.estimate()
+    stream.push("yaw_rate_radps", 1e6, 0.0)
+    stream.push("yaw_rate_radps", -3.0, 0.0)
+    assert stream.counts == {"outside": 2}
+    assert stream.estimate() == before
+    for name, stamp, value in samples(5.0):
+        stream.push(name, stamp + 1000.0, value)
+    after = stream.estimate()
+    assert before is not None and after is not None
+    assert after.time == pytest.approx(before.time + 1000.0)
+    assert after.sideslip == pytest.approx(before.sideslip, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("sample", "message"),
+    [
+        (("radar", 1.0, 0.0), "unknown channel 'radar'; known: speed_x_mps, yaw_rate_radps"),
+        (("steer_rad", math.nan, 0.0), "steer_rad: expected finite numbers, got nan s, 0.0"),
+        (("steer_rad", 1.0, math.inf), "steer_rad: expected finite numbers, got 1.0 s, inf"),
+    ],
+)
+def test_refused_samples(sample: Sample, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make_stream().push(*sample)
+
+
+@pytest.mark.parametrize(
+    ("channels", "options", "message"),
+    [
+        (("speed_x_kmh", "steer_deg"), {}, "no channel of yaw_rate among speed_x_kmh, steer_deg"),
+        (("speed_x_kmh", "steer_deg", "gyro"), {}, "unknown column name 'gyro'"),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "yaw_rate_degps"),
+            {},
+            "yaw_rate comes twice among speed_x_kmh",
+        ),
+        (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"dt": 2.0}, "expected 0 < dt <= 0.25"),
+        (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"memory": 0.0}, "got 0.01, 0.0"),
+    ],
+)
+def test_refused_streams(channels: tuple[str, ...], options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Stream("passenger-car", channels, **options)
