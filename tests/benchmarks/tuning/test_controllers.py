@@ -121,6 +121,8 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
     parts = [slow.seeds[low:high] for low, high in ((0, 2), (2, 4), (4, 8), (8, 16))]
     assert [asked.count(part) for part in parts] == [16, 8, 4, 2]
     assert [row["seeds"] for row in log["trials"]].count(16) == 2
+    assert log["trials"][0]["seeds"] < 16 and asked.count(slow.seeds) == 1
+    assert log["start"] == pytest.approx(math.log(0.9 / 0.5) + 1.0, abs=1e-4)  # on all seeds
     best = log["best"]
     assert best["seeds"] == 16
     wanted = abs(math.log(best["numbers"]["grip"] / 0.5)) + 2 / 16
