@@ -4,7 +4,7 @@ The compiled functions write the matrices, here and in the filters.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,9 @@ import numpy.typing as npt
 from ..numerics.jit import as_python, jit
 from ..numerics.primitives import Matrix, Scalar, Vector
 from .parameters import Vehicle
+
+if TYPE_CHECKING:
+    from control import StateSpace
 
 Array = npt.NDArray[np.float64]
 
@@ -137,6 +140,14 @@ class LinearModel:
         block[:n] = np.hstack([self.A, self.B]) * dt
         exact = expm(block)
         return exact[:n, :n], exact[:n, n:]
+
+    def to_control(self) -> "StateSpace":
+        """Convert to a `control.StateSpace` with names (needs the extra `design`)."""
+        import control
+
+        D = np.zeros((len(self.outputs), len(self.inputs)))
+        names = {name: list(getattr(self, name)) for name in ("states", "inputs", "outputs")}
+        return control.StateSpace(self.A, self.B, self.C, D, **names)
 
 
 def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[Array, Array]:

@@ -251,3 +251,17 @@ def test_slip_cannot_be_seen_from_the_wheels_alone_at_zero_yaw_rate() -> None:
 
     assert (rank(0.0, 2, 1), rank(0.1, 2, 1)) == (1, 2)  # v_x and v_y by the wheels alone
     assert rank(0.0, 4, 3) == 4
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_to_control_keeps_matrices_and_names(name: str) -> None:
+    pytest.importorskip("control")
+    model = MODELS[name](COMS, 25.0 * KMH)
+    system = model.to_control()
+    for letter in "ABC":
+        np.testing.assert_array_equal(getattr(system, letter), getattr(model, letter))
+    assert not system.D.any()
+    assert tuple(system.state_labels) == model.states
+    assert tuple(system.input_labels) == model.inputs
+    assert tuple(system.output_labels) == model.outputs
+    assert system.isctime()
