@@ -215,7 +215,18 @@ def _make_headlines(root: Path) -> list[str]:
 
 
 def replace_table(text: str, new_table: str) -> str:
-    """Replace a page's table with the same first column head; ValueError without exactly one."""
+    """Replace a page's table with the same first column head.
+
+    Args:
+        text: Page.
+        new_table: Markdown.
+
+    Returns:
+        Page with the new table.
+
+    Raises:
+        ValueError: The page has no such table, or several.
+    """
     first = re.escape(new_table.split(" | ")[1].split(",")[0])
     pattern = re.compile(rf"^\| \| {first}[^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
