@@ -14,7 +14,7 @@ from ..sensors.inertial import NormalDraws, compute_fast_row
 from ..sensors.slow import GPS, draw_first_drift
 from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
 from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity
-from ..vehicle.parameters import GRAVITY
+from ..vehicle.parameters import GRAVITY, MIN_RELAXATION
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import NEVER_DUE, finish_reset
 from .step import make_step_params, make_step_variant
@@ -79,7 +79,8 @@ def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
     p[P.road.wave_rate] = select(d.bank_wave != 0.0, rate, 0.0)
     p[P.road.wave_phase] = 5.0 * turn
     p[P.task.torque_slew] = d.torque_rate * p[P.car.T_max] * TICK
-    p[P.car.relaxation] = p[P.car.relaxation] * d.relaxation
+    relaxation = p[P.car.relaxation] * d.relaxation
+    p[P.car.relaxation] = select(relaxation > 0.0, maximum(relaxation, MIN_RELAXATION), 0.0)
     p[P.car.k_l], p[P.car.k_r] = d.torque_scale * d.torque_left, d.torque_scale
     gust = d.gust * p[P.car.m]
     p[P.disturbance.force] = p[P.disturbance.force] + gust

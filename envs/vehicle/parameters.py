@@ -25,7 +25,7 @@ LATERAL_FIELDS = (
 )  # fmt: skip
 """Parameters of a linear bicycle, in the order of `linear.Bicycle`."""
 _POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # inertia of two points over the axles
-_MIN_RELAXATION = 0.05  # m: a tick of 1 ms follows no shorter one at 100 m/s
+MIN_RELAXATION = 0.05  # m: a tick of 1 ms follows no shorter one at 100 m/s
 _MIN_NUMBER = 1.0 / MAX_NUMBER  # a parameter below it counts as zero: it is divided by
 
 
@@ -90,8 +90,8 @@ class Vehicle:
             if not (is_finite(value) and is_low_ok):
                 got = f"{short_repr(value)} {entry.metadata['unit']}"
                 raise ValueError(f"Vehicle.{entry.name}: {got} is not {requirement}finite")
-        if 0.0 < self.relaxation < _MIN_RELAXATION:
-            got, rule = short_repr(self.relaxation), f"neither 0 nor {_MIN_RELAXATION} or more"
+        if 0.0 < self.relaxation < MIN_RELAXATION:
+            got, rule = short_repr(self.relaxation), f"neither 0 nor {MIN_RELAXATION} or more"
             raise ValueError(f"Vehicle.relaxation: {got} m is {rule}")
 
     def replace(self, **changes: Any) -> "Vehicle":
