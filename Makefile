@@ -20,10 +20,10 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
 
-# What every run writes, and a recorded drive (LOG=file) beside.
-WRITTEN := --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
+# What every run writes; DATA=folder has downloaded drives, for the suite logs.
+WRITTEN := --html report.html --json results.json $(if $(DATA),--data "$(DATA)")
 
-bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json (LOG=file adds a recorded drive)
+bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json
 	$(BIN)/sideslip bench estimation control --quick $(WRITTEN)
 
 bench-all: .venv/ready-bench ## every suite on few seeds, half an hour on two cores
