@@ -61,7 +61,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         cases.extend((function, chunk) for chunk in chunks)
         return [DriveResult(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
 
-    monkeypatch.setattr(study, "run_cases", stand_in)
+    monkeypatch.setattr(run, "run_cases", stand_in)
     return cases
 
 

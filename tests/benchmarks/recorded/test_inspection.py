@@ -93,7 +93,8 @@ def test_a_number_is_measured_and_its_cure_mends_it(tmp_path: Path, run: Run) ->
 
 def test_the_page_fits_a_screen(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    log, page = tmp_path / "drive.csv", tmp_path / "page.html"
+    monkeypatch.chdir(tmp_path)  # a long folder stands in a line of its own
+    log, page = Path("drive.csv"), Path("page.html")
     drive(CLEAN)[0].to_csv(log, index=False)
     status, out, _ = run("inspect", log, "--html", page)
     lines = out.splitlines()

@@ -19,7 +19,7 @@ from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.scenarios.world import GROUPS, IDEAL, WORLDS, World, make_world
 from sideslip.envs.sensors.errors import CAMERA_HEIGHT
 from sideslip.envs.task import RATE_TICKS
-from sideslip.envs.vehicle.parameters import GRAVITY, MIN_RELAXATION, PASSENGER_CAR, critical_speed
+from sideslip.envs.vehicle.parameters import GRAVITY, PASSENGER_CAR, critical_speed
 from sideslip.estimators import EstimateObservation
 
 from ..batches import drive, pair, same
@@ -442,14 +442,3 @@ def test_version_1_of_an_id_is_version_0_in_the_world_v1(name: str) -> None:
         one, other = older.step(action), newer.step(action)
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1] == other[1]
-
-
-def test_a_length_that_no_tick_follows_is_drawn_as_the_shortest() -> None:
-    """Doubled ranges begin at 0, and the oracles build the drawn car."""
-    world = {"base": "v1", "relaxation": (0.0, 0.3)}
-    env: Any = gymnasium.make("sideslip/YawFusion-v0", world=world).unwrapped
-    lengths = []
-    for seed in range(30):
-        env.reset(seed=seed)
-        lengths.append(env.vehicle.relaxation)
-    assert min(lengths) == MIN_RELAXATION < max(lengths)

@@ -11,6 +11,7 @@ import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, make_vehicle
 from sideslip.envs.io import write_document
+from sideslip.envs.vehicle.parameters import MIN_RELAXATION
 
 pytestmark = pytest.mark.plain
 
@@ -236,3 +237,11 @@ def test_an_env_takes_what_the_reader_takes_and_is_built_again(tmp_path: Path) -
     scenario = {"base": "straight", "vehicle": {"front_stiffness": 7000.0}}  # as of `Vehicle`
     env = gym.make("sideslip/YawVision-v0", scenario=scenario)
     assert env.get_wrapper_attr("_episode").vehicle.front_stiffness == 7000.0
+
+
+def test_a_length_that_no_tick_follows_is_drawn_as_the_shortest() -> None:
+    """Doubled ranges begin at 0, and the oracles build the drawn car."""
+    world = {"base": "v1", "relaxation": (0.0, 0.3)}
+    env: Any = gym.make("sideslip/YawFusion-v0", world=world).unwrapped
+    lengths = [env.reset(seed=seed) and env.vehicle.relaxation for seed in range(30)]
+    assert min(lengths) == MIN_RELAXATION < max(lengths)
