@@ -138,7 +138,10 @@ def apply_wires(log: Log, wires: SignalCalibration) -> Log:
         packets[is_sensor, PACKET.captured] -= rows
         period = round(was.period / record.dt)
         phase = (round((was.phase or 0.0) / record.dt) - rows) % period * record.dt
-        slow[sensor] = dataclasses.replace(was, delays=(rows * record.dt,), phase=phase)
+        late = packets[is_sensor, PACKET.arrived] - packets[is_sensor, PACKET.captured]
+        low, high = (late.min(), late.max()) if len(late) else (rows, rows)  # what it had too
+        delays, jitter = (float(low) * record.dt,), float(high - low) * record.dt
+        slow[sensor] = dataclasses.replace(was, delays=delays, jitter=jitter, phase=phase)
     packets = packets[packets[:, PACKET.captured] >= record.first]
     record = dataclasses.replace(record, fast=fast, packets=packets)
     truth = dict(log.truth)

@@ -72,7 +72,7 @@ class InspectedDrive:
     kinds: Mapping[str, str]  # kinds of samples that names of columns tell
     logs: Sequence[Log]  # calibrated parts
     car: Vehicle
-    gain: float = 1.0  # rad at the wheels per unit of logged steering
+    wires: SignalCalibration = field(default_factory=SignalCalibration)  # of the parts
     contradictions: Sequence[LogFinding] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +88,19 @@ class InspectedDrive:
             shifted = [apply_wires(log, SignalCalibration(latency={"gps": late})) for log in logs]
             aligned = find_contradictions(shifted, self.car)
             findings = findings if any(map(_is_course, aligned)) else aligned
-        self.contradictions = of_speed + findings
+        self.contradictions = of_speed + list(map(self._compose_cure, findings))
+
+    def _compose_cure(self, finding: LogFinding) -> LogFinding:
+        """Put what is stated already into a cure of the steering: an option replaces it."""
+        if finding.channel == "steering" and finding.check == "sign":
+            cure = f"--steering-sign {-self.wires.sign}"
+        elif finding.channel == "steering" and finding.check == "ratio":
+            ratio = float(finding.cure.split()[1]) * self.wires.ratio
+            cure = f"--steering-ratio {ratio:.3g}"
+        else:
+            return finding
+        text = finding.text.replace(finding.cure, cure)
+        return dataclasses.replace(finding, text=text, cure=cure)
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
@@ -174,7 +186,10 @@ def _check_stamps(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_gaps(drive: InspectedDrive) -> Iterator[LogFinding]:
-    time, speed = drive.values["time"], np.nan_to_num(drive.values.get("speed_x", np.inf))
+    time = drive.values["time"]
+    speed = drive.values.get("speed_x", np.full(len(time), np.inf))
+    known_rows = np.where(np.isfinite(speed) | np.isinf(speed), np.arange(len(speed)), 0)
+    speed = np.nan_to_num(speed[np.maximum.accumulate(known_rows)])  # that of the newest row
     clock, moving = time, np.broadcast_to(np.abs(speed) > _STANDING, time.shape)
     for name in ("time", *(name for name in drive.values if name != "time")):
         column = drive.values[name]
@@ -287,7 +302,7 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     needed = (turning / speed - bias) * (car.wheelbase / speed + under * speed)
     offset, limit = float(np.median(steer - needed)), 2.0 * _ALLOWED["steer_offset_sd"]
     text = f"offset {offset * _DEGREES:.2f} deg at the wheels"
-    cure = f"--steering-offset {-offset * _DEGREES:.2f}"
+    cure = f"--steering-offset {(drive.wires.offset - offset) * _DEGREES:.2f}"
     yield _judge("bias", "steer", abs(offset) > limit, text, cure)
 
 
@@ -301,7 +316,8 @@ def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
     late = find_latency(blocks, _TIMES, 1.0)
     first, last = (find_latency(x, _TIMES, 1.0) for x in (blocks[:half], blocks[half:]))
     text = f"{late[0]:.2f} +- {late[1]:.2f} s later than the gyro"
-    cure = f"--latency gps={max(late[0], 0.0):.2f}" if late[0] > 0.0 else "mend its stamps"
+    stated = drive.wires.latency.get("gps", 0.0)
+    cure = f"--latency gps={stated + late[0]:.2f}" if stated + late[0] > 0.0 else "mend its stamps"
     yield _judge("late", "course", abs(late[0]) > max(_LATE, late[1]), text, cure)
     drift, margin = last[0] - first[0], 0.5 * math.hypot(first[1], last[1])
     text = f"its clock gains {drift:.2f} +- {margin:.2f} s from the first half to the second"
@@ -312,7 +328,7 @@ def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
     for name, noise in _RESOLUTION.items():
         column = drive.values.get(name, np.zeros(0))
-        column = column[np.isfinite(column)] * (drive.gain if name == "steer" else 1.0)
+        column = column[np.isfinite(column)] * (abs(drive.wires.gain) if name == "steer" else 1.0)
         if len(column):
             step, is_angle = estimate_resolution(column), name not in ("accel_y", "speed_x")
             limit = math.sqrt(12.0) * noise

@@ -119,6 +119,9 @@ def identify(
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
     stated = wires or SignalCalibration()
+    logs = [apply_wires(log, SignalCalibration(at=stated.at)) for log in logs]
+    if "gps" in stated.at:
+        car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
     result = IdentificationResult(car, stated)
     w = make_windows(logs, [find_saturated(log) for log in logs])
     gain, related = estimate_steering_gain(logs, car)
@@ -134,8 +137,8 @@ def identify(
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
-    slips = estimate_slips(logs, result.car, result.wires)
-    both = (estimate_slips(logs, car, stated), slips)
+    slips = estimate_slips(logs, result.car, result.wires._replace(at={}))
+    both = (estimate_slips(logs, car, stated._replace(at={})), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
     findings, noise, latency = _make_sensor_findings(logs, slips)
     result.findings += findings

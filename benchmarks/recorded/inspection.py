@@ -133,7 +133,7 @@ def read_drive(
         if set(NEEDED) <= values.keys():
             logs, remarks = read_parts(source, names)
             logs = [apply_wires(log, wires) for log in logs]
-        drive = InspectedDrive(values, kinds, logs, car, abs(wires.gain))
+        drive = InspectedDrive(values, kinds, logs, car, wires)
     except FileNotFoundError:
         raise
     except ValueError as error:
@@ -144,8 +144,8 @@ def read_drive(
 
 def _predict(log: Log, car: Vehicle) -> Prediction:
     """Run the filter over a part and take its own deviation."""
-    options = {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
-    facts = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt, **options}
+    facts = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt}
+    facts |= {"present": log.record.present}
     filter_ = call_quietly(make_estimator, FILTER, **facts)
     estimates = filter_.run(log)
     place = estimates.names.index("beta")
@@ -183,6 +183,9 @@ def _compose_verdict(
             f"First: {what}{first.text}{cure}.",
             tally,
         )
+    if math.isnan(prediction.usual):
+        slow = "The car is never fast enough for a sideslip angle: nothing is estimated."
+        return format_verdict(slow, tally)
     deviation = prediction.usual * _DEGREES
     is_lost = prediction.nis > LOST
     worth = "worth little" if is_lost or prediction.usual > _USEFUL else "worth it"

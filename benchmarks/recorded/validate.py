@@ -8,7 +8,7 @@ import numpy as np
 
 from ...envs.record import PACKET, Array, Log
 from ...envs.vehicle.parameters import Vehicle
-from ...estimators.wires import SignalCalibration
+from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable
 from .bicycle_fit import compute_residual, make_windows, simulate_windows
 from .identify import identify
@@ -85,7 +85,9 @@ def make_validation_table(
     Returns:
         A row for each channel; none, with the reason in the note, where nothing is identified.
     """
-    odd, even = split_blocks(logs)
+    moved = [apply_wires(log, SignalCalibration(at=wires.at if wires else {})) for log in logs]
+    odd, even = split_blocks(moved)
+    wires = wires and wires._replace(at={})
     result = identify(odd, car, wires, tyres)
     w = make_windows(even, [find_saturated(log) for log in even]) if even else None
     reason = result.reason
@@ -109,7 +111,8 @@ def make_validation_table(
         truth = np.concatenate([log.truth["beta"][::every] for log in even])
         # with the antenna at the centre of gravity its sideslip angle is the car's
         slip = simulate_windows(car.replace(antenna_ahead=0.0), result.theta, w)[2]
-        measured["sideslip angle"] = truth[places], slip[:, places[0] - w.starts[0] - 1]
+        if np.isfinite(truth[places]).any():
+            measured["sideslip angle"] = truth[places], slip[:, places[0] - w.starts[0] - 1]
     cells = [_compare(name, *pair) for name, pair in measured.items()]
     return ResultTable(title, columns, cells, _NOTE, keyed=False)
 

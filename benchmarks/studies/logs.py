@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import Array, Log
 from ...envs.recordings.log_file import read_parts
@@ -17,7 +18,7 @@ from ...estimators.wires import apply_wires, read_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
-from ..recorded.emulate import find_backward
+from ..recorded.emulate import find_backward, find_moving
 from ..recorded.honesty import HONESTY, compute_honesty
 from ..report.study import Request, Study
 
@@ -48,14 +49,26 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
         for path in files:
             beside = path.with_name("vehicle.toml")
             vehicle: VehicleSource = beside if beside.exists() else preset["vehicle"]
-            wires = read_wires(vehicle)
-            for part in read_parts(path, parse_mapping(preset["mapping"]))[0]:
-                log = apply_wires(part, wires)
-                if "beta" in log.truth and log.time[-1] - log.time[0] >= SETTLED:
+            try:
+                parts, _ = read_parts(path, parse_mapping(preset["mapping"]))
+            except ValueError as error:
+                absent.append(f"{error}.")
+                continue
+            for part in parts:
+                log = apply_wires(part, read_wires(vehicle))
+                if _find_scored(log).any():
                     records += _score(log, vehicle)
                 else:
-                    absent.append(f"{log.name}: without a true sideslip angle it is not scored.")
+                    reason = "no true sideslip angle while it moves, from 2 s on"
+                    absent.append(f"{log.name} is not scored: {reason}.")
     return records, absent
+
+
+def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
+    """Mark the rows that count: moving forward, settled, with a truth."""
+    truth = log.truth.get("beta", np.full(len(log.time), np.nan))
+    is_settled = log.time >= log.time[0] + SETTLED - 1e-9
+    return is_settled & find_moving(log) & ~find_backward(log) & np.isfinite(truth)
 
 
 def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
@@ -63,7 +76,7 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
     facts = {"sensors": log.slow, "dt": log.record.dt, "present": log.record.present}
     filter_ = call_quietly(make_estimator, _NAME, vehicle=make_vehicle(vehicle), **facts)
     truth, records = log.truth["beta"], []
-    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log) & np.isfinite(truth)
+    counts = _find_scored(log)
     for label, estimates in (
         (_NAME, filter_.run(log)),
         ("its smoother, 1 s", call_quietly(smooth, filter_, log)),
@@ -86,7 +99,7 @@ def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -
         suite.add_rows([numbers], scenario=record["drive"])
     suite.warnings = [text.removesuffix(".") for text in absent]
     if records:
-        note = "Absolute errors of the sideslip angle from 2 s on, driven forward."
+        note = "Absolute errors of the sideslip angle from 2 s on, moving forward."
         suite.tables = [ResultTable("Recorded drives", _COLUMNS, records, note)]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..numerics import require_extra
-from ..validation import join_names
+from ..validation import join_names, short_repr
 from .dialect import find_unit, to_metres
 
 if TYPE_CHECKING:
@@ -30,8 +30,12 @@ _TRACES = {  # reader of python-can, by what its files begin with
     "TRCReader": rb";\$FILEVERSION",
 }
 _BAG = re.compile(rb"\x89MCAP|SQLite format 3")
+_LONGEST_STEP_BACK = 0.25  # s, by which frames of a bus may come out of order
 _LONGEST_LATENCY = 5.0  # s; beyond it a bag's log has another clock than its headers
 DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
+_ARITHMETIC = re.compile(
+    r"(?:[\d\s.+\-*/^(),]|\bX1?\b|(?<=\d)e|\b(?:sin|cos|tan|exp|log|sqrt|abs)\b)*", re.I
+)
 _DBC_NEEDED = "a CAN trace needs its description: --map dbc=FILE"
 
 
@@ -68,7 +72,12 @@ def _join_channels(
 
     columns = {}
     for name, (stamps, values) in channels.items():
-        column = pd.Series(np.asarray(values, np.float64), np.asarray(stamps, np.float64))
+        stamps = np.asarray(stamps, np.float64)
+        if (is_back := np.diff(stamps) < -_LONGEST_STEP_BACK).any():
+            row = int(np.argmax(is_back))
+            times = f"{stamps[row + 1]:.12g} s after {stamps[row]:.12g} s"
+            raise ValueError(f"{name}: the clock is set back, {times}; cut the file there")
+        column = pd.Series(np.asarray(values, np.float64), stamps)
         columns[name] = column[~column.index.duplicated()]
     frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
     known = ["s", *(units.get(name, "") for name in columns)]
@@ -152,6 +161,9 @@ def read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable
 
     chosen: dict[str, tuple[int, int]] = {}
     with MDF(path) as recorded:
+        for group in recorded.groups:
+            for channel in group.channels:
+                _check_formula(channel.name, channel.conversion)
         has_frames = any("CAN_DataFrame" in name for name in recorded.channels_db)
         if has_frames and not dbc:
             raise ValueError(_DBC_NEEDED)
@@ -172,6 +184,15 @@ def read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable
             columns[name] = signal.timestamps, signal.samples
             units[name] = find_unit(signal.unit)
     return _join_channels(columns, units, names)
+
+
+def _check_formula(name: str, conversion: Any) -> None:
+    """Check a channel's conversion: asammdf gives a formula beyond arithmetic to Python's eval."""
+    formula = getattr(conversion, "formula", "") or ""
+    if not _ARITHMETIC.fullmatch(formula):
+        raise ValueError(f"{name} has a formula that is no arithmetic: {short_repr(formula)}")
+    for nested in (getattr(conversion, "referenced_blocks", None) or {}).values():
+        _check_formula(name, nested)
 
 
 def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
@@ -202,20 +223,24 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
     short = [name.partition(".")[2] for name in names]
     messages: dict[tuple[int, bool], tuple[Any, dict[str, str]]] = {}
     channels, units = dict[str, _Channel](), dict[str, str]()
+    named = {name.partition(".")[2] for name in names if is_wanted(name)}  # MESSAGE.SIGNAL decides
     for message in database.messages:
         wanted = {}
         for signal in message.signals:
-            for label in (f"{message.name}.{signal.name}", signal.name):
-                if is_wanted(label):
-                    if label == signal.name and short.count(label) > 1:
-                        both = [x for x in names if x.endswith(f".{label}")]
-                        raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
-                    wanted[signal.name], channels[label] = label, _Channel.make()
-                    units[label] = find_unit(signal.unit or "")
-                    break
+            label = f"{message.name}.{signal.name}"
+            if not is_wanted(label):
+                label = signal.name
+                if signal.name in named or not is_wanted(label):
+                    continue
+                if short.count(label) > 1:
+                    both = [x for x in names if x.endswith(f".{label}")]
+                    raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
+            wanted[signal.name], channels[label] = label, _Channel.make()
+            units[label] = find_unit(signal.unit or "")
         if wanted:
             messages[message.frame_id, message.is_extended_frame] = message, wanted
     remarks, seen_ids, n_short, cut = [], set[int](), 0, ""
+    buses: dict[tuple[int, bool], set[object]] = {}
     try:
         frames = getattr(can, reader)(path)
         if getattr(frames, "file_size", 0) > path.stat().st_size:
@@ -226,6 +251,7 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
             if key not in messages or frame.is_error_frame or frame.is_remote_frame:
                 continue
             message, wanted = messages[key]
+            buses.setdefault(key, set()).add(frame.channel)
             try:
                 decoded = message.decode(bytes(frame.data), decode_choices=False)
             except DecodeError:
@@ -245,6 +271,10 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
         remarks.append(f"WARNING: the trace is cut or damaged, and read up to there: {cut}.")
     if n_short:
         remarks.append(f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.")
+    for (number, _), names_of_buses in buses.items():
+        if len(names_of_buses) > 1:
+            text = join_names(sorted(map(str, names_of_buses)))
+            raise ValueError(f"0x{number:x} is on several buses: {text}; write a trace of one")
     sent = [message for message in database.messages if message.frame_id in seen_ids]
     if seen_ids and not sent:
         ids = ", ".join(f"0x{x:x}" for x in sorted(seen_ids)[:4])

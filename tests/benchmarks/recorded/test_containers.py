@@ -332,6 +332,75 @@ def test_a_clock_that_jumps_divides_the_trace(tmp_path: Path) -> None:
     assert len(logs) == 2 and any("parts" in text for text in remarks)
 
 
+def test_a_formula_in_an_mdf_runs_nothing(tmp_path: Path) -> None:
+    """asammdf hands what is no arithmetic to Python's eval."""
+    frame, marker = table(), tmp_path / "ran"
+    for formula, is_refused in (
+        (f"__import__('os').mkdir('{marker}') or X1", True),
+        ("2*X1", False),
+    ):
+        signals = [
+            asammdf.Signal(
+                frame[x].to_numpy(),
+                frame["time_s"].to_numpy(),
+                name=x,
+                conversion={"formula": formula} if x == "yaw_rate_radps" else None,
+            )
+            for x in FAST_COLUMNS
+        ]
+        with asammdf.MDF(version="4.10") as file:
+            file.append(signals)
+            path = Path(file.save(tmp_path / "drive.mf4", overwrite=True))
+        if is_refused:
+            with pytest.raises(
+                ValueError, match="yaw_rate_radps has a formula that is no arithmetic"
+            ):
+                read_parts(path)
+        else:
+            (log,), _ = read_parts(path)
+            np.testing.assert_allclose(log.record.fast[:, FAST.gyro], 2.0 * frame["yaw_rate_radps"])
+    assert not marker.exists()
+
+
+def write_frames(path: Path, change: Callable[[int, Any], None]) -> Path:
+    write_dbc(path.parent)
+    with can.Logger(path) as logger:
+        for i, frame in enumerate(frames()):
+            change(i, frame)
+            logger.on_message_received(frame)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda i, frame: setattr(frame, "channel", f"can{i % 2}"),
+            "0x100 is on several buses: can0",
+        ),
+        (
+            lambda i, frame: setattr(frame, "timestamp", frame.timestamp - 5.0 * (i > 600)),
+            "the clock is set back, .* s after .* s; cut the file there",
+        ),
+    ],
+)
+def test_a_trace_of_two_buses_or_clocks_is_refused(
+    tmp_path: Path, change: Callable[[int, Any], None], message: str
+) -> None:
+    path = write_frames(tmp_path / "drive.log", change)
+    with pytest.raises(ValueError, match=message):
+        read_parts(path, {**COLUMNS, "dbc": str(tmp_path / "car.dbc")})
+
+
+def test_a_message_names_one_of_two_signals(tmp_path: Path) -> None:
+    """That it is ours by name, as its namesake is, is no matter then."""
+    path = write_trace(tmp_path, "drive.blf")
+    text = TWICE.replace("SG_ Speed :", "SG_ Speed_X :")
+    mapping = {**COLUMNS, "speed_x_mps": "Motion.Speed_X", "dbc": str(write_dbc(tmp_path, text))}
+    (log,), _ = read_parts(path, mapping)
+    np.testing.assert_array_equal(log.record.fast[:, FAST.wheel_left], table()["speed_x_mps"])
+
+
 OTHER = DBC.replace("BO_ 256", "BO_ 300").replace("BO_ 512", "BO_ 600")
 TWICE = DBC.replace('Quality : 16|16@1+ (0.0625,0) [0|99] ""', 'Speed : 16|16@1+ (0.1,0) [0|99] ""')
 REFUSALS: dict[str, tuple[str, Mapping[str, str], str]] = {

@@ -1,5 +1,6 @@
 """Every planted fault of a log is named, none of a clean drive, and the page fits a screen."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,25 @@ def test_the_page_fits_a_screen(tmp_path: Path, run: Run, monkeypatch: pytest.Mo
     text = page.read_text()
     assert "<details open><summary>Channels" in text and text.count("<figure") >= 5
     assert 'src="http' not in text
+
+
+def test_a_cure_contains_what_is_stated(tmp_path: Path, run: Run) -> None:
+    """An option replaces what was stated before: taken as it is said, it mends the log."""
+    log = tmp_path / "drive.csv"
+    table = drive(CLEAN)[0]
+    table.assign(steer_rad=table["steer_rad"] - np.radians(2.0)).to_csv(log, index=False)
+    _, out, _ = run("inspect", log, "--steering-offset", -1)
+    offset = float(re.search(r"--steering-offset\s+(-?[\d.]+)", out)[1])  # type: ignore[index]
+    assert offset == pytest.approx(2.0, abs=0.5)
+    assert "--steering-offset" not in run("inspect", log, "--steering-offset", offset)[1]
+
+
+def test_a_car_that_hardly_moves_is_no_drive(tmp_path: Path, run: Run) -> None:
+    log, table = tmp_path / "drive.csv", drive(CLEAN)[0]
+    speeds = {name: 0.0 * table[name] + 1.0 for name in table if "speed" in str(name)}
+    table.assign(**speeds).to_csv(log, index=False)
+    _, out, _ = run("inspect", log)
+    assert "nan" not in out and "worth it:" not in out
 
 
 def test_a_blocker_ends_with_status_1(tmp_path: Path, run: Run) -> None:

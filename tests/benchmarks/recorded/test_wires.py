@@ -161,3 +161,16 @@ def test_a_stream_moves_the_course_as_the_whole_record_does(tmp_path: Path) -> N
     write_vehicle(car, PASSENGER_CAR, SignalCalibration(at={"accel": [1.0, 0.0, 0.0]}))
     with pytest.raises(ValueError, match="accelerations of the centre of gravity"):
         sideslip.Stream(car, names)
+
+
+def test_a_stated_latency_comes_to_the_logged_one() -> None:
+    log, _ = drive(1)
+    packets = log.record.packets.copy()
+    packets[:, PACKET.arrived] += 10
+    slow = {"gps": dataclasses.replace(log.slow["gps"], delays=(0.1,))}
+    record = dataclasses.replace(log.record, packets=packets)
+    late = apply_wires(
+        dataclasses.replace(log, record=record, slow=slow), SignalCalibration(latency={"gps": 0.2})
+    )
+    delays = late.record.packets[:, PACKET.arrived] - late.record.packets[:, PACKET.captured]
+    assert late.slow["gps"].longest_delay == pytest.approx(0.3) and set(delays) == {30.0}
