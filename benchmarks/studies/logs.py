@@ -68,7 +68,8 @@ def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
     """Mark the rows that count: moving forward, settled, with a truth."""
     truth = log.truth.get("beta", np.full(len(log.time), np.nan))
     is_settled = log.time >= log.time[0] + SETTLED - 1e-9
-    return is_settled & find_moving(log) & ~find_backward(log) & np.isfinite(truth)
+    is_scored = is_settled & find_moving(log) & ~find_backward(log) & np.isfinite(truth)
+    return np.asarray(is_scored, np.bool_)
 
 
 def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:

@@ -121,7 +121,7 @@ def test_a_cure_contains_what_is_stated(tmp_path: Path, run: Run) -> None:
 
 def test_a_car_that_hardly_moves_is_no_drive(tmp_path: Path, run: Run) -> None:
     log, table = tmp_path / "drive.csv", drive(CLEAN)[0]
-    speeds = {name: 0.0 * table[name] + 1.0 for name in table if "speed" in str(name)}
+    speeds = {str(x): 0.0 * table[x] + 1.0 for x in table if "speed" in str(x)}
     table.assign(**speeds).to_csv(log, index=False)
     _, out, _ = run("inspect", log)
     assert "nan" not in out and "worth it:" not in out
