@@ -186,7 +186,7 @@ def read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable
     return _join_channels(columns, units, names)
 
 
-def _check_formula(name: str, conversion: Any) -> None:
+def _check_formula(name: str, conversion: object) -> None:
     """Check a channel's conversion: asammdf gives a formula beyond arithmetic to Python's eval."""
     formula = getattr(conversion, "formula", "") or ""
     if not _ARITHMETIC.fullmatch(formula):

@@ -1,7 +1,6 @@
 """One drive in eleven containers gives the same record; what is wrong with a file is one line."""
 
 import functools
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -448,4 +447,3 @@ def test_a_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
     (path / "metadata.yaml").unlink()
     with pytest.raises(ValueError, match="expected a file, found a folder"):
         read_parts(path, BAG)
-    shutil.rmtree(path)
