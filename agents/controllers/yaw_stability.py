@@ -303,31 +303,6 @@ MODEL_IN = ModelInputs(*range(9))
 MODEL_LAST = ModelMemory(*range(4))
 
 
-def compute_feedback_gains(
-    vehicle: Vehicle, speed: float, bandwidth: Sequence[float] = MODEL_BANDWIDTH
-) -> tuple[Array, Array]:
-    """Compute P and I of C_fb = P + I / s, from errors of beta and gamma to delta_f and N_z.
-
-    (31) solved for C_fb gives P_n^-1 diag(K / s) = B^-1 diag(K) - B^-1 A diag(K) / s, a proper
-    PI. The closed loop is diag(K / (s + K)) and the poles of A, which the PI's zeros cancel: it is
-    internally stable where the nominal car is, below its critical speed. The printed (32) is this
-    for equal K only.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        bandwidth: K_beta and K_gamma (rad/s).
-
-    Returns:
-        P and I, each of shape (2, 2).
-    """
-    plant = _plant(Bicycle(*map(float, vehicle.lateral)), float(speed))
-    columns = np.diag(np.asarray(bandwidth, np.float64))
-    P = [_inputs(plant, *column) for column in columns]
-    I = [_inputs(plant, *(-x for x in _drift(plant, *column))) for column in columns]  # noqa: E741
-    return np.array(P).T, np.array(I).T
-
-
 @jit
 def _model_following_law(
     x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]

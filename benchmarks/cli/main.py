@@ -151,7 +151,6 @@ class _Bench:
     html: File
     json: File
     parquet: File
-    picture: File = take("The summary: PNG, PDF or SVG.", ends=".png .pdf .svg")
     page: File = take("Put the tables between this Markdown page's marks.", ends=".md")
     jobs: int | None
     episodes: int | None = take("A cell of control (256), or seeds of other suites.", min=4)
@@ -191,13 +190,9 @@ class _Bench:
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
             done = run_suites(names, request, comparison)
         write_output(console, done, vars(self), brief=True)
-        if self.picture is not None:
-            from ..picture import write_picture
-
-            write_picture(self.picture, done)
         if self.page is not None:
             write_page(self.page, done)
-        print_written(console, self.picture, self.page)
+        print_written(console, self.page)
 
     def _make_comparison(self, agents: list[str], filters: list[str]) -> "ComparisonRequest":
         """Make the request of a user's own entries."""

@@ -1,4 +1,4 @@
-"""Results of suites: rows for machines, tables of numbers and maps, and the files of rows."""
+"""Results of suites: rows for machines, tables of numbers, and the files of rows."""
 
 import json
 import math
@@ -13,7 +13,6 @@ import numpy as np
 
 from ... import __version__
 from ...envs.io import atomic_file, from_json, write_atomic
-from ...envs.record import Array
 from ...envs.validation import check_choice
 from .metrics import METRICS
 from .stats import Estimate
@@ -137,18 +136,6 @@ def _rescale(cell: Cell, scale: float) -> Cell:
     return cell.rescale(scale) if isinstance(cell, Estimate) else scale * np.asarray(cell)
 
 
-@dataclass(frozen=True)
-class ShareMap:
-    """Fractions between 0 and 1 over two axes."""
-
-    title: str
-    x: Array  # values of the horizontal axis
-    y: Array  # values of the vertical axis
-    shares: Mapping[str, Array]  # fractions by name, each of shape (y, x)
-    x_label: str  # label of the horizontal axis
-    y_label: str  # label of the vertical axis
-
-
 @dataclass
 class Suite:
     """The result of a benchmark: rows for machines, tables and figures for people.
@@ -163,7 +150,6 @@ class Suite:
     tables: list[ResultTable] = field(default_factory=list)
     figures: list[tuple[str, "Figure", str]] = field(default_factory=list)  # title, plotly, caption
     explorers: list[Explorer] = field(default_factory=list)  # figures with menus
-    maps: list[ShareMap] = field(default_factory=list)  # maps for the summary's PNG
     files: list[tuple[str, str, str]] = field(default_factory=list)  # name, media type, text
     verdict: str = ""  # answer in plain words, at most five lines
     warnings: list[str] = field(default_factory=list)  # about the input, above the verdict

@@ -12,13 +12,11 @@ import numpy.typing as npt
 
 from ...envs.numerics import require_extra
 from ...envs.record import Array
-from ...envs.rendering.palette import FACTS, GREY, INK, find_base, find_colour
-from ..harness.results import ShareMap
+from ...envs.rendering.palette import FACTS, GREY, find_base, find_colour
 from ..harness.stats import Estimate
 
 with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
-    from plotly.subplots import make_subplots
 
 SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
 """Colours from bad to good, safe for the colour-blind."""
@@ -294,36 +292,4 @@ def draw_heat_map(
     figure.update_layout(
         height=170 + 22 * len(names), hovermode="closest", showlegend=False, meta="scroll"
     )
-    return figure
-
-
-def draw_share_maps(share_map: ShareMap) -> go.Figure:
-    """Draw fractions over two axes, a panel for each name, with the line at one half.
-
-    Args:
-        share_map: Fractions.
-
-    Returns:
-        Figure.
-    """
-    n_columns = min(3, len(share_map.shares))
-    n_rows = -(-len(share_map.shares) // n_columns)
-    names = list(share_map.shares)
-    gaps = {"horizontal_spacing": 0.06, "vertical_spacing": 0.28 / n_rows}
-    figure = make_subplots(n_rows, n_columns, subplot_titles=names, shared_yaxes=True, **gaps)
-    for i, (name, share) in enumerate(share_map.shares.items()):
-        place = {"row": i // n_columns + 1, "col": i % n_columns + 1}
-        hover = f"{name}<br>%{{x:.1f}}, %{{y:.1f}}: %{{z:.2f}}<extra></extra>"
-        axes = {"x": share_map.x, "y": share_map.y, "z": share}
-        figure.add_trace(go.Heatmap(**axes, coloraxis="coloraxis", hovertemplate=hover), **place)
-        half = {"start": 0.5, "end": 0.5, "size": 1.0, "coloring": "none"}
-        pen = {"contours": half, "line": {"color": INK, "width": 1.5}}
-        figure.add_trace(go.Contour(**axes, **pen, showscale=False, hoverinfo="skip"), **place)
-        figure.update_xaxes(title_text=share_map.x_label, **place)
-        if place["col"] == 1:
-            figure.update_yaxes(title_text=share_map.y_label, **place)
-    scale = [list(stop) for stop in SHARE_SCALE]
-    bar = {"colorscale": scale, "cmin": 0.0, "cmax": 1.0, "colorbar": {"title": {"text": "share"}}}
-    figure.update_layout(height=120 + 230 * n_rows, coloraxis=bar, showlegend=False, meta="scroll")
-    figure.update_layout(margin={"t": 34, "l": 60, "b": 52})
     return figure

@@ -26,7 +26,6 @@ from sideslip.benchmarks.control.tasks import (
     make_tuning_seeds,
 )
 from sideslip.benchmarks.report import study
-from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suites
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
@@ -187,5 +186,5 @@ def test_tuning_seeds_are_nobody_elses() -> None:
     """Suites and users count theirs from 0: what they look at, nobody tuned on."""
     tuned = make_tuning_seeds(4096)
     assert tuned[:64] == make_tuning_seeds(64) and len(set(tuned)) == 4096
-    for first in (0, recovery_region.FIRST_SEED, calibration._FIRST):
+    for first in (0, calibration._FIRST):
         assert set(tuned).isdisjoint(range(first, first + 2**20))

@@ -1,6 +1,5 @@
 """Verdicts name the truly best by construction, call a tie a tie, and stay within five lines."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from sideslip.benchmarks.recorded.suite import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 from sideslip.benchmarks.speed.timing import Taken
-from sideslip.benchmarks.studies import coordinated_control, estimation, recovery_region
+from sideslip.benchmarks.studies import estimation
 
 RNG = np.random.default_rng(0)
 
@@ -77,44 +76,6 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
     assert "2.00 times the least possible" in camera
     assert "err least, too close to tell apart" in gps and "dakf" in gps and "course-kf" in gps
     assert "4.0 and 2.0 times as large" in why
-
-
-def shares(level: float) -> Any:
-    return np.clip(level + RNG.normal(0.0, 0.01, (5, 5, 8)), 0.0, 1.0)
-
-
-def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
-    levels = {"none": 0.2, "two-dof": 0.3, "esc": 0.7, "lqr": 0.5}
-    levels |= dict(zip(recovery_region.ORACLES, (0.8, 0.9), strict=True))
-    cars = {"a car": {name: shares(level) for name, level in levels.items()}}
-    cars["a car"][recovery_region.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
-    cars["another"] = cars["a car"] | {"lqr": cars["a car"]["esc"]}
-    _, first, second, why, _ = fits(recovery_region.STUDY.compose_verdict(cars))
-    assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
-    assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
-    assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
-    undriven = {"a car": {"none": shares(0.1)}}
-    assert len(fits(recovery_region.STUDY.compose_verdict(undriven))) == 2
-
-
-def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None:
-    over = [0.9, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02]
-    found = np.ones((8, 4, 4))
-    found[1:, :, :2] = np.array(over)[:, None, None]
-    found[..., 3] = 0.0
-    found[6:, 0, 3] = 1.0  # K = 50 and 100: a run fails
-    lanes = [np.full((30, 3), 5.0)]
-    for i in range(1, len(coordinated_control.LANE_CONTROLLERS)):
-        rng = np.random.default_rng(i)  # the same whatever ran before
-        lanes.append(np.column_stack([rng.normal(1.0 if i != 4 else 0.5, 0.05, 30)] * 3))
-    compose = coordinated_control.STUDY.compose_verdict
-    results = coordinated_control.FollowingResults(found, found, lanes)
-    _, follows, lane, why, _ = fits(compose(results))
-    assert "K = 20 rad/s errs least, 10 %" in follows and "fail at 50, 100" in follows
-    assert lane.startswith("Lanes: both on multirate-residual-kf strays least, 5")
-    assert re.search(r"m by -(4|5)\d %", why) and "5.0 m" in why
-    found[..., 3] = 1.0
-    assert "every bandwidth" in compose(results)
 
 
 def claim(paper: str, stated: str, value: float) -> Any:
