@@ -198,7 +198,7 @@ def _make_headlines(root: Path) -> list[str]:
     """
     table = json.loads((root / "docs/next_car.json").read_text(encoding="utf-8"))
     whole = table["rows"][0]
-    key, speeds = ("YawFusion-v0 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
+    key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
     (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
     cells, limit = _Cells(read_json(root / ROWS)), f"tier {LIMIT}"
     by_tier = [cells.find(f"tier {tier}", ENTRIES[_BEST]) for tier in TITLES]

@@ -78,6 +78,11 @@ class Card:
         check_names_no_code(self.env_id, self.estimator, self.estimator_options)
         self._to_json()
 
+    @property
+    def world_id(self) -> str:
+        """Id of the env in the world of the training: version 1 is version 0 with its errors."""
+        return self.env_id.replace("-v0", f"-v{self.world_version}")
+
     @classmethod
     def from_env_id(
         cls,

@@ -117,7 +117,7 @@ def _list_policies() -> dict[str, str]:
     lines = {}
     for name in list_shipped():
         card = load_policy(name).card
-        lines[name] = f"{card.algorithm} on {card.env_id}, estimator {card.estimator or 'none'}"
+        lines[name] = f"{card.algorithm} on {card.world_id}, estimator {card.estimator or 'none'}"
     return lines
 
 

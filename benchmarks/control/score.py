@@ -209,7 +209,7 @@ class Standing:
         for task, metrics in self.by_task.items():
             where = {"scenario": task.name, "spec": ControlCase(task, self.entry).spec}
             n = len(self.drives[task].costs)
-            suite.add_rows([metrics], task.env_id, n=n, **where, **labels)
+            suite.add_rows([metrics], task.world_id, n=n, **where, **labels)
         labels["scenario"] = f"tier {self.tier}"
         suite.add_rows([self.overall], n=self.n, **labels)
         suite.add_rows([{"us_per_decision": self.us}], **labels)

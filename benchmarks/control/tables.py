@@ -160,7 +160,7 @@ def _describe_policies() -> list[str]:
     names = [entry.agent for entries in LEARNED.values() for entry in entries]
     cards = {name: load_policy(name).card for name in names if is_policy(name)}
     return [
-        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} in "
+        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.world_id} in "
         f"{card.cpu_seconds:.0f} CPU-s, for the reference {card.reference}."
         for name, card in cards.items()
     ]

@@ -84,6 +84,11 @@ class ControlTask:
         return {name: getattr(self, name) for name in names}
 
     @property
+    def world_id(self) -> str:
+        """Id of the env in the tier's world."""
+        return self.env_id.replace("-v0", f"-{WORLD}") if self.tier else self.env_id
+
+    @property
     def seed_text(self) -> str:
         """JSON from which the seeds are drawn."""
         return json.dumps(self.record)
