@@ -74,7 +74,8 @@ class PolicyEvaluation:
         text = (
             f"{len(self.seeds)} episodes of {task.scenario}, the same seeds for all. "
             f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
-            f"steps of {card.world_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
+            f"steps of {card.world_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} "
+            "CPU-s."
         )
         if self.reference != card.reference:
             text += f" Here it is judged by another reference, {self.reference}: by another cost."
