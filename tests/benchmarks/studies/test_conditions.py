@@ -13,7 +13,14 @@ from sideslip.benchmarks.harness.drives import make_unchecked_filter
 from sideslip.benchmarks.harness.results import read_json
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import conditions
-from sideslip.benchmarks.studies.conditions import BAD_INPUT, BASE, CONDITIONS, Condition, Edit
+from sideslip.benchmarks.studies.conditions import (
+    BAD_INPUT,
+    BASE,
+    CONDITIONS,
+    IDEALLY,
+    Condition,
+    Edit,
+)
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.estimators.filters import FILTERS
 
@@ -74,16 +81,19 @@ def test_stamps_are_late_by_packets(name: str, late: int) -> None:
 
 
 def test_a_scenario_does_what_its_name_says() -> None:
-    assert drive("mass + 25 %", duration=SHORT)[2].vehicle.mass == 1.25 * 1500.0
-    assert drive("mass + 25 %", duration=SHORT)[2].nominal.mass == 1500.0
-    assert drive("friction 0.35, hard steering", duration=SHORT)[2].vehicle.friction == 0.35
+    loaded = drive("mass + 25 %" + IDEALLY, duration=SHORT)[2]
+    assert loaded.vehicle.mass == 1.25 * loaded.nominal.mass == 1.25 * 1500.0
+    slippery = drive("friction 0.35, hard steering" + IDEALLY, duration=SHORT)[2]
+    assert slippery.vehicle.friction == 0.35
     speed = drive("stops and stands")[0].record.fast[9500:, FAST.wheel_left]
     assert np.abs(speed).max() < 0.2
     log = drive("stop and go")[0]
     assert log.record.fast[4900, FAST.wheel_left] - log.record.fast[9500, FAST.wheel_left] > 4.5
     captured = drive("no GPS for 10 s")[0].record.packets[:, PACKET.captured]
     assert not ((captured > 6000) & (captured < 15800)).any()
-    assert not drive(BASE, duration=SHORT)[2].config.world.is_ideal
+    for name in NAMED:
+        is_ideal = drive(name, duration=0.1)[2].config.world.is_ideal
+        assert is_ideal == name.endswith(IDEALLY), name
 
 
 def measure(name: str, seeds: int) -> dict[str, Any]:
@@ -93,7 +103,7 @@ def measure(name: str, seeds: int) -> dict[str, Any]:
 
 
 def test_who_is_told_errs_less_and_nobody_alarms_without_a_fault() -> None:
-    for name in (BASE, "camera and GPS"):
+    for name in (BASE, "camera and GPS" + IDEALLY):
         cells = measure(name, 6)
         assert 1.0 < cells["rmse_over_told"].value < 4.0, name
         assert cells["rmse_over_gyro"].value < 1.0 and cells["coverage"].value > 0.88
@@ -102,7 +112,7 @@ def test_who_is_told_errs_less_and_nobody_alarms_without_a_fault() -> None:
 
 def test_who_is_told_is_honest() -> None:
     """So its levels are those of the drives."""
-    condition, squares = NAMED["camera and GPS"], []
+    condition, squares = NAMED["camera and GPS" + IDEALLY], []
     for seed in range(conditions._FIRST_SEED, conditions._FIRST_SEED + 4):
         run = conditions._run_informed_filter(condition, seed)
         error = run["beta"] - conditions._drive_car(condition, seed)[0].truth["beta"]
@@ -134,7 +144,7 @@ def test_a_filter_that_is_lost_says_so() -> None:
 
 
 def test_looking_at_the_health_changes_no_bit() -> None:
-    log, _, base = drive("camera and GPS", duration=SHORT)
+    log, _, base = drive(BASE, duration=SHORT)
     filter_ = make_unchecked_filter(conditions.NAME, log, base.nominal, {})
     beta, deviation, healthy = conditions._run_with_health(filter_, log)
     run = filter_.run(log)
@@ -143,12 +153,13 @@ def test_looking_at_the_health_changes_no_bit() -> None:
 
 
 def test_a_run_has_rows_verdict_and_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    short = [dataclasses.replace(NAMED[name], duration=4.0) for name in (BASE, "GPS", BAD_INPUT)]
+    names = BASE, "GPS", BAD_INPUT, "GPS" + IDEALLY
+    short = [dataclasses.replace(NAMED[name], duration=4.0) for name in names]
     monkeypatch.setattr(conditions, "CONDITIONS", short)
     suite = conditions.STUDY.run(Request(quick=True, jobs=1))
     metrics = {"rmse", "rmse_over_told", "rmse_over_gyro", "nees", "coverage"}
     assert {row.metric for row in suite.rows} >= metrics
-    assert {row.scenario: row.n for row in suite.rows} == {BASE: 16, "GPS": 4, BAD_INPUT: 4}
+    assert {row.scenario: row.n for row in suite.rows} == dict.fromkeys(names, 4) | {BASE: 16}
     lines = suite.verdict.splitlines()
     assert len(lines) == 5 and max(map(len, lines)) <= 110 and "worst is GPS" in lines[1]
     assert suite.answers[0][2] == lines[1] and len(suite.tables) == 1
@@ -161,13 +172,18 @@ def test_the_page_says_what_its_file_says() -> None:
         cells.setdefault(row.scenario, {})[row.metric] = row.value
     assert list(cells) == list(NAMED) and {row.suite for row in rows} == {"conditions"}
     text = " ".join((DOCS / "results" / "conditions.md").read_text().split())
-    judged = [item for name, item in cells.items() if name not in (BASE, BAD_INPUT)]
+    others = {name: cells[name] for name in NAMED if name != BASE and BAD_INPUT not in name}
+    judged = [item for name, item in others.items() if not name.endswith(IDEALLY)]
+    clean = [item["nees"] for name, item in others.items() if name.endswith(IDEALLY)]
     middle = np.median([item["rmse_over_told"] for item in judged])
     held = sum(item["coverage"] >= 0.88 for item in judged)
+    honest = sum(0.5 <= item["nees"] <= 2.0 for item in judged)
     for sentence in (
         f"In world `v1` it errs {cells[BASE]['rmse_over_told']:.2f} times as much.",
-        f"Over {len(judged)} other conditions the median is {middle:.2f}.",
-        f"The 95 % interval holds at least 88 % of the time in {held} of them.",
+        f"With one error more, in {len(judged)} conditions, the median is {middle:.2f}.",
+        f"The 95 % interval holds at least 88 % of the time in {held} of them, and NEES is 0.5 to 2 "
+        f"in {honest}.",
+        f"its interval is about twice too wide (NEES {np.median(clean):.1f})",
     ):
         assert sentence in text, sentence
     few, many = sorted({row.n for row in rows})[-2:]
