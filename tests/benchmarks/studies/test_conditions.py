@@ -181,8 +181,8 @@ def test_the_page_says_what_its_file_says() -> None:
     for sentence in (
         f"In world `v1` it errs {cells[BASE]['rmse_over_told']:.2f} times as much.",
         f"With one error more, in {len(judged)} conditions, the median is {middle:.2f}.",
-        f"The 95 % interval holds at least 88 % of the time in {held} of them, and NEES is 0.5 to 2 "
-        f"in {honest}.",
+        f"The 95 % interval holds at least 88 % of the time in {held} of them.",
+        f"NEES is 0.5 to 2 in {honest}.",
         f"its interval is about twice too wide (NEES {np.median(clean):.1f})",
     ):
         assert sentence in text, sentence
