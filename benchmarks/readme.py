@@ -19,7 +19,7 @@ from rich.console import Console
 from ..envs.scenarios.world import GROUPS, make_world
 from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .control.run import Results, measure
-from .control.score import rank_entries
+from .control.score import CONSTANTS, Standing, rank_entries
 from .control.tasks import (
     LIMIT,
     NOMINAL,
@@ -88,11 +88,24 @@ def _measure_entries(
         for tier in TITLES:
             for standing in rank_entries(results, tier):
                 standing.add_rows(suite, salt)
+                if not changes:
+                    suite.add_rows(_score_otherwise(standing), salt=salt)
         suffix = _DOUBLED if changes else ""
         rows += [
             replace(x, scenario=x.scenario + suffix) for x in suite.rows if x.metric in METRICS
         ]
     return rows
+
+
+def _score_otherwise(standing: Standing) -> list[dict[str, Any]]:
+    """Make rows of an entry's score by other constants."""
+    names = {"controller": standing.entry.agent, "estimator": standing.entry.estimator}
+    return [
+        names
+        | {"scenario": f"tier {standing.tier}, {label}", "n": standing.n}
+        | {"score": standing.compute_score(*constants)}
+        for label, constants in CONSTANTS.items()
+    ]
 
 
 def _list_tasks() -> list[ControlTask]:

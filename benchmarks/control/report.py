@@ -24,7 +24,7 @@ from ..report.film import make_track_kml
 from .baseline_gaps import DELAY_TASK, DELAYS
 from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, Entry
 from .run import SIGNALS
-from .score import PairedDrives, Standing, check_losses
+from .score import CONSTANTS, PairedDrives, Standing, check_losses
 from .tables import Matrix, compute_gaps, subtract
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask
 
@@ -233,8 +233,6 @@ _CAPTION = (
     "nominal: an LQG that knows the data sheet. A loss that nominal does not have counts as 7.4 "
     "times its cost. Whiskers: 95 % intervals. Hollow: a variant."
 )
-_CONSTANTS = {"as scored": (2.0, 1.0), "a loss: 1": (1.0, 1.0), "a loss: 3": (3.0, 1.0)}
-_CONSTANTS |= {"half of J_0": (2.0, 0.5), "twice J_0": (2.0, 2.0)}
 
 
 def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
@@ -324,22 +322,22 @@ def _draw_maps(
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
             columns = [task.name for task in tasks]
             figures.append((title, draw.draw_heat_map(names, columns, values, metric, good), text))
-    places = np.array([_compute_places(standings, *pair) for pair in _CONSTANTS.values()]).T
+    places = np.array([_compute_places(standings, *pair) for pair in CONSTANTS.values()]).T
     title = f"Tier {tier}: places, by the score's constants"
     text = "The line between entries that surely lose more cars than nominal, and others, stays."
-    heat_map = draw.draw_heat_map(names, list(_CONSTANTS), places, "place", "low")
+    heat_map = draw.draw_heat_map(names, list(CONSTANTS), places, "place", "low")
     return [*figures, (title, heat_map, text)]
 
 
 def _compute_places(standings: Sequence[Standing], loss: float, floor_factor: float) -> Array:
     """Compute the places of entries by a score of other constants, 1 for the best, NaN for none."""
-    keys = []
-    for standing in standings:
-        scores = [x.compute_scores(loss, floor_factor).mean() for x in standing.pairs.values()]
-        keys.append((standing.loses_more, -float(np.mean(scores)) if scores else math.inf))
+    scores = [standing.compute_score(loss, floor_factor) for standing in standings]
+    keys = [
+        (standing.loses_more, math.inf if math.isnan(score) else -score)
+        for standing, score in zip(standings, scores, strict=True)
+    ]
     order = sorted(range(len(keys)), key=keys.__getitem__)
-    places = np.argsort(order) + 1.0
-    return np.where([score < math.inf for _, score in keys], places, np.nan)
+    return np.where(np.isnan(scores), np.nan, np.argsort(order) + 1.0)
 
 
 def make_tracks(matrix: Matrix) -> list[tuple[str, str, str]]:

@@ -33,6 +33,14 @@ from .run import DriveResult, Results
 from .tasks import NOMINAL, ControlTask
 
 LOSS = 2.0  # r of a drive that nominal alone loses, and less it where the entry alone does
+CONSTANTS = {
+    "as scored": (LOSS, 1.0),
+    "a loss: 1": (1.0, 1.0),
+    "a loss: 3": (3.0, 1.0),
+    "half of J_0": (LOSS, 0.5),
+    "twice J_0": (LOSS, 2.0),
+}
+"""Other constants of the score: r of a loss, and the factor on J_0."""
 _CLIP = 3.0
 FAILURE_RATIO = 20.0  # times nominal's cost, of a failure in `compute_log_ratios`
 _RATES = {"spin": "spin_rate", "off-road": "departure_rate", "not-finite": "not_finite_rate"}
@@ -137,6 +145,19 @@ class Standing:
     def scores(self) -> dict[ControlTask, Array]:
         """r of each drive by task."""
         return {task: pair.compute_scores() for task, pair in self.pairs.items()}
+
+    def compute_score(self, loss: float, floor_factor: float) -> float:
+        """Compute the score by other constants.
+
+        Args:
+            loss: r of a drive that nominal alone loses.
+            floor_factor: Factor on J_0.
+
+        Returns:
+            Mean of the tasks' means, NaN where none was driven.
+        """
+        means = [pair.compute_scores(loss, floor_factor).mean() for pair in self.pairs.values()]
+        return float(np.mean(means)) if means else math.nan
 
     @cached_property
     def by_task(self) -> dict[ControlTask, dict[str, Estimate]]:
