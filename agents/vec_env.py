@@ -29,13 +29,14 @@ _Indices = int | Iterable[int] | None
 _Wrapping = Callable[[CarVectorEnv], CarVectorEnv]
 _ROW_ATTRIBUTES = (  # each is a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
-    "estimator", "np_random", "np_random_seed",
+    "estimator", "np_random", "np_random_seed", "config",
 )  # fmt: skip
 _SHARED_ATTRIBUTES = (  # each is the same for all rows
-    "layout", "control_period", "reference", "dt", "setting", "config", "spec", "render_mode",
+    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode",
     "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
+_OTHER_NAMES = {"config": "row_configs"}  # of what the vector env has one of all rows too
 _METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
 _SCALES = {  # by unit, what is much in a drive; other units keep their numbers
     "rad": STEER_SCALE, "rad/s": GAMMA_SCALE, "m/s": 10.0, "m/s2": 1.0, "m": 1.0, "N": 500.0,
@@ -69,7 +70,7 @@ class _VecEnvRow:
             return self._set[name]
         if name in _METHODS:
             return getattr(self, name)
-        attribute = f"single_{name}" if name in _SPACES else name
+        attribute = f"single_{name}" if name in _SPACES else _OTHER_NAMES.get(name, name)
         if name in (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES):
             for layer in self._iterate_layers():
                 if attribute in vars(layer) or hasattr(type(layer), attribute):
@@ -329,7 +330,15 @@ def make_vec_env(
     bridge.action_space.seed(seed)
     bridge.seed(seed)
     monitor = VecMonitor(bridge, monitor_file, tuple(info_keywords))
-    return ScaledVecEnv(monitor, get_layout(env)) if scaled else monitor
+    if not scaled:
+        return monitor
+    layout = get_layout(bridge.vector_env)
+    if (len(layout),) != bridge.observation_space.shape:
+        raise ValueError(
+            f"observations have {bridge.observation_space.shape} entries and the layout "
+            f"{len(layout)}: scaled=False leaves them alone"
+        )
+    return ScaledVecEnv(monitor, layout)
 
 
 def make_native_env(

@@ -94,15 +94,15 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     (floats, `failure` an int code of `sideslip.envs.FAILURES`, `is_success` a bool).
 
     ## Options of reset
-    `scenario`, `vehicle`, `friction`, `duration` (s), `state` (mapping of `v_x, v_y, gamma, psi, X,
-    Y, s, y, theta`, `phi, phi_dot` where the car rolls, `slip_f, slip_r` where its tyres relax);
-    unknown keys raise ValueError.
+    `scenario`, `vehicle` (the true one: `nominal` stays), `friction`, `duration` (s), `state`
+    (mapping of `v_x, v_y, gamma, psi, X, Y, s, y, theta`, `phi, phi_dot` where the car rolls,
+    `slip_f, slip_r` where its tyres relax); unknown keys raise ValueError.
 
     Args:
         sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
         scenario: Name, file, mapping or `Scenario`, as `make_scenario` reads it.
         vehicle: The true vehicle: name, file, mapping or `Vehicle`, as `make_vehicle` reads it.
-        nominal: The vehicle of estimators and controllers; None for the true one.
+        nominal: The vehicle of estimators and controllers; None for `vehicle`.
         control_period: Ticks (1 ms) between two decisions.
         reference: "zero-slip", "model" (the nominal steady state), "limited" (that, by friction) or
             "lagged" (limited, never oversteering, with a lag of 0.1 s).
@@ -371,13 +371,14 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
+        """Restore a snapshot of this env, or of one like it: until the next reset car, scenario and
+        clocks are the snapshot's.
 
         Args:
             snapshot: Return value of `get_state`.
 
         Raises:
-            ValueError: If it is of another car, road, control period, sensors or observation.
+            ValueError: If it is of another control period, road, sensors or observation.
         """
         self._restore(snapshot)
 

@@ -36,7 +36,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
     _has_over = False  # whether a row may be over
 
     def __init__(self, autoreset_mode: str | AutoresetMode, rows: list[EnvConfig]) -> None:
-        self.num_envs, self._row_configs, self.config = len(rows), rows, rows[0]
+        self.num_envs, self.row_configs, self.config = len(rows), rows, rows[0]
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -125,7 +125,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         configs: list[EpisodeConfig] = []
         known: dict[tuple[object, ...], int] = {}  # rows with the same objects share a config
         for m, i in enumerate(chosen.tolist()):
-            config, values = self._row_configs[i], row_options[i]
+            config, values = self.row_configs[i], row_options[i]
             key = (id(config), *values, *map(id, values.values()))
             if key not in known:
                 known[key] = len(configs)

@@ -80,6 +80,10 @@ class EpisodeConfig:
     held_speed: float | None  # m/s, where it is one number and held exactly
 
 
+_SlowChanges = Mapping[str, Mapping[str, Any] | None]
+"""Changes to slow sensors by name, as `apply_changes` takes them."""
+
+
 def make_car(vehicle: Vehicle) -> CarParams:
     """Make the plant's parameters of a vehicle.
 
@@ -139,13 +143,16 @@ def _make_speed_profile(scenario: Scenario, lead_in: float) -> SpeedProfile:
     return profile._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
 
 
-def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None, lead_in: float) -> Link:
+def _make_link(
+    scenario: Scenario, name: str, sensor: SlowSensor | None, lead_in: float, world: World
+) -> Link:
     """Make a slow sensor's link with the scenario's outage behind a lead-in (ticks)."""
     try:
         outage = getattr(scenario, f"{name}_outage", None)
         if outage is not None:
             outage = tuple(time + lead_in * TICK for time in outage)
-        return make_link(sensor, outage)
+        max_stamp = get_range(world.gps_stamp)[1] if name == "gps" else 0.0
+        return make_link(sensor, outage, max_stamp)
     except ValueError as error:
         raise ValueError(f"scenario {short_repr(scenario.name)}: {name}: {error}") from None
 
@@ -157,9 +164,12 @@ def _compute_gains(exponent: float) -> tuple[float, float]:
 
 
 def _apply_scenario_clocks(
-    sensors: dict[str, SlowSensor], scenario: Scenario
+    sensors: dict[str, SlowSensor], scenario: Scenario, changes: _SlowChanges
 ) -> dict[str, SlowSensor]:
-    """Replace clocks and delays of the sensors by the fields `<sensor>_...` of a scenario."""
+    """Replace clocks and delays of the sensors by the fields `<sensor>_...` of a scenario.
+
+    The env's own changes to the sensors come over these, a drawn latency on top of both.
+    """
     changed = {}
     for name, sensor in sensors.items():
         period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
@@ -170,6 +180,7 @@ def _apply_scenario_clocks(
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         if loss := getattr(scenario, f"{name}_loss", 0.0):
             sensor = dataclasses.replace(sensor, loss=loss)
+        sensor = apply_changes({name: sensor}, {name: changes.get(name)})[name]
         low, high = map(count_ticks, get_range(getattr(scenario, f"{name}_latency", 0.0)))
         if high > 0.0:  # the worst case: the smallest latency as a delay, the rest as jitter
             delays = tuple(delay + low * TICK for delay in sensor.delays)
@@ -230,7 +241,7 @@ class EnvConfig:
     vision: str
     delay: str | None
     strict: bool
-    slow_changes: Mapping[str, Mapping[str, Any] | None]
+    slow_changes: _SlowChanges
     world: World = IDEAL
     lead_in: float = 0.0  # s
 
@@ -310,7 +321,7 @@ class EnvConfig:
         if self.lead_in:
             _check_later_start(scenario)
         lead_in = n * math.ceil(count_ticks(self.lead_in) / n)  # in whole steps
-        slow = _apply_scenario_clocks(self.slow, scenario)
+        slow = _apply_scenario_clocks(self.slow, scenario, self.slow_changes)
         if "gps" in slow and get_range(world.gps_stamp) != (0.0, 0.0):  # its clock is its own
             slow["gps"] = dataclasses.replace(slow["gps"], phase=None)
         if self.vision == "image":
@@ -319,7 +330,9 @@ class EnvConfig:
         check_choice("reference", self.reference, REFERENCES)
         if scenario.roll:
             vehicle.check_roll()
-        links = {name: _make_link(scenario, name, slow.get(name), lead_in) for name in SLOW_NAMES}
+        links = {
+            name: _make_link(scenario, name, slow.get(name), lead_in, world) for name in SLOW_NAMES
+        }
         if "gps" in slow:
             slow["gps"] = _apply_stamp_range(slow["gps"], *get_range(world.gps_stamp))
         hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)

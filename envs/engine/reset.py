@@ -3,7 +3,7 @@
 from ..numerics.functions import CHANNELS, PI, draw_normals, draw_uniforms, exp, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, select
+from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, minimum, select
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
 from ..scenarios.driver import compute_target_angle
@@ -191,7 +191,8 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
         link, column = read(p, P.slow[sensor]), Z.slow[sensor]
         share = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)[0]
         phase = select(link.phase < 0.0, floor(share * link.period), link.phase)
-        phase = phase + select(phase + link.stamp < 0.0, link.period, 0.0)  # no stamp before tick 0
+        early = floor((phase + link.stamp) / maximum(link.period, 1.0))  # periods before tick 0
+        phase = phase - minimum(early, 0.0) * link.period  # no stamp lies there
         z[column.next_capture] = select(link.period > 0.0, phase, NEVER)
         z[column.captured] = NEVER
         z[column.drift] = draw_first_drift(sensor, read(p, P.sky), key_low, key_high)

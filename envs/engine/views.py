@@ -28,7 +28,8 @@ class CarTruth(NamedTuple):
     fiala: Vehicle  # likewise, with Fiala's law fitted to tyres of the Magic Formula
     motor_left: float  # torque over the commanded one, of the left motor
     motor_right: float
-    calibration: Array  # offset and scale of each fast column, (2, FAST_WIDTH)
+    # offset and scale of steering, wheels and torques, (2, FAST_WIDTH); of others 0 and 1
+    calibration: Array
 
 
 class Episode(NamedTuple):
@@ -54,10 +55,12 @@ class Episode(NamedTuple):
         car, change = read(self.params, P.car), read(self.params, P.tyre_change)
         if not car.m > 0.0:  # not reset yet
             return self.config.vehicle
-        is_changed = self.state[Z.clock.tick] >= change.tick
-        return self.config.vehicle.replace(
+        is_changed, vehicle = self.state[Z.clock.tick] >= change.tick, self.config.vehicle
+        return vehicle.replace(
             mass=car.m,
             yaw_inertia=car.I,
+            sprung_mass=vehicle.sprung_mass * (car.S / vehicle.roll_moment_arm),
+            roll_inertia=car.I_x,
             front_arm=car.l_f,
             rear_arm=car.l_r,
             relaxation=car.relaxation,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from highway_env.road.graphics import WorldSurface
 
 MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
+_MAX_PERIOD = 20  # ticks between two looks at a lane that bends
 _OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")
 _FIXED_STATE = ("s", "theta", "X", "Y")
 
@@ -83,6 +84,13 @@ class HighwayEnv(StabilityEnv):
         self.traffic = check_int("traffic", traffic, "vehicles", 0, MAX_VEHICLES)
         adapted = self._adapt_scenario(make_scenario(scenario))
         super().__init__(sensors, adapted, vehicle, reference=reference, **options)
+        if self.config.lead_in:
+            raise ValueError("lead_in: the vehicle ahead does not wait, so an episode has none")
+        if road == "curved" and self.control_period > _MAX_PERIOD:
+            raise ValueError(
+                f"control_period is {self.control_period} ticks; road {road!r} bends, and the lane "
+                f"is found once a step: {_MAX_PERIOD} ticks at most"
+            )
         self._traffic: Traffic | None = None
 
     def _adapt_scenario(self, scenario: Scenario) -> Scenario:

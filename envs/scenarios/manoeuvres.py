@@ -427,7 +427,11 @@ def _parse_scenario(values: Fields) -> Scenario:
     if unknown := [key for key in values if key not in known]:
         raise TypeError(describe_unknown("scenario field", unknown, [*known, "base"]))
     if base is not None:
-        return make_scenario(base).replace(**values)
+        start = make_scenario(base)
+        for name in ("vehicle", "nominal", "noise"):  # the base's numbers that are not named stay
+            if isinstance(values.get(name), Mapping):
+                values[name] = {**getattr(start, name), **values[name]}
+        return start.replace(**values)
     return Scenario(**{"name": "custom", **values})
 
 

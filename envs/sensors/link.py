@@ -82,20 +82,26 @@ class Link(NamedTuple):
     @property
     def max_in_flight(self) -> int:
         """The most packets of a present sensor under way at once, duplicates included."""
-        longest = max(self.delay_0, self.delay_1, self.delay_2, self.delay_3) + self.jitter
+        delay = max(self.delay_0, self.delay_1, self.delay_2, self.delay_3)
+        longest = max(delay + self.jitter, self.stamp)  # nothing arrives before its stamp
         n_packets = int(longest // self.period) + 1
         return 2 * (n_packets + 1) if self.duplicate > 0.0 else n_packets
 
 
-def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
+def make_link(
+    sensor: SlowSensor | None,
+    outage: tuple[float, float] | None = None,
+    max_stamp: float = 0.0,
+) -> Link:
     """Convert a slow sensor to ticks.
 
     Args:
         sensor: Clock and link; None: an absent sensor.
         outage: (from, to) without packets (s).
+        max_stamp: How much later than a capture its stamp is, at most (s).
 
     Returns:
-        The link.
+        The link, whose stamp is 0 until one is drawn.
 
     Raises:
         ValueError: If more packets could be under way at once than the queue holds.
@@ -107,14 +113,15 @@ def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = No
     link = Link._make(
         [count_ticks(sensor.period), phase, float(len(delays)), *delays, *[0.0] * (4 - len(delays)),
          count_ticks(sensor.jitter), sensor.loss, sensor.duplicate,
-         *map(count_ticks, outage or (0.0, 0.0)), 0.0]
+         *map(count_ticks, outage or (0.0, 0.0)), count_ticks(max(max_stamp, 0.0))]
     )  # fmt: skip
     if link.max_in_flight > MAX_IN_FLIGHT:
         raise ValueError(
-            f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s puts "
-            f"{link.max_in_flight} packets under way at once; there is room for {MAX_IN_FLIGHT}"
+            f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s and "
+            f"stamps up to {max(max_stamp, 0.0):g} s later puts {link.max_in_flight} packets under "
+            f"way at once; there is room for {MAX_IN_FLIGHT}"
         )
-    return link
+    return link._replace(stamp=0.0)
 
 
 @jit

@@ -15,6 +15,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.env_info import get_env_facts
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 from sideslip.estimators import EstimateObservation
+from sideslip.estimators.vector import truth as vector_truth
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 pytest.importorskip("stable_baselines3")
@@ -330,3 +331,20 @@ def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) ->
     for name, each in zip(names, changed, strict=True):
         with pytest.raises(ValueError, match=f"^{name} may change observations or actions"):
             make_agent("none", each)
+
+
+def test_a_wrapper_that_adds_entries_has_its_own_scales() -> None:
+    """Of an angle 0.05 rad is one, in the wrapper's entries as in the env's."""
+    plain = make_vec_env(VISION, 2, 0, wrapper_class=vector_truth.TruthObservation, scaled=False)
+    scaled = make_vec_env(VISION, 2, 0, wrapper_class=vector_truth.TruthObservation)
+    names = [entry.name for entry in plain.get_attr("layout")[0]]
+    raw, divided = plain.reset(), scaled.reset()
+    assert raw.shape[1] > make_vec_env(VISION, 2, 0).observation_space.shape[0]
+    for name, scale in (("steer", 0.05), ("true_front_stiffness", 1.0)):
+        column = names.index(name)
+        assert divided[:, column] == pytest.approx(raw[:, column] / scale, rel=1e-6), name
+
+
+def test_each_row_has_its_own_config() -> None:
+    env = make_vec_env(VISION, 2, env_kwargs={"scenario": ["straight", "slalom"]})
+    assert [config.scenario.name for config in env.get_attr("config")] == ["straight", "slalom"]

@@ -190,6 +190,8 @@ def test_steering_is_added_where_it_is_asked_for() -> None:
         ({"scenario": "curved-road-driver"}, "curvature"),
         ({"scenario": {"base": "wet-evasion", "small_angle": True}}, "small_angle"),
         ({"scenario": {"base": "wet-evasion", "path": "iso-3888-2"}}, "path"),
+        ({"lead_in": 5.0}, "the vehicle ahead does not wait"),
+        ({"road": "curved", "control_period": 100}, "control_period is 100 ticks; .* 20 ticks at"),
     ],
 )
 def test_what_is_out_of_place_is_refused(changes: dict[str, Any], words: str) -> None:

@@ -388,3 +388,10 @@ def test_a_car_without_control_mostly_gets_through(name: str) -> None:
         env.reset(seed=seed)
         ends.append(play(env, [0.0] * 200)[-1].terminated)
     assert sum(ends) <= 2
+
+
+def test_numbers_of_a_base_that_are_not_named_stay() -> None:
+    base = make_scenario("coms-slalom")
+    changed = make_scenario({"base": "coms-slalom", "vehicle": {"roll_damping": 1200.0}})
+    assert base.vehicle and changed.vehicle == {**base.vehicle, "roll_damping": 1200.0}
+    assert changed.nominal == base.nominal

@@ -202,9 +202,11 @@ def test_a_loaded_car_drives_as_one_that_was_built_so() -> None:
     heavy = car.replace(
         mass=1.2 * car.mass, yaw_inertia=1.2 * 1.1 * car.yaw_inertia,
         front_arm=car.front_arm + back, rear_arm=car.rear_arm - back,
-        relaxation=0.5 * car.relaxation,
+        relaxation=0.5 * car.relaxation, sprung_mass=1.2 * car.sprung_mass,
+        roll_inertia=1.2 * car.roll_inertia,
     )  # fmt: skip
-    for name in ("mass", "yaw_inertia", "front_arm", "rear_arm", "relaxation"):
+    changed = {"mass", "yaw_inertia", "front_arm", "rear_arm", "relaxation"}
+    for name in changed | {"sprung_mass", "roll_inertia"}:
         assert getattr(loaded.vehicle, name) == pytest.approx(getattr(heavy, name), rel=1e-14)
     tyred = FULL | QUIET | {"tyres": "magic-formula"}
     built = StabilityEnv("gps", tyred, heavy, car)

@@ -223,7 +223,7 @@ def test_more_packets_under_way_than_there_is_room_for_are_refused(changes: Any)
 @pytest.mark.parametrize("n", [1, 10, 1000])
 def test_a_scenario_sets_the_gps_clock_and_its_packets_have_room(n: int) -> None:
     clock = {"gps_period": MIN_GPS_PERIOD, "gps_delays": [0.12, 0.05, 0.1], "duration": 60.0}
-    env = StabilityEnv("fusion", control_period=n, gps={"duplicate": 1.0, "delays": [0.0]})
+    env = StabilityEnv("fusion", control_period=n, gps={"duplicate": 1.0})
     env.reset(seed=0, options={"scenario": LINEAR | clock})
     told = env.slow_sensors["gps"]
     assert (told.period, told.delays, told.duplicate) == (0.05, (0.12, 0.05, 0.1), 1.0)
@@ -238,3 +238,28 @@ def test_a_scenario_sets_the_gps_clock_and_its_packets_have_room(n: int) -> None
     env.reset(seed=0)
     assert env.slow_sensors["gps"].period == 0.2
     assert StabilityEnv("vision", scenario=LINEAR | clock).slow_sensors.keys() == {"camera"}
+
+
+def test_the_envs_own_clock_comes_over_the_scenarios() -> None:
+    late = {"camera_delays": [0.05], "camera_jitter": 0.01, "camera_loss": 0.1}
+    env = StabilityEnv("vision", scenario=LINEAR | late, camera={"delays": [0.1], "loss": 0.0})
+    told = env.slow_sensors["camera"]
+    assert (told.delays, told.jitter, told.loss) == ((0.1,), 0.01, 0.0)
+    assert StabilityEnv("vision", scenario=LINEAR | late).slow_sensors["camera"].loss == 0.1
+
+
+def test_late_stamps_have_room_under_way_or_are_refused() -> None:
+    """A packet does not arrive before its stamp, so that the queue is longer than by its delay."""
+    with pytest.raises(ValueError, match=r"stamps up to 0\.1 s later puts 21 packets under way"):
+        StabilityEnv("gps", gps={"period": 0.005}, world={"gps_stamp": 0.1})
+    env = StabilityEnv("gps", gps={"period": 0.02}, world={"gps_stamp": 0.1}, scenario="straight")
+    env.reset(seed=0)
+    assert all(abs(env.step([0.0])[4]["beta"]) < 0.1 for _ in range(40))
+
+
+def test_no_stamp_of_a_fast_clock_lies_before_tick_0() -> None:
+    env = StabilityEnv("gps", gps={"period": 0.02}, world={"gps_stamp": (-0.05, 0.0)})
+    for seed in range(20):
+        env.reset(seed=seed)
+        found = packets(play(env, [0.0] * 10))
+        assert 0.0 <= found[:, CAPTURED].min() < 20.0
