@@ -124,12 +124,14 @@ class Log:
         slow: Slow sensors by name.
         truth: True values by name ("beta", "psi", ...), each of shape (n,), in SI units.
         name: Name of the log.
+        origin: Time of tick 0 on the file's clock (s).
     """
 
     record: Record
     slow: dict[str, SlowSensor]
     truth: dict[str, Array] = field(default_factory=dict)
     name: str = "log"
+    origin: float = 0.0
 
     @property
     def time(self) -> Array:

@@ -87,13 +87,14 @@ class _LatencySearch:
         lag, curvature, margin = self._minimise_nis(sum_nis)
         min_nis, count, memory = results[lag]
         scale = max(min_nis / max(count, 1), 1.0)
-        is_significant = margin > 2.0 * _MIN_LOG_RATIO * scale and curvature > 0.0
-        self.done = is_significant and self._count == self._looks[-1]
-        if not is_significant:
+        limit = 2.0 * _MIN_LOG_RATIO * scale
+        is_sharp, is_better = margin > limit, sum_nis(self.lag) - min_nis > limit
+        self.done = is_sharp and curvature > 0.0 and self._count == self._looks[-1]
+        # the first step away from a latency that is surely wrong need not be to a sharp optimum
+        if not curvature > 0.0 or not (is_sharp or (self.lag == 0 and is_better)):
             return delayed_filters
         self.sd = float(np.sqrt(2.0 * scale / curvature))
-        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * _MIN_LOG_RATIO * scale
-        if lag == self.lag or not is_better:
+        if lag == self.lag or not (self.lag > 0 or is_better):
             return delayed_filters
         self.lag = lag
         return memory

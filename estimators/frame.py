@@ -82,7 +82,7 @@ def _run_joint(log: "Log", car: Vehicle) -> "pd.DataFrame":
     beta, gamma = (filter_.names.index(name) for name in ("beta", "gamma"))
     return pd.DataFrame(
         {
-            "time_s": record.ticks * dt,
+            "time_s": log.origin + record.ticks * dt,
             "sideslip_rad": X[:, beta],
             "sideslip_sd_rad": S[:, beta],
             "yaw_rate_radps": X[:, gamma],

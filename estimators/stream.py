@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..envs.record import FAST, PACKET, Array
-from ..envs.recordings.dialect import SENSORS, SLOW_QUANTITIES
+from ..envs.recordings.dialect import LATENCIES, SENSORS, SLOW_QUANTITIES
 from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
 from ..envs.recordings.tables import find_offset, parse_column_name
 from ..envs.sensors.link import SlowSensor
@@ -78,6 +78,11 @@ class Stream:
             raise ValueError(f"no channel of {', '.join(missing)} among {', '.join(channels)}")
         if twice := [name for name in dict.fromkeys(quantities) if quantities.count(name) > 1]:
             raise ValueError(f"{', '.join(twice)} comes twice among {', '.join(channels)}")
+        if told := [name for name in LATENCIES.values() if name in quantities]:
+            raise ValueError(f"{told[0]}: no such channel, for a sample that is pushed has come")
+        lacking = [name for name in SENSORS["camera"] if name not in quantities]
+        if 0 < len(lacking) < len(SENSORS["camera"]):
+            raise ValueError(f"a camera's sample has both values; no channel of {lacking[0]}")
         if not (0.0 < dt <= MAX_HOLE and dt < memory < math.inf):
             raise ValueError(f"expected 0 < dt <= {MAX_HOLE} s < memory, got {dt}, {memory}")
         wires = read_wires(vehicle)
@@ -101,7 +106,7 @@ class Stream:
         self._latest = np.empty(len(quantities))  # ticks of the newest samples
         self._x: Array
         self._sd: Array
-        self._strange = 0
+        self._strange, self._origin = 0, 0  # ticks in here are not negative
         self._begin(0)
         sensors = {
             name: SlowSensor(period=dt, phase=0.0)
@@ -140,13 +145,15 @@ class Stream:
             raise ValueError(f"{channel}: expected finite numbers, got {stamp} s, {value}")
         tick = round((stamp - latency) / self.dt)
         if self._newest < self._base or self._strange > _PATIENCE:
-            self._begin(tick - self._memory)
+            self._origin = min(tick, 0)
+            self._begin(tick - self._origin - self._memory)
+        tick -= self._origin
         oldest = max(self._newest - self._memory, self._base)
         if not oldest <= tick <= max(self._newest, self._base + self._memory) + self._hole:
-            self._strange += 1
+            self._strange += self._is_fast[place]  # a receiver may send many old fixes at once
             self.counts["outside"] += 1
             return
-        self._strange = 0
+        self._strange *= not self._is_fast[place]
         if tick - self._base >= len(self._rows):
             self._shift()
         self._rows[tick - self._base, place] = factor * value + shift
@@ -179,7 +186,7 @@ class Stream:
         beta, gamma = names.index("beta"), names.index("gamma")
         silence = self._newest - self._latest[self._is_fast].min()
         healthy = self._filter.is_healthy and bool(silence <= self._hole)
-        time = self._newest * self.dt
+        time = (self._newest + self._origin) * self.dt
         return SideslipEstimate(time, float(x[beta]), float(sd[beta]), float(x[gamma]), healthy)
 
     def _fill(self, start: int, end: int) -> None:

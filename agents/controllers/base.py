@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -198,8 +199,11 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
         The number as a float.
 
     Raises:
+        TypeError: It is none.
         ValueError: The number is out of range.
     """
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} is a number, got {value!r}")
     if not 0.0 <= value < math.inf or (value == 0.0 and not allow_zero):
         rule = "number of zero or more" if allow_zero else "positive number"
         raise ValueError(f"{name} is a {rule}, got {value!r}")

@@ -14,7 +14,7 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
 from ...envs.record import Array
 from ...envs.task import REFERENCES
 from ...envs.ticks import TICK
-from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
 from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_gain_table
 from ..env_info import AnyEnv, get_env_facts
@@ -109,7 +109,7 @@ class Lqr(Controller):
     Args:
         env: Env of the controller.
         disturbance_time: Time in which F_d and N_d decay (s).
-        vehicle: Vehicle of the design; None: the env's nominal one.
+        vehicle: Vehicle of the design, as for `make_vehicle`; None: the env's nominal one.
         stiffness: Entries of the front and rear cornering stiffness (N/rad), to schedule gains on.
         span: Range of the stiffness schedule, as factors of the vehicle's.
         knots: Knots of each stiffness axis; the table is designed once.
@@ -128,7 +128,7 @@ class Lqr(Controller):
         self,
         env: AnyEnv,
         disturbance_time: float = 0.3,
-        vehicle: Vehicle | None = None,
+        vehicle: VehicleSource | None = None,
         stiffness: Sequence[str] = (),
         span: tuple[float, float] = (0.5, 1.6),
         knots: int = 7,
@@ -158,7 +158,7 @@ class Lqr(Controller):
         if knows_car:
             self.needs += tuple(f"true_{name}" for name in TRUE_PARAMETERS)
         super().__init__(env, grip)
-        car = self.nominal if vehicle is None else vehicle
+        car = self.nominal if vehicle is None else make_vehicle(vehicle)
         rate = get_env_facts(env).moment_rate
         self._steer_unit = self.authority  # of the added steering that is remembered
         self.remembered = 2 if rate > 0.0 else 0  # numbers at the end of the memory

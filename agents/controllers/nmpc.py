@@ -19,7 +19,7 @@ from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
-from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource
 from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
 from ..design.prediction import (
@@ -242,7 +242,7 @@ class Nmpc(Lqr):
         horizon: float = 0.5,
         iterations: int = 2,
         disturbance_time: float = 0.3,
-        vehicle: Vehicle | None = None,
+        vehicle: VehicleSource | None = None,
         stiffness: Sequence[str] = (),
         span: tuple[float, float] = (0.5, 1.6),
         knots: int = 7,

@@ -31,19 +31,25 @@ _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
-def _make_log(values: dict[str, Array], name: str, dt: float | None = None) -> Log:
+def _make_log(
+    values: dict[str, Array], name: str, dt: float | None = None, origin: float = 0.0
+) -> Log:
     """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
 
-    Its first tick is that of the first row, 0 where time starts below 0: ticks are never negative.
-    A logged input (steering, torque, command) acts from its row to the next, so it stands one row
-    later in the record.
+    Its first tick is that of the first row, by the time from `origin` (s) on. A logged input
+    (steering, torque, command) acts from its row to the next, so it stands one row later in the
+    record.
     """
     dt = find_step(values["time"]) if dt is None else dt
-    first = max(round(float(values["time"][0]) / dt), 0)
+    first = round((float(values["time"][0]) - origin) / dt)
     fast, present = make_fast_rows(values)
     packets, slow = make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
-    return Log(record, slow, _compute_truth(values), name)
+    camera = [name for name in SENSORS["camera"] if np.isfinite(values.get(name, np.nan)).any()]
+    if camera and "camera" not in slow:
+        both = " and ".join(SENSORS["camera"])
+        raise ValueError(f"no row has both {both}: a camera's sample is of both")
+    return Log(record, slow, _compute_truth(values), name, origin)
 
 
 def make_packet_rows(
@@ -145,12 +151,16 @@ def make_packets(
         Packets, shape (count, PACKET_WIDTH), and slow sensors by name.
     """
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
+    absent = np.full(len(values["time"]), np.nan)
     for sensor, names in SENSORS.items():
         if not np.isfinite(values.get(names[0], np.nan)).any():
             continue
         known = np.flatnonzero(np.isfinite(values[names[0]]))
+        if sensor == "camera":  # a filter takes both values or none
+            known = known[np.isfinite(values.get(names[1], absent)[known])]
+        if not len(known):
+            continue
         ticks = (first + known).astype(np.float64)
-        absent = np.full(len(values["time"]), np.nan)
         columns = np.stack([values.get(name, absent)[known] for name in names], axis=1)
         quality = np.ones(len(known))
         if sensor == "gps":
@@ -252,7 +262,8 @@ def read_parts(
         if len(pieces) > 1:
             dt = find_step(max((piece["time"] for piece in pieces), key=len))
             pieces = [_resample_evenly(piece, dt, _SAME_STEP) for piece in pieces]
-        logs = [_make_log(piece, title, dt) for piece in pieces]
+        origin = min(0.0, *(float(piece["time"][0]) for piece in pieces))  # no tick is negative
+        logs = [_make_log(piece, title, dt, origin) for piece in pieces]
     except ValueError as error:
         raise ValueError(f"{label}: {error}") from None
     remarks += [f"{count} {text}." for count, text in [*done, (count, drop_reason)] if count]

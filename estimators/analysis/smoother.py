@@ -102,6 +102,7 @@ class _FilteredBlock(NamedTuple):
     before: Matrix  # prediction, shape (K, n)
     x: Matrix  # state after the row's samples, shape (K, n)
     P: Matrix  # its covariance, shape (K, n, n)
+    Q: Matrix  # of the step to the row, shape (K, n, n)
 
 
 @jit
@@ -116,13 +117,14 @@ def _filter_forwards(
 ) -> int:
     """Filter fast rows, and packets from `position` on that arrive by then; return those done."""
     n, dense = f.n, f.dense
-    F, before, x, P = block
+    F, before, x, P, Q = block
     for j in range(len(fast)):
         read_fast_row(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
         run_tick(f, gains)
         for i in range(n):
             before[j, i] = f.predicted[f.tick % WINDOW, i]
             for k in range(n):
+                Q[j, i, k] = f.Q[i, k]
                 diagonal = f.decay[i] if i == k else 0.0
                 F[j, i, k] = f.G[i, k] if i < dense else diagonal
             if f.kind == LATERAL and f.speed_before > 0.0:
@@ -143,10 +145,10 @@ def _smooth_blocks(
 ) -> tuple[Array, Array, Array]:
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
     f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
-    Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)
-    blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,))]  # two, side by side
+    # two, side by side
+    blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,), (n,))]
     done = position = 0  # rows, packets
     for start in range(0, rows, lag):
         for array in blocks if start > 0 else ():  # what was the next block is the present one
@@ -155,16 +157,16 @@ def _smooth_blocks(
         block = _FilteredBlock(*(array[first : end - start] for array in blocks))
         position = _filter_forwards(f, gains, fast[done:end], packets, position, nis, block)
         done = end
-        x, std = _smooth_backwards(Q, _FilteredBlock(*(array[: end - start] for array in blocks)))
+        x, std = _smooth_backwards(_FilteredBlock(*(array[: end - start] for array in blocks)))
         stop = min(start + lag, rows)
         X[start:stop], S[start:stop] = x[: stop - start], std[: stop - start]
     return X, S, nis
 
 
-def _smooth_backwards(Q: Array, block: _FilteredBlock) -> tuple[Array, Array]:
+def _smooth_backwards(block: _FilteredBlock) -> tuple[Array, Array]:
     """Smooth by Rauch, Tung and Striebel from the last filtered state to the first."""
-    F, before, x, P = block
-    predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
+    F, before, x, P, Q = block
+    predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q[1:]
     sd = np.sqrt(np.einsum("kii->ki", predicted))
     sd[sd == 0.0] = 1.0
     scaled = predicted / (sd[:, :, None] * sd[:, None, :])

@@ -217,11 +217,12 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
         return False
     for layer in range(len(layers)):
         f = layers[layer]
+        growth = maximum(compute_excess(f), 1.0)  # as `compute_deviation`: lost, it is less sure
         for i in range(f.n):
             x[offset + i] = f.x[i]
             for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
                 row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
-                P[offset + i, offset + j] = read_covariance(f, gains, row, column)
+                P[offset + i, offset + j] = growth * read_covariance(f, gains, row, column)
         offset += f.n
     return True
 

@@ -37,9 +37,9 @@ _Values = dict[str, Any]  # options by name
 
 
 _NUMBERS = (  # options that every filter has
-    *("leak", "satellites", "robust", "map_lag_sd", "model_error", "noise_time"),
-    *("force_share", "moment_share", "adapt", "allow_unstable"),
+    *("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable"),
 )
+_DISTURBANCES = {"F_d", "N_d", "d", "d1", "d2", "d3"}
 
 
 class _Reader:
@@ -158,8 +158,13 @@ def parse_config(
         key.removesuffix("_noise"): reader.read_number(key, sd, POSITIVE)
         for key, sd in NOISE.items()
     }
+    if _DISTURBANCES & {*states}:
+        chosen |= reader.read("leak")
     if first.forces:
         chosen |= reader.read("force_sd", "moment_sd", "disturbance_time", "moment_time")
+        chosen |= reader.read("force_share", "moment_share")
+    if first.forces and TYRES[0] in states:
+        chosen |= reader.read("model_error")
     Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     count = int(reader.read("wary")["wary"])

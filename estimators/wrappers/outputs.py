@@ -92,7 +92,7 @@ def write_outputs(estimator: EstimatorLike, observed: Observed) -> None:
     e = x[truth_plan[:, 0]] - np.where(truth_plan[:, 2] == 1, beta, gamma)
     P_e = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
     nees = e @ np.linalg.solve(P_e, e) / len(e) if len(e) and np.linalg.det(P_e) > 0.0 else 0.0
-    summary[:] = x[first], std[first], nees, 1.0
+    summary[:] = x[first], std[first], nees, float(getattr(estimator, "is_healthy", True))
 
 
 @jit

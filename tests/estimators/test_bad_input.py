@@ -10,6 +10,7 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import COUNTERS
 from sideslip.estimators.design.options import OPTIONS
+from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -42,6 +43,9 @@ SHORT = type(FIG7)(duration=0.3)
             "unknown option 'wibble', 'wobble'; known: Q",
         ),
         ("dakf", {"force_sd": 1.0}, TypeError, "dakf: unknown option 'force_sd'"),
+        ("dakf", {"force_share": 0.1}, TypeError, "dakf: unknown option 'force_share'"),
+        ("exact-kf", {"model_error": 0.3}, TypeError, "exact-kf: unknown option 'model_error'"),
+        ("bicycle-kf", {"leak": 0.1}, TypeError, "bicycle-kf: unknown option 'leak'"),
         ("bicycle-kf", {"q_beta": -1.0}, ValueError, "Q is indefinite.*-1"),
         ("bicycle-kf", {"q_beta": float("nan")}, ValueError, "Q is not finite"),
         ("bicycle-kf", {"Q": [[1.0, 2.0], [2.0, 1.0]]}, ValueError, "Q is indefinite"),
@@ -87,7 +91,7 @@ def test_constructor_errors_name_the_thing(
 
 
 NUMBERS = [key for key, x in OPTIONS.items() if type(x.default) in {int, float}]
-NEEDED = {"assumed_delay": {"delay": "constant"}}
+NEEDED = {"assumed_delay": {"delay": "constant"}, "model_error": WITH_TYRES}
 for name in ("force_sd", "moment_sd", "disturbance_time"):
     NEEDED[name] = {"disturbances": "forces"}
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.envs.recordings.log_file import read_parts
 from sideslip.estimators import make_estimator
 from sideslip.estimators.delayed_channels import _align_rows, _LatencySearch
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
+from tests.estimators.test_frame import drive
 from tests.estimators.test_late import later
 
 FIND = {"gyro": "find"}
@@ -103,3 +105,19 @@ def test_it_leaves_alone_what_a_log_cannot_tell_and_goes_on_looking() -> None:
     )
     filter_.run(later(Log(both, still.slow), {"gyro": 0.06}))
     assert filter_.latency["gyro"] == pytest.approx(0.06, abs=0.003)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.1])
+def test_a_gps_alone_finds_a_gyro_that_is_far_too_late(late: float) -> None:
+    """Its optimum is flat, but no latency is surely worse."""
+    table, truth, car = drive()
+    gyro = table.yaw_rate_radps.shift(round(late / 0.01)).bfill()
+    log = read_parts(table.assign(yaw_rate_radps=gyro))[0][0]
+    errors = []
+    for latency in (FIND, {"gyro": late}):
+        filter_ = make_estimator(
+            "joint", vehicle=car, sensors=log.slow, dt=log.record.dt, latency=latency
+        )
+        error = (filter_.run(log)["beta"] - truth)[1000:]
+        errors.append(np.sqrt(np.mean(error**2)))
+    assert errors[0] < 1.2 * errors[1]

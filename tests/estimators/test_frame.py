@@ -118,11 +118,22 @@ def test_filter_begins_anew_after_a_hole() -> None:
     assert result.sideslip_sd_rad[first] > 2.0 * result.sideslip_sd_rad[first - 1]
 
 
+@pytest.mark.parametrize("hole", [(30.0, 31.0), (15.0, 17.0)])
+def test_time_below_zero_stays_the_logs(hole: tuple[float, float]) -> None:
+    table, _, car = drive()
+    cut = table[(table.time_s < hole[0]) | (table.time_s > hole[1])]
+    expected = estimate(cut, car)
+    result = estimate(cut.assign(time_s=cut.time_s - 10.0), car)
+    np.testing.assert_allclose(result.time_s, expected.time_s - 10.0, atol=1e-9)
+    np.testing.assert_allclose(result.sideslip_rad, expected.sideslip_rad, atol=2e-3)
+
+
 @pytest.mark.parametrize(
     ("changes", "arguments", "message"),
     [
         ({"yaw_rate_radps": None}, {}, "the frame: no column yaw_rate_radps; the log has time_s"),
         ({"yaw_rate_radps": "fast"}, {}, "the frame: column 'yaw_rate_radps', row 1: expected a"),
+        ({"camera_psi_rad": 0.1}, {}, "no row has both camera_psi and camera_y_l"),
         ({}, {"latency": {"radar": 0.1}}, "a latency is CHANNEL=S"),
         ({}, {"latency": {"gps": -0.1}}, "a latency is CHANNEL=S"),
         ({}, {"mapping": {"steer_rad": "Delta"}}, "the frame: no column 'Delta' for steer_rad"),

@@ -3,12 +3,13 @@
 import dataclasses
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.estimators import Estimator, make_estimator
+from sideslip.estimators import EstimateObservation, Estimator, make_estimator
 from sideslip.estimators.analysis.bound import VehicleChange, compute_error_bound
 from sideslip.estimators.delayed_channels import LateEstimator
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
@@ -173,3 +174,19 @@ def test_filters_that_cannot_have_one() -> None:
         make_estimator("multirate-residual-kf", **common, latency=LATE)
     with pytest.raises(TypeError, match="latency is seconds by channel"):
         make_estimator("exact-kf", **common, latency=0.06)
+
+
+def test_a_lost_filter_says_so_with_a_latency_too() -> None:
+    """Beside one without: the same health and, where it is lost, a deviation as wide."""
+    scenario = {"base": "coms-slalom", "gyro_bias": 0.4}
+    found = []
+    for latency in ({}, {"gyro": 0.001}):
+        env: Any = gym.make("sideslip/YawFusion-v1", scenario=scenario)
+        env = EstimateObservation(env, "joint", options={"latency": latency})
+        env.reset(seed=0)
+        infos = [env.step(np.zeros(1))[4] for _ in range(300)]
+        healthy = np.mean([info["healthy"] for info in infos])
+        found.append((healthy, np.mean([info["beta_std"] for info in infos[100:]])))
+    (healthy, deviation), (late_healthy, late_deviation) = found
+    assert healthy < 0.5 and late_healthy == pytest.approx(healthy, abs=0.05)
+    assert late_deviation == pytest.approx(deviation, rel=0.2)

@@ -143,9 +143,44 @@ def test_refused_samples(sample: Sample, message: str) -> None:
             "yaw_rate comes twice among speed_x_kmh",
         ),
         (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"dt": 2.0}, "expected 0 < dt <= 0.25"),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "course_rad", "gps_latency_s"),
+            {},
+            "gps_latency: no such channel, for a sample that is pushed has come",
+        ),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "camera_psi_rad"),
+            {},
+            "a camera's sample has both values; no channel of camera_y_l",
+        ),
         (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"memory": 0.0}, "got 0.01, 0.0"),
     ],
 )
 def test_refused_streams(channels: tuple[str, ...], options: Any, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         Stream("passenger-car", channels, **options)
+
+
+def test_a_clock_below_zero_gives_the_same_numbers() -> None:
+    estimates = []
+    for shift in (0.0, -100.0):
+        stream = make_stream()
+        for name, stamp, value in samples(6.0):
+            stream.push(name, stamp + shift, value)
+            stream.estimate()
+        estimates.append(stream.estimate())
+        assert stream.counts == {"outside": 0} and not any(stream._filter.counts.values())
+    one, other = estimates
+    assert one is not None and other is not None
+    assert other.time == pytest.approx(one.time - 100.0)
+    assert other.sideslip == pytest.approx(one.sideslip, abs=1e-9)
+
+
+def test_old_fixes_that_come_at_once_do_not_set_the_clock_back() -> None:
+    stream = make_stream()
+    for sample in samples(6.0):
+        stream.push(*sample)
+    before = stream.estimate()
+    for k in range(20):
+        stream.push("course_rad", 2.0 + 0.1 * k, 0.0)
+    assert stream.counts == {"outside": 20} and stream.estimate() == before

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
+from sideslip.agents.controllers.lqr import Lqr
 from sideslip.agents.design.sampled_model import DesignSpec, make_design_model
-from sideslip.envs import COMS
+from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.task import MODEL
 from sideslip.estimators import EstimateObservation
 
@@ -74,6 +75,7 @@ VALUES: list[Refusal] = [
             ({"pole": -1.0}, "pole is a positive number"),
         )
     ),
+    ("lqr", "slip", {"vehicle": "lorry"}, "lorry"),
     ("pid", "slip", {}, "unknown agent 'pid'"),
 ]
 
@@ -86,6 +88,16 @@ def test_what_no_controller_can_be_built_with_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         make_agent(name, ENVS[env](), **options)
+
+
+def test_a_vehicle_of_the_design_is_named_as_everywhere() -> None:
+    named, stated = (
+        make_agent("lqr", ENVS["slip"](), vehicle=car) for car in ("passenger-car", PASSENGER_CAR)
+    )
+    assert isinstance(named, Lqr) and isinstance(stated, Lqr)
+    assert named.vehicle == stated.vehicle == PASSENGER_CAR
+    with pytest.raises(TypeError, match="disturbance_time is a number, got 'x'"):
+        make_agent("lqr", ENVS["slip"](), disturbance_time="x")
 
 
 @pytest.mark.parametrize(("name", "option"), [("lqr", "weight"), ("two-dof", "speed")])

@@ -335,11 +335,13 @@ def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) ->
 
 def test_a_wrapper_that_adds_entries_has_its_own_scales() -> None:
     """Of an angle 0.05 rad is one, in the wrapper's entries as in the env's."""
-    plain = make_vec_env(VISION, 2, 0, wrapper_class=vector_truth.TruthObservation, scaled=False)
-    scaled = make_vec_env(VISION, 2, 0, wrapper_class=vector_truth.TruthObservation)
+    wrapper = vector_truth.TruthObservation
+    plain: Any = make_vec_env(VISION, 2, 0, wrapper_class=wrapper, scaled=False)
+    scaled: Any = make_vec_env(VISION, 2, 0, wrapper_class=wrapper)
+    bare: Any = make_vec_env(VISION, 2, 0)
     names = [entry.name for entry in plain.get_attr("layout")[0]]
     raw, divided = plain.reset(), scaled.reset()
-    assert raw.shape[1] > make_vec_env(VISION, 2, 0).observation_space.shape[0]
+    assert raw.shape[1] > bare.observation_space.shape[0]
     for name, scale in (("steer", 0.05), ("true_front_stiffness", 1.0)):
         column = names.index(name)
         assert divided[:, column] == pytest.approx(raw[:, column] / scale, rel=1e-6), name

@@ -3,9 +3,11 @@
 import math
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.agents.rollout import rollout
 from sideslip.envs.record import PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator, smooth
@@ -89,6 +91,19 @@ def test_an_estimator_of_any_rule_is_smoothed_alike_and_left_alone() -> None:
     np.testing.assert_array_equal(built["clone"].x, before)
     used = log.record.packets[:, PACKET.arrived] < len(log.record.fast)
     assert np.isfinite(found["clone"].nis[used]).all()
+
+
+def test_a_filter_whose_noise_changes_as_it_drives_is_smoothed_with_that_noise() -> None:
+    """`joint` rewrites its process noise every few rows; what comes later makes it surer."""
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario="coms-slalom")
+    log, car = rollout(env, seed=1).log, env.unwrapped.vehicle
+    runs = [make_estimator("joint", vehicle=car, sensors=log.slow).run(log)]
+    runs += [smooth("joint", log, lag, vehicle=car) for lag in (0.2, 1.0, math.inf)]
+    rows, beta = log.time > 2.0, runs[0].names.index("beta")
+    errors = [np.sqrt(np.mean((run["beta"] - log.truth["beta"])[rows] ** 2)) for run in runs]
+    deviations = [run.std[rows, beta].mean() for run in runs]
+    assert max(errors[1:]) < 0.9 * errors[0]
+    assert deviations == sorted(deviations, reverse=True)
 
 
 def test_a_state_that_is_known_exactly_stays_known() -> None:
