@@ -6,6 +6,7 @@ cv2 is imported when a command needs it, after the limit on a picture's pixels i
 import math
 import os
 import time
+from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -98,6 +99,11 @@ class _Replay:
         if is_nmea(log):
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
+            record: Any = self  # a dataclass, by `register`
+            given = {x.name for x in fields(record) if getattr(self, x.name) != x.default}
+            used = {"log", "vehicle", "mapping", "html", "json", "parquet", "plot", "kml"}
+            if ignored := sorted(given - used):
+                raise ValueError(f"{log}: {', '.join(ignored)}: of no use to a receiver's log")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log, self.vehicle, self.mapping)
             write_output(console, [make_receiver_suite(received)], vars(self))

@@ -139,6 +139,10 @@ class _Run:
             print_written(console, self.video)
 
 
+_LIMIT = 600.0  # s
+_COUNTED = {"highway", "procedures", "speed"}  # suites whose number of drives is fixed
+
+
 @register("bench", "Compare estimators and controllers.")
 class _Bench:
     """Compare estimators and controllers; with --agent and --estimator your own beside some of
@@ -165,7 +169,7 @@ class _Bench:
     env_id: str = take("The contests of this id alone.", "", "--env")
     fresh: bool = take("Seeds drawn after your files are hashed: publishable.", False, "--fresh")
     salt: str = take("Salt of the test seeds, hexadecimal; default: made from the sources.", "")
-    limit: float = take("s of wall time for a contestant in a contest.", 600.0)
+    limit: float = take("s of wall time for a contestant in a contest.", _LIMIT)
     trust: bool
     engine_name: str
     address: str
@@ -174,19 +178,31 @@ class _Bench:
         comparison = None
         if self.agent or self.estimator:
             comparison = self._make_comparison(self.agent or [], self.estimator or [])
-        elif self.scenario or self.env_id or self.fresh:
-            raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
+        own = {
+            "--scenario": self.scenario, "--env": self.env_id, "--fresh": self.fresh,
+            "--vehicle": self.vehicle, "--trust": self.trust, "--limit": self.limit != _LIMIT,
+        }  # fmt: skip
+        if given := [name for name, value in own.items() if value and comparison is None]:
+            raise ValueError(f"{', '.join(given)} go with --agent or --estimator")
         everything = [name for name in SUITES if name != "logs" or self.data]
         names = self.suites or (["control"] if comparison else everything)
         for name in names:
             check_choice("suite", name, SUITES)
         check_salt(self.salt, names)
         check_page(self.page, names)
+        for option, suite in (("keep", "control"), ("clairvoyant", "control"), ("data", "logs")):
+            is_of = suite in names and not (comparison and option != "keep")
+            if getattr(self, option) is not None and not is_of:
+                raise ValueError(f"--{option} goes with the suite {suite}, got {', '.join(names)}")
+        if self.episodes is not None and not {*names} - _COUNTED:
+            raise ValueError(f"--episodes: {', '.join(names)} has a number of its own")
         request = Request(
             self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.data,
             self.salt,
         )  # fmt: skip
-        how = "the same command" if self.keep else "add --keep FOLDER, which keeps finished cases"
+        how = "the same command" if self.keep else "the same command, from the start"
+        if "control" in names and not self.keep:
+            how = "add --keep FOLDER, which keeps finished cases of control"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
             done = run_suites(names, request, comparison)
         write_output(console, done, vars(self), brief=True)

@@ -333,7 +333,7 @@ def _compute_places(standings: Sequence[Standing], loss: float, floor_factor: fl
     """Compute the places of entries by a score of other constants, 1 for the best, NaN for none."""
     scores = [standing.compute_score(loss, floor_factor) for standing in standings]
     keys = [
-        (standing.loses_more, math.inf if math.isnan(score) else -score)
+        (standing.rank[0], math.inf if math.isnan(score) else -score)
         for standing, score in zip(standings, scores, strict=True)
     ]
     order = sorted(range(len(keys)), key=keys.__getitem__)

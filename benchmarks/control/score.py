@@ -177,10 +177,15 @@ class Standing:
         return check_losses(list(self.pairs.values()))
 
     @property
+    def is_partial(self) -> bool:
+        """Whether it did not drive every task: who leaves out what it does badly is not ranked."""
+        return any(result.error for result in self.results.values())
+
+    @property
     def rank(self) -> tuple[bool, float]:
         """Key of the order: smaller is better; what has no number comes last."""
         value = self.overall.get("score", Estimate(math.nan)).value
-        return self.loses_more, float(np.nan_to_num(-value, nan=np.inf))
+        return self.loses_more or self.is_partial, float(np.nan_to_num(-value, nan=np.inf))
 
     @property
     def control_period(self) -> float:
@@ -266,7 +271,7 @@ def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
 
 
 def rank_entries(results: Results, tier: str | None) -> list[Standing]:
-    """Rank the entries of a tier: those that surely lose more cars than nominal come last.
+    """Rank a tier's entries: last who surely loses more cars than nominal, or leaves out tasks.
 
     Args:
         results: Episodes.

@@ -73,8 +73,10 @@ class ControlTask:
     @property
     def kind(self) -> str:
         """Class of the tasks that share their tuned options."""
-        if self.vehicle in ("", "coms"):
-            return f"coms-{'zero-slip' if self.reference == 'zero-slip' else 'model'}"
+        named = {"vehicle": self.vehicle, "reference": self.reference}
+        named |= {key: self.changes[key] for key in named if isinstance(self.changes.get(key), str)}
+        if named["vehicle"] in ("", "coms"):
+            return f"coms-{'zero-slip' if named['reference'] == 'zero-slip' else 'model'}"
         return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
 
     @property

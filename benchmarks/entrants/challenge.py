@@ -74,7 +74,9 @@ def _check_entry(entry: Entry) -> None:
             load_policy(source)
         elif known is AGENTS and source.endswith(ZIP):
             check_trusted(Path(source), entry.trust)
-        elif source not in ("", TRUTH, *SETUPS) and ":" not in source:
+        elif source == TRUTH:
+            raise ValueError("truth is what oracles are told; an entry estimates")
+        elif source not in ("", *SETUPS) and ":" not in source:
             known.load(source, list_shipped() if known is AGENTS else SETUPS)
 
 
@@ -211,8 +213,7 @@ class ComparisonRequest:
     ) -> list[ControlTask]:
         """Tasks of the id; one that no tier has takes the place of the id without steering."""
         env_id = self.env_id
-        if env_id in ("", YAW, STEERING):
-            selected = [task for task in tasks if env_id in ("", task.env_id)]
-        else:
+        selected = [task for task in tasks if env_id in ("", task.env_id, task.world_id)]
+        if not selected and env_id not in (YAW, STEERING):
             selected = [replace(task, env_id=env_id) for task in tasks if task.env_id == YAW]
         return [replace(task, changes=changes) for task in selected]

@@ -40,6 +40,7 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 _INSTALLED = {*site.getsitepackages(), sys.prefix, sys.base_prefix, str(_PACKAGE)}
 _SYSTEM = ("/proc", "/sys", "/dev", "/etc", "/usr", "/lib", "/lib64")
 _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argument with the path
+_STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.exec", "os.posix_spawn", "os.system")
 
 
 class ChildSettings(NamedTuple):
@@ -130,6 +131,8 @@ def _make_audit_hook(
     skipped = tuple(f"{os.path.realpath(folder)}/" for folder in folders)
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
+        if event in _STARTS and start.allowed is not None:  # of which nobody knows what it opens
+            refuse(f"it started a process ({event})")
         place = _OPENS.get(event)
         path = None if place is None else arguments[place]
         if not isinstance(path, str | bytes | os.PathLike) or not path:
@@ -147,17 +150,21 @@ def _make_audit_hook(
 
 
 def _limit_process(scratch: Path) -> None:
-    """Limit this process for good: its memory, and where it may write."""
+    """Limit this process for good: its memory, where it may write, and whom it can reach."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (_WRITTEN, _WRITTEN))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if sys.platform == "linux":
         libc = ctypes.CDLL(None, use_errno=True)
         libc.prctl(1, 9, 0, 0, 0)  # PR_SET_PDEATHSIG: killed with the driver
+        apart = _NEW_NETWORK | _NEW_IPC  # no other entry's process is to be reached
+        if libc.unshare(apart):
+            libc.unshare(apart | _NEW_USER)
         libc.prctl(38, 1, 0, 0, 0)  # PR_SET_NO_NEW_PRIVS
         _apply_landlock(libc, {scratch: _WRITES, Path(os.devnull): _WRITES & _OF_FILES})
 
 
+_NEW_IPC, _NEW_USER, _NEW_NETWORK = 1 << 27, 1 << 28, 1 << 30  # unshare(2)
 # Linux's Landlock (landlock(7)): its system calls, and the rights to change files.
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 _WRITES = sum(1 << bit for bit in (1, *range(4, 15)))

@@ -191,7 +191,8 @@ def _make_table(comparison: Comparison) -> ResultTable:
         lines.append({"label": label, "n": standing.n} | standing.overall)
     note = (
         "> yours. score: mean r, 0 as nominal, an LQG that knows the nominal car; a loss that "
-        "nominal does not have counts -2. Who surely loses more cars than nominal comes last. "
+        "nominal does not have counts -2. Who surely loses more cars than nominal comes last, and "
+        "who does not drive every contest. "
         "cost, won: of the drives that nominal finishes too."
     )
     return ResultTable("Your contestants and the package's", _TABLE, lines, note)
@@ -210,7 +211,7 @@ class Score:
         failures: Fraction of all episodes that failed.
         n: Episodes that count.
         contests: A row for each task with the same numbers.
-        error: Reason why no task was driven, "" otherwise.
+        error: Reason why a task was not driven, "" where all were.
         text: Sentence of the benchmark.
     """
 
@@ -295,7 +296,7 @@ def score(
         rows.append(row | {"n": pairs.n if pairs else 0, "error": result.error})
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
     errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
-    n, contests, error = standing.n, tuple(rows), errors[0] if all(errors) else ""
+    n, contests, error = standing.n, tuple(rows), next(filter(None, errors), "")
     text = _make_sentence(standing)
     return Score(*names, total, cost, won, failures, n, contests, error, text)
 

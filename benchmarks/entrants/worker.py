@@ -138,7 +138,7 @@ class _ChildProcess:
         return f"its process ended with status {status}; {last}".rstrip("; ")
 
     def close(self) -> float:
-        """End the process and what it started; return its CPU seconds after its start."""
+        """End the process and its group; return its CPU seconds after its start."""
         self._stop()
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         self._process.wait()

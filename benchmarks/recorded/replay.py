@@ -100,6 +100,7 @@ def replay_file(
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
     wires, tables, unknown = wires or SignalCalibration(), [], ""
+    factor = settings.get("stiffness_factor", 1.0)  # of corners, whose tyres are nominal
     if vehicle == "identify":
         result, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
         vehicle, tables, unknown = result.car, shown.tables, result.reason
@@ -121,6 +122,7 @@ def replay_file(
     settings["emulated"] = not any(part.slow for part in logs)
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suite, *others = [replay(part, design, **settings) for part in parts]
+    settings["stiffness_factor"] = factor
     others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
     for other in others:
         suite.rows += other.rows

@@ -119,7 +119,7 @@ def test_a_policy_of_the_matrix_is_shipped_and_its_training_noted() -> None:
     policies = [entry.agent for entries in LEARNED.values() for entry in entries]
     assert policies and {*policies} <= {*list_shipped()}
     for policy, note in zip(policies, tables._describe_policies(), strict=True):
-        assert load_policy(policy).card.env_id in note and "reference" in note
+        assert load_policy(policy).card.world_id in note and "reference" in note
 
 
 def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) -> None:
@@ -176,3 +176,13 @@ def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -
 def test_a_mistake_is_told(run: Run, arguments: tuple[object, ...], said: str) -> None:
     status, _, err = run("enjoy", *arguments)
     assert status == 2 and said in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("distill-car-steering", "car-steering"), ("distill-coms-yaw", "coms-zero-slip")],
+)
+def test_a_policys_rival_has_the_options_of_its_car(name: str, kind: str) -> None:
+    """Not those of the id's own car: a policy's card has the car as an option of the env."""
+    task = evaluate_policy(name, 2).task
+    assert task.kind == kind and task.tier == ""

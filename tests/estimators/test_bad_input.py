@@ -91,7 +91,10 @@ def test_constructor_errors_name_the_thing(
 
 
 NUMBERS = [key for key, x in OPTIONS.items() if type(x.default) in {int, float}]
-NEEDED = {"assumed_delay": {"delay": "constant"}, "model_error": WITH_TYRES}
+NEEDED: dict[str, dict[str, Any]] = {
+    "assumed_delay": {"delay": "constant"},
+    "model_error": WITH_TYRES,
+}
 for name in ("force_sd", "moment_sd", "disturbance_time"):
     NEEDED[name] = {"disturbances": "forces"}
 

@@ -1,6 +1,7 @@
 """Scores: r of a drive, what a loss counts, which drives count, who stands below the line."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,18 @@ def test_below_the_line_stand_those_that_surely_lose_more_cars() -> None:
     assert [item.label for item in ranked][-1] == "sure" and ranked[-1].loses_more
     assert not any(item.loses_more for item in ranked[:-1])
     assert not check_losses([PairedDrives(nominal, nominal, 1.0)]) and not check_losses([])
+
+
+def test_who_leaves_out_a_task_is_ranked_behind_who_drives_it() -> None:
+    """However good it is in the others: a task left out would be one of its worst."""
+    other = replace(TASK, scenario="road-slalom")
+    results = {(task, Entry(NOMINAL)): driven([8.0] * 10) for task in (TASK, other)}
+    results |= {(task, Entry("whole")): driven([9.0] * 10) for task in (TASK, other)}
+    results |= {(TASK, Entry("part")): driven([1.0] * 10)}
+    results[other, Entry("part")] = replace(driven([1.0] * 10), error="ValueError: no, thanks")
+    ranked = rank_entries(results, "road")
+    assert [item.label for item in ranked] == ["nominal", "whole", "part"]
+    assert [item.is_partial for item in ranked] == [False, False, True]
 
 
 def test_a_larger_share_is_sure_by_the_sign_of_what_differs() -> None:

@@ -3,6 +3,7 @@
 import ast
 import ctypes
 import re
+import socket
 import sys
 from pathlib import Path
 
@@ -115,3 +116,29 @@ def test_what_it_opens_shows_in_a_rehearsal_or_ends_it(when: str, tmp_path: Path
     driven = IsolatedDrive(allowed=allowed)(cheat(tmp_path, "import neighbour", read))
     right = f"it opened {tmp_path}/table.txt, which it had not opened in the rehearsal"
     assert driven.error == right
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="namespaces are Linux's")
+def test_no_other_process_is_reached_by_network_or_shared_memory(tmp_path: Path) -> None:
+    """An entry that has seen the seeds' drives could tell another one of them."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        segment = ctypes.CDLL(None).shmget(0x5EED, 4096, 0o1600)
+        try:
+            driven = IsolatedDrive()(cheat(tmp_path, f"""
+import ctypes, socket
+found = [
+    attempt(lambda: socket.create_connection(("127.0.0.1", {server.getsockname()[1]}), 2.0)),
+    ctypes.CDLL(None).shmget(0x5EED, 4096, 0o600),
+]
+raise ValueError(json.dumps(found))
+"""))  # fmt: skip
+        finally:
+            ctypes.CDLL(None).shmctl(segment, 0, None)  # IPC_RMID
+    assert segment >= 0 and '["OSError", -1]' in driven.error, driven.error
+
+
+def test_a_process_that_it_starts_ends_a_fresh_drive(tmp_path: Path) -> None:
+    """Nobody knows what it opens."""
+    allowed = frozenset({str(tmp_path / "mine.py")})
+    driven = IsolatedDrive(allowed=allowed)(cheat(tmp_path, "os.system('true')"))
+    assert driven.error == "it started a process (os.system)"

@@ -253,6 +253,8 @@ def test_contests_are_those_of_the_id() -> None:
     assert ComparisonRequest(esc).tasks == select_quick_tasks(list_scored_tasks())
     steering = ComparisonRequest(esc, env_id=STEERING).tasks
     assert {contest.env_id for contest in steering} == {STEERING} and len(steering) == 3
+    dirty = STEERING.replace("-v0", "-v1")  # the tasks' own world: the same tasks
+    assert ComparisonRequest(esc, env_id=dirty).tasks == steering
     vision = list(ComparisonRequest(esc, env_id="sideslip/YawVision-v0").tasks)
     assert {contest.env_id for contest in vision} == {"sideslip/YawVision-v0"}
     assert [contest.tier for contest in vision] == ["small car", "road", "limit"]
@@ -277,6 +279,7 @@ def test_a_users_agent_has_nominals_filter_and_no_tuned_options() -> None:
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "agent": ({"entries": (on_default("lqrr"),)}, "unknown agent 'lqrr'"),
     "estimator": ({"entries": (Entry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
+    "truth": ({"entries": (Entry("lqr", "truth"),)}, "truth is what oracles are told"),
     "zip": ({"entries": (on_default("mine.zip"),)}, "mine.zip"),
     "file": ({"entries": (on_default("mine.py:A"),)}, "there is no file mine.py"),
     "id": ({"env_id": "YawFusion"}, "env"),
@@ -301,6 +304,10 @@ def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) ->
     ("arguments", "message"),
     [
         (("control", "--fresh"), "go with --agent or --estimator"),
+        (("control", "--vehicle", "coms"), "--vehicle go with --agent or --estimator"),
+        (("papers", "--keep", "cases"), "--keep goes with the suite control, got papers"),
+        (("papers", "--data", "."), "--data goes with the suite logs, got papers"),
+        (("highway", "--episodes", "4"), "highway has a number of its own"),
         (("papers", "--agent", "esc"), "go with the suite control alone"),
         (("--estimator", "none"), "goes with --agent"),
         (("papers", "--salt", "ab12"), "--salt goes with control, got"),

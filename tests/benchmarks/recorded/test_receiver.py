@@ -12,6 +12,7 @@ from sideslip.benchmarks.recorded import receiver
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
+from tests.benchmarks.conftest import Run
 from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence
 
 ORIGIN = (48.0, 11.0)
@@ -169,3 +170,9 @@ def test_the_recordings_are_answered(name: str) -> None:
     lines = receiver._compose_verdict(replay).splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert " costs: " in lines[0] if "munich" in name else " changes nothing: " in lines[0]
+
+
+def test_options_of_a_drive_with_a_gyro_are_refused(tmp_path: Path, run: Run) -> None:
+    path = log_of(drive(0.0, 200), tmp_path / "a.nmea")
+    status, _, error = run("replay", path, "--until", 3, "--gyro-bias", 4)
+    assert status == 2 and "gyro_bias, until: of no use to a receiver's log" in error

@@ -177,6 +177,10 @@ def test_files_in_rows_out(tmp_path: Path) -> None:
     assert len(read_json(tmp_path / "rows.json")) == len(suite.rows)
     anyway = replay_file(drive, mapping=["steer_deg=Delta"], **settings)
     assert "No vehicle was named" in anyway.text
+    corner = next(row for row in anyway.rows if row.scenario.endswith("front x 0.7, rear x 0.7"))
+    nominal = make_vehicle("ferrari-250lm-nominal").front_stiffness
+    found = json.loads(corner.spec)["vehicle"]["front_stiffness"]
+    assert found == pytest.approx(0.7 * nominal)  # and no factor of the fitted design on top
 
 
 @pytest.mark.skipif(not STANFORD.exists(), reason="the shared recordings are not here")
