@@ -224,7 +224,7 @@ def _make_headlines(root: Path) -> list[str]:
         for pair in pairs
     )
     return [
-        f"costs {best[0]} and {best[1]} % of LQG as designed; tuned, LQG costs {tuned[0]} and "
+        f"costs {best[0]} and {best[1]} % of LQG as designed. Tuned, LQG costs {tuned[0]} and "
         f"{tuned[1]} %. At the limit it loses {best_lost[1]} % of the cars, tuned LQG "
         f"{tuned_lost[1]} %.",
         f"On {table['n']} of them it errs {whole['rms / deg']:.2f} deg (RMS), and its 95 % "

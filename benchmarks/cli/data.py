@@ -100,9 +100,9 @@ class _Replay:
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
             record: Any = self  # a dataclass, by `register`
-            given = {x.name for x in fields(record) if getattr(self, x.name) != x.default}
+            changed = {x.name for x in fields(record) if getattr(self, x.name) != x.default}
             used = {"log", "vehicle", "mapping", "html", "json", "parquet", "plot", "kml"}
-            if ignored := sorted(given - used):
+            if ignored := sorted(changed - used):
                 raise ValueError(f"{log}: {', '.join(ignored)}: of no use to a receiver's log")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log, self.vehicle, self.mapping)

@@ -178,12 +178,12 @@ class _Bench:
         comparison = None
         if self.agent or self.estimator:
             comparison = self._make_comparison(self.agent or [], self.estimator or [])
-        own = {
+        of_entries = {
             "--scenario": self.scenario, "--env": self.env_id, "--fresh": self.fresh,
             "--vehicle": self.vehicle, "--trust": self.trust, "--limit": self.limit != _LIMIT,
         }  # fmt: skip
-        if given := [name for name, value in own.items() if value and comparison is None]:
-            raise ValueError(f"{', '.join(given)} go with --agent or --estimator")
+        if stray := [name for name, value in of_entries.items() if value and comparison is None]:
+            raise ValueError(f"{', '.join(stray)} go with --agent or --estimator")
         everything = [name for name in SUITES if name != "logs" or self.data]
         names = self.suites or (["control"] if comparison else everything)
         for name in names:

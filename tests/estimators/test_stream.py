@@ -146,7 +146,7 @@ def test_refused_samples(sample: Sample, message: str) -> None:
         (
             ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "course_rad", "gps_latency_s"),
             {},
-            "gps_latency: no such channel, for a sample that is pushed has come",
+            "gps_latency: no channel, for a sample that is pushed has come",
         ),
         (
             ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "camera_psi_rad"),
