@@ -79,9 +79,7 @@ class Stream:
         if twice := [name for name in dict.fromkeys(quantities) if quantities.count(name) > 1]:
             raise ValueError(f"{', '.join(twice)} comes twice among {', '.join(channels)}")
         if latencies := [name for name in LATENCIES.values() if name in quantities]:
-            raise ValueError(
-                f"{latencies[0]}: no such channel, for a sample that is pushed has come"
-            )
+            raise ValueError(f"{latencies[0]}: no channel, for a sample that is pushed has come")
         lacking = [name for name in SENSORS["camera"] if name not in quantities]
         if 0 < len(lacking) < len(SENSORS["camera"]):
             raise ValueError(f"a camera's sample has both values; no channel of {lacking[0]}")

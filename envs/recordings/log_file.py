@@ -32,16 +32,18 @@ _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
 def _make_log(
-    values: dict[str, Array], name: str, dt: float | None = None, origin: float = 0.0
+    values: dict[str, Array], name: str, dt: float | None = None, origin: float | None = None
 ) -> Log:
     """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
 
-    Its first tick is that of the first row, by the time from `origin` (s) on. A logged input
-    (steering, torque, command) acts from its row to the next, so it stands one row later in the
-    record.
+    Its first tick is that of the first row, by the time from `origin` (s) on; None: from 0, or from
+    a first row below it, for no tick is negative. A logged input (steering, torque, command) acts
+    from its row to the next, so it stands one row later in the record.
     """
     dt = find_step(values["time"]) if dt is None else dt
-    first = round((float(values["time"][0]) - origin) / dt)
+    start = float(values["time"][0])
+    origin = min(start, 0.0) if origin is None else origin
+    first = round((start - origin) / dt)
     fast, present = make_fast_rows(values)
     packets, slow = make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)

@@ -428,9 +428,8 @@ def _parse_scenario(values: Fields) -> Scenario:
         raise TypeError(describe_unknown("scenario field", unknown, [*known, "base"]))
     if base is not None:
         start = make_scenario(base)
-        for name in ("vehicle", "nominal", "noise"):  # the base's numbers that are not named stay
-            if isinstance(values.get(name), Mapping):
-                values[name] = {**getattr(start, name), **values[name]}
+        for name in {"vehicle", "nominal", "noise"} & values.keys():  # what is not named stays
+            values[name] = {**getattr(start, name), **dict(values[name])}
         return start.replace(**values)
     return Scenario(**{"name": "custom", **values})
 
@@ -446,7 +445,6 @@ def _read_trace(source: Path) -> Scenario:
     length = round((len(trace) - 1) * step, 9)
     fields: Fields = {"trace": trace, "trace_step": step, "duration": length}
     speed = values.get("speed_x", np.zeros(0))
-    known_speed = speed[np.isfinite(speed)]
-    if len(known_speed):
+    if len(known_speed := speed[np.isfinite(speed)]):
         fields["speed"] = max(float(known_speed[0]), 0.0)  # noise at rest
     return Scenario(name=source.stem, steering="trace", **fields)

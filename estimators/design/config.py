@@ -226,6 +226,7 @@ def _select_defaults(
     ]
     left_out = {f"{name}_sd" for name in absent} | {f"{name}_time" for name in absent}
     left_out |= {f"q_{name}" for name in absent}
+    left_out |= {"model_error"} if TYRES[0] in absent else set()
     return {key: value for key, value in defaults.items() if key not in left_out}
 
 

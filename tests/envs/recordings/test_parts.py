@@ -82,7 +82,7 @@ def test_nothing_that_lasts(tmp_path: Path) -> None:
 
 
 def test_a_part_without_a_slow_sensors_sample_lacks_the_sensor(tmp_path: Path) -> None:
-    table = drive(1200).assign(course_rad=np.nan, camera_psi_rad=np.nan)
+    table = drive(1200).assign(course_rad=np.nan, camera_psi_rad=np.nan, camera_y_l_m=0.0)
     table.loc[:500:20, "course_rad"] = 0.1
     table.loc[::10, "camera_psi_rad"] = 0.1
     logs, done = read_parts(saved(without(table, 550, 620), tmp_path))
