@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import sideslip
+from sideslip.agents.baselines import GRIP, STEER_WEIGHT
 from sideslip.benchmarks.control.entries import (
     REFERENCE_FILTER,
     ControlCase,
@@ -35,6 +36,7 @@ from sideslip.benchmarks.entrants.challenge import (
     make_user_entry,
 )
 from sideslip.benchmarks.entrants.score import _compose_verdict, _make_sentence, _make_table
+from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.benchmarks.conftest import Run
 from tests.policies import VISION
 
@@ -61,10 +63,10 @@ def wrapped(folder: Path, options: dict[str, Any]) -> str:
 
 @pytest.mark.long
 def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run) -> None:
-    """Bit for bit, by command and by `score`; so it is nominal, whose design LQR is."""
+    """Bit for bit, by command and by `score`: LQR as it is designed is nominal."""
     contest = ControlTask("", YAW, "coms", "zero-slip", "gust")
-    shipped = Entry("lqr", REFERENCE_FILTER)
-    mine = wrapped(tmp_path, ControlCase(contest, shipped).agent_options)
+    shipped, time = Entry(NOMINAL), SCENARIOS["gust"].disturbance_time
+    mine = wrapped(tmp_path, {"disturbance_time": time, "grip": GRIP, "steer_weight": STEER_WEIGHT})
     rows = tmp_path / "rows.json"
     arguments = ("--scenario", "gust", "--env", YAW, "--episodes", 4, "--jobs", 1, "--json", rows)
     status, out, error = run("bench", "control", "--agent", mine, *arguments)
