@@ -23,7 +23,7 @@ from .wires import move_course, read_wires
 
 _SNAPSHOT_ROWS = 16
 _ROOM = 4  # memories that the buffer holds
-_PATIENCE = 10  # successive samples outside the memory, after which the clock has jumped
+_PATIENCE = 10  # successive fast samples outside the memory, after which the clock has jumped
 
 
 class SideslipEstimate(NamedTuple):

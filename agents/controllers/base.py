@@ -199,7 +199,7 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
         The number as a float.
 
     Raises:
-        TypeError: It is none.
+        TypeError: It is no number.
         ValueError: The number is out of range.
     """
     if not isinstance(value, Real):

@@ -139,8 +139,7 @@ class _Run:
             print_written(console, self.video)
 
 
-_LIMIT = 600.0  # s
-_COUNTED = {"highway", "procedures", "speed"}  # suites whose number of drives is fixed
+_FIXED = {"highway", "procedures", "speed"}  # suites whose number of drives is fixed
 
 
 @register("bench", "Compare estimators and controllers.")
@@ -169,7 +168,7 @@ class _Bench:
     env_id: str = take("The contests of this id alone.", "", "--env")
     fresh: bool = take("Seeds drawn after your files are hashed: publishable.", False, "--fresh")
     salt: str = take("Salt of the test seeds, hexadecimal; default: made from the sources.", "")
-    limit: float = take("s of wall time for a contestant in a contest.", _LIMIT)
+    limit: float | None = take("s of wall time for a contestant in a contest; default: 600.")
     trust: bool
     engine_name: str
     address: str
@@ -180,7 +179,7 @@ class _Bench:
             comparison = self._make_comparison(self.agent or [], self.estimator or [])
         of_entries = {
             "--scenario": self.scenario, "--env": self.env_id, "--fresh": self.fresh,
-            "--vehicle": self.vehicle, "--trust": self.trust, "--limit": self.limit != _LIMIT,
+            "--vehicle": self.vehicle, "--trust": self.trust, "--limit": self.limit is not None,
         }  # fmt: skip
         if stray := [name for name, value in of_entries.items() if value and comparison is None]:
             raise ValueError(f"{', '.join(stray)} go with --agent or --estimator")
@@ -191,10 +190,10 @@ class _Bench:
         check_salt(self.salt, names)
         check_page(self.page, names)
         for option, suite in (("keep", "control"), ("clairvoyant", "control"), ("data", "logs")):
-            is_of = suite in names and not (comparison and option != "keep")
-            if getattr(self, option) is not None and not is_of:
+            fits = suite in names and not (comparison and option != "keep")
+            if getattr(self, option) is not None and not fits:
                 raise ValueError(f"--{option} goes with the suite {suite}, got {', '.join(names)}")
-        if self.episodes is not None and not {*names} - _COUNTED:
+        if self.episodes is not None and not {*names} - _FIXED:
             raise ValueError(f"--episodes: {', '.join(names)} has a number of its own")
         request = Request(
             self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.data,
@@ -214,6 +213,7 @@ class _Bench:
         """Make the request of a user's own entries."""
         from ..control.entries import QUICK_EPISODES
         from ..entrants.challenge import EPISODES, ComparisonRequest, make_user_entries
+        from ..entrants.worker import LIMIT
 
         if list(self.suites or []) not in ([], ["control"]):
             raise ValueError("--agent and --estimator go with the suite control alone")
@@ -229,7 +229,7 @@ class _Bench:
             episodes=self.episodes or (QUICK_EPISODES if self.quick else EPISODES),
             fresh=self.fresh,
             salt=self.salt,
-            limit=self.limit,
+            limit=LIMIT if self.limit is None else self.limit,
         )
 
 

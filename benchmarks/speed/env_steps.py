@@ -27,10 +27,10 @@ _STEPS, _FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on
 
 _FUSION_ID, _VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
 FUSION, VISION = "YawFusion-v0", "YawVision-v0"
-DIRTY = "YawFusion-v1"  # with cars and sensors that err
+FUSION_V1 = "YawFusion-v1"  # with cars and sensors that err
 _PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
 _FILTER: dict[str, Any] = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
-AT_ONCE, DIRTY_AT_ONCE = f"{FUSION} x {COUNT}", f"{DIRTY} x {COUNT}"
+AT_ONCE, V1_AT_ONCE = f"{FUSION} x {COUNT}", f"{FUSION_V1} x {COUNT}"
 FILTERED = f"{AT_ONCE} + exact-kf, full P"
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
 CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
@@ -125,8 +125,8 @@ def make_workloads() -> WorkloadSet:
     field, make = WorkloadSet("Cost of an env-step", "step", note), gym.make_vec
     field.add(FUSION, lambda: _make_episode(gym.make(_FUSION_ID)))
     field.add(AT_ONCE, lambda: _make_batch(make(_FUSION_ID, COUNT)))
-    field.add(DIRTY, lambda: _make_episode(gym.make(f"sideslip/{DIRTY}")))
-    field.add(DIRTY_AT_ONCE, lambda: _make_batch(make(f"sideslip/{DIRTY}", COUNT)))
+    field.add(FUSION_V1, lambda: _make_episode(gym.make(f"sideslip/{FUSION_V1}")))
+    field.add(V1_AT_ONCE, lambda: _make_batch(make(f"sideslip/{FUSION_V1}", COUNT)))
     field.add(
         FILTERED, lambda: _make_batch(EstimateObservations(make(_FUSION_ID, COUNT), **_FILTER))
     )

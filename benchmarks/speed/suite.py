@@ -110,7 +110,7 @@ def _compose_verdict(results: _SpeedResults) -> str:
 def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
     """Make the verdict of the CPU times a unit (us) and the table of targets."""
     us = {name: times.range.value for name, times in taken.items()}
-    step_time, batch_time = us[env_steps.DIRTY], us[env_steps.DIRTY_AT_ONCE]
+    step_time, batch_time = us[env_steps.FUSION_V1], us[env_steps.V1_AT_ONCE]
     over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in _RIVALS if x in us]
     met = [line[0] for line in goals.cells if line[-1] == "met"]
     missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, outcome in goals.cells

@@ -33,7 +33,7 @@ from ..report.study import Request, Study
 
 NAME, GYRO_ALONE = "joint", "bicycle-kf"
 BASE, BAD_INPUT = "base world v1", "steering in degrees"
-IDEALLY = ", ideal world"  # ends the name of a condition in which nothing else errs
+IDEAL_SUFFIX = ", ideal world"  # ends the name of a condition in which nothing else errs
 _BASE_FACTOR = 4  # seeds of the base world over those of another condition
 _FIRST_SEED = 200_000  # no drive of `tuning`
 _WATCH = 0.1  # s between two looks at `is_healthy`
@@ -109,7 +109,7 @@ _RAMP = {"bank": 0.07, "curve_start": 60.0, "curve_ramp": 20.0}
 _GUST = {"wind_force": (1500.0, 2500.0), "wind_arm": 0.3, "wind_start": 7.0, "wind_length": 3.0}
 _STOP = {"speed_change": -5.2, "change_start": 5.0, "change_length": 4.0}
 _STAND = _STOP | {"speed_change": -6.5}
-_DIRTY = (
+_IN_V1 = (
     Condition(BASE, _BOTH, _LANE, fault=np.inf),
     Condition("GPS", fault=np.inf),
     Condition("camera", _CAMERA, _LANE, fault=np.inf),
@@ -142,14 +142,17 @@ _DIRTY = (
     Condition("steering sensor 50 ms late", edit=Edit(("steer",), delay=0.05)),
     Condition(BAD_INPUT, _BOTH, _LANE, Edit(("steer",), scale=1.0 / _DEGREE, start=5.0), fault=5.0),
 )
-_CLEAN = (  # a camera that errs cannot see a road from which the car turns away
+_IDEAL = (  # a camera that errs cannot see a road from which the car turns away
     Condition("camera and GPS", _BOTH, _LANE, fault=np.inf),
     Condition("camera and GPS, straight road", _BOTH, fault=np.inf),
-    *_DIRTY[1:],
+    *_IN_V1[1:],
 )
 CONDITIONS = (
-    *_DIRTY,
-    *(replace(x, name=x.name + IDEALLY, env_id=x.env_id.replace("-v1", "-v0")) for x in _CLEAN),
+    *_IN_V1,
+    *(
+        replace(x, name=x.name + IDEAL_SUFFIX, env_id=x.env_id.replace("-v1", "-v0"))
+        for x in _IDEAL
+    ),
 )
 
 
@@ -313,7 +316,7 @@ _NOTE = (
 
 def _compose_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
     others = [name for name in results if name != BASE and BAD_INPUT not in name]
-    clean = [name for name in others if name.endswith(IDEALLY)]
+    clean = [name for name in others if name.endswith(IDEAL_SUFFIX)]
     judged = [name for name in others if name not in clean]
     ratio, nees, coverage, gyro, silence = (
         {name: float(np.ravel(cells.get(key, np.inf))[0]) for name, cells in results.items()}

@@ -127,7 +127,7 @@ def test_a_replay_without_truth_has_no_winner() -> None:
 
 
 def test_speed_counts_its_goals_and_names_those_that_are_missed() -> None:
-    rounds = {env_steps.DIRTY: [9.0, 10.0, 11.0], env_steps.DIRTY_AT_ONCE: [0.5]}
+    rounds = {env_steps.FUSION_V1: [9.0, 10.0, 11.0], env_steps.V1_AT_ONCE: [0.5]}
     taken = {name: Taken(x) for name, x in {**rounds, env_steps.LANE: [300.0]}.items()}
     cells = [["a", ">= 2 x", "3", "", "met"], ["b", ">= 9 x", "3", "", "not met"]]
     cells.append(["c", ">= 1 x", "", "", "not measured"])

@@ -39,7 +39,7 @@ def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.Mon
     measured = Suite("speed", "", "")
     workloads = env_steps.make_workloads()
     taken, absent = workloads.measure(measured, SHORT), workloads.absent
-    assert {env_steps.DIRTY, env_steps.DIRTY_AT_ONCE, env_steps.FILTERED} <= set(taken)
+    assert {env_steps.FUSION_V1, env_steps.V1_AT_ONCE, env_steps.FILTERED} <= set(taken)
     assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
     assert absent == {
         env_steps.LANE: "highway-env is not installed",

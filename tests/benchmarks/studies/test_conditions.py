@@ -17,7 +17,7 @@ from sideslip.benchmarks.studies.conditions import (
     BAD_INPUT,
     BASE,
     CONDITIONS,
-    IDEALLY,
+    IDEAL_SUFFIX,
     Condition,
     Edit,
 )
@@ -81,9 +81,9 @@ def test_stamps_are_late_by_packets(name: str, late: int) -> None:
 
 
 def test_a_scenario_does_what_its_name_says() -> None:
-    loaded = drive("mass + 25 %" + IDEALLY, duration=SHORT)[2]
+    loaded = drive("mass + 25 %" + IDEAL_SUFFIX, duration=SHORT)[2]
     assert loaded.vehicle.mass == 1.25 * loaded.nominal.mass == 1.25 * 1500.0
-    slippery = drive("friction 0.35, hard steering" + IDEALLY, duration=SHORT)[2]
+    slippery = drive("friction 0.35, hard steering" + IDEAL_SUFFIX, duration=SHORT)[2]
     assert slippery.vehicle.friction == 0.35
     speed = drive("stops and stands")[0].record.fast[9500:, FAST.wheel_left]
     assert np.abs(speed).max() < 0.2
@@ -93,7 +93,7 @@ def test_a_scenario_does_what_its_name_says() -> None:
     assert not ((captured > 6000) & (captured < 15800)).any()
     for name in NAMED:
         is_ideal = drive(name, duration=0.5)[2].config.world.is_ideal
-        assert is_ideal == name.endswith(IDEALLY), name
+        assert is_ideal == name.endswith(IDEAL_SUFFIX), name
 
 
 def measure(name: str, seeds: int) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def measure(name: str, seeds: int) -> dict[str, Any]:
 
 
 def test_who_is_told_errs_less_and_nobody_alarms_without_a_fault() -> None:
-    for name in (BASE, "camera and GPS" + IDEALLY):
+    for name in (BASE, "camera and GPS" + IDEAL_SUFFIX):
         cells = measure(name, 6)
         assert 1.0 < cells["rmse_over_told"].value < 4.0, name
         assert cells["rmse_over_gyro"].value < 1.0 and cells["coverage"].value > 0.88
@@ -112,7 +112,7 @@ def test_who_is_told_errs_less_and_nobody_alarms_without_a_fault() -> None:
 
 def test_who_is_told_is_honest() -> None:
     """So its levels are those of the drives."""
-    condition, squares = NAMED["camera and GPS" + IDEALLY], []
+    condition, squares = NAMED["camera and GPS" + IDEAL_SUFFIX], []
     for seed in range(conditions._FIRST_SEED, conditions._FIRST_SEED + 4):
         run = conditions._run_informed_filter(condition, seed)
         error = run["beta"] - conditions._drive_car(condition, seed)[0].truth["beta"]
@@ -153,7 +153,7 @@ def test_looking_at_the_health_changes_no_bit() -> None:
 
 
 def test_a_run_has_rows_verdict_and_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = BASE, "GPS", BAD_INPUT, "GPS" + IDEALLY
+    names = BASE, "GPS", BAD_INPUT, "GPS" + IDEAL_SUFFIX
     short = [dataclasses.replace(NAMED[name], duration=4.0) for name in names]
     monkeypatch.setattr(conditions, "CONDITIONS", short)
     suite = conditions.STUDY.run(Request(quick=True, jobs=1))
@@ -173,8 +173,8 @@ def test_the_page_says_what_its_file_says() -> None:
     assert list(cells) == list(NAMED) and {row.suite for row in rows} == {"conditions"}
     text = " ".join((DOCS / "results" / "conditions.md").read_text().split())
     others = {name: cells[name] for name in NAMED if name != BASE and BAD_INPUT not in name}
-    judged = [item for name, item in others.items() if not name.endswith(IDEALLY)]
-    clean = [item["nees"] for name, item in others.items() if name.endswith(IDEALLY)]
+    judged = [item for name, item in others.items() if not name.endswith(IDEAL_SUFFIX)]
+    clean = [item["nees"] for name, item in others.items() if name.endswith(IDEAL_SUFFIX)]
     middle = np.median([item["rmse_over_told"] for item in judged])
     held = sum(item["coverage"] >= 0.88 for item in judged)
     honest = sum(0.5 <= item["nees"] <= 2.0 for item in judged)
