@@ -154,7 +154,7 @@ FILTERS: dict[str, FilterDefinition] = {
         slow=SLOW_NAMES,
         gains="covariance",
         disturbances="forces",
-        source="docs/PAPERS.md section 3",
+        source="docs/PAPERS.md",
     ),
     "joint": FilterDefinition(
         slow=SLOW_NAMES,

@@ -105,7 +105,7 @@ CLAIMS = (
         note="Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the "
         "noise follows it; where the noise does not, it is a wrong R. The double layer, which "
         "corrects between courses, gains nothing. On three real receivers the spread hardly "
-        "follows HDOP (docs/PAPERS.md)."),
+        "follows HDOP (docs/howto/receivers.md)."),
     claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
         ClaimPart("slip, double layer / best rival", ROAD, PROPOSED, stated=Bound("<", 1.0),
             rivals=(THREE, LOB)),

@@ -1,9 +1,8 @@
 """Claims of the papers: the simulations that measure them and the rule of their verdicts.
 
 A simulation gives one number a seed for each subject and quantity. A part of a claim is such a
-number, what the paper states of it and the threshold that an honest implementation meets
-(docs/PAPERS.md section 3). The median over the seeds has to meet the threshold, which has no part
-in the verdict.
+number, what the paper states of it and the threshold that an honest implementation meets. The
+median over the seeds has to meet the threshold, which has no part in the verdict.
 """
 
 import math

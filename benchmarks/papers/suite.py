@@ -35,7 +35,7 @@ _TEXT = (
     "A part of a claim is one number a seed. `reproduced`: all parts are as the paper states, each "
     "in nine of ten seeds. `not reproduced`: no part is, even in the median over the seeds. "
     "`partly`: anything between. `report only`: the paper states nothing that could be false. "
-    "Thresholds are what an honest implementation reaches (docs/PAPERS.md section 3); the median "
+    "Thresholds are what an honest implementation reaches; the median "
     "has to meet them. No paper prints its noise or its tuning: both are ours, and filters are "
     "tuned on other seeds than these. A twin is a road test's simulation with everything that the "
     "plant has: Fiala tyres, lags, roll, wandering HDOP."

@@ -61,12 +61,10 @@ CLAIMS = (
         ClaimPart("multirate / bound: the stiffness error", FIG7, MULTI, rivals=("bound",)),
         ClaimPart("delay ignored / multirate", FIG7, NO_DELAY, rivals=(MULTI,)),
         ClaimPart("delay ignored, tuned for it / multirate", FIG7, RETUNED, rivals=(MULTI,)),
-        note="docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The "
-        "exact filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the "
-        "delay costs is a matter of tuning: more than twice the error with the gains of the "
-        "filter that knows the delay; far less than that filter's error with gains tuned for "
-        "ignoring it, since on a single sine the lag that is left cancels the lag of too soft "
-        "tyres."),
+        note="What ignoring the delay costs is a matter of tuning: more than twice the error with "
+        "the gains of the filter that knows the delay; far less than that filter's error with "
+        "gains tuned for ignoring it, since on a single sine the lag that is left cancels the lag "
+        "of too soft tyres."),
     claim("Fig. 9 (twin)", "on the road the bicycle model's filter is the poorest",
         _make_poorest_part(FIG9, None)),
     claim("Fig. 9 (twin)", "on the road the filter with pseudo-residuals is the best",

@@ -130,7 +130,7 @@ def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> A
     ("estimator", "rate"), [("single-rate-kf", "camera"), ("multirate-kf", "control")]
 )
 def test_fig8_control_against_none(scenario: str, limit: float, estimator: str, rate: str) -> None:
-    """PAPERS section 3: RMS slip with control at most 0.40 (tyres 1.2 x: 0.55) of none's."""
+    """RMS slip with control at most 0.40 (tyres 1.2 x: 0.55) of none's."""
     none = _lane_change("none", "", scenario)
     controlled = _lane_change("two-dof", estimator, scenario, rate=rate)
     ratio = np.sqrt(np.mean(controlled["beta"] ** 2) / np.mean(none["beta"] ** 2))

@@ -114,7 +114,7 @@ def test_joined_chunks_keep_the_order_of_the_seeds() -> None:
 
 
 def test_exact_ranks() -> None:
-    """docs/PAPERS.md section 3: dakf 4 of 5, dual-rate 4 of 6, vision alone 4 of 4."""
+    """Ranks: dakf 4 of 5, dual-rate 4 of 6, vision alone 4 of 4."""
     numbers, _ = theory.compute_coms_ranks(0)
     ranks = {name: value for (name, _), value in numbers.items()}
     assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}

@@ -83,7 +83,7 @@ def radius_of_29(q: Array, printed: bool, frames: int = 30) -> float:
 
 @pytest.mark.parametrize("strength", [5.0, 20.0])
 def test_gains_from_the_pseudo_noise_grow(strength: float) -> None:
-    """docs/PAPERS.md found a radius of 1.17 to 1.22, as printed and as corrected."""
+    """An independent trial found a radius of 1.17 to 1.22, as printed and as corrected."""
     q = np.array([1e-4, 1e-4, 1e-4, strength, strength, strength])
     A, C = make_extended_model()
     R = np.array([[COURSE_SD**2]])

@@ -88,7 +88,7 @@ def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
 
 
 def test_table_ii_within_half_a_decibel() -> None:
-    """PAPERS section 3: 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
+    """Printed are 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
     for printed, dt in zip(PRINTED, (0.033, 0.001), strict=True):
         decibels, omega = _compute_gain_margin(_make_estimator_loop(COMS, DESIGN, dt))
         assert decibels == pytest.approx(printed, abs=0.5)
@@ -97,7 +97,7 @@ def test_table_ii_within_half_a_decibel() -> None:
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_the_multirate_loop_has_the_larger_gain_margin_with_the_same_pi(placement: str) -> None:
-    """PAPERS section 3: by 20 dB at least."""
+    """The multirate loop's margin is larger by 20 dB at least."""
     design = dataclasses.replace(DESIGN, placement=placement)
     slow, fast = (
         _compute_gain_margin(_make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)

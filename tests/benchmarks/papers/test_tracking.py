@@ -1,4 +1,4 @@
-"""dakf-stability Fig. 7: the thresholds of PAPERS section 3, and what they leave out."""
+"""dakf-stability Fig. 7: the thresholds of an honest implementation, and what they leave out."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -185,7 +185,7 @@ def test_files_in_rows_out(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not STANFORD.exists(), reason="the shared recordings are not here")
 def test_the_stanford_drive_reaches_its_numbers() -> None:
-    """Told the fitted car x 0.7: PAPERS section 4 has 1.11 deg gyro only, multirate 0.50-0.53."""
+    """Told the fitted car x 0.7: gyro only 1.11 deg, multirate 0.50-0.53."""
     settings: dict[str, Any] = {"stiffness_factor": 0.7, "seeds": 3, "figures": False}
     car = make_vehicle("ferrari-250lm-fitted")
     suite = replay(read_log(STANFORD), car, estimators=["multirate-kf"], **settings)

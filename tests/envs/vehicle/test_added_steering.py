@@ -185,7 +185,7 @@ def gain(vehicle: Vehicle, V_x: float) -> float:
 
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_it_is_minus_the_ratio_of_the_static_gains(V_x: float) -> None:
-    """The middle of (24) lacks this minus: PAPERS section 2."""
+    """The middle of (24) lacks this minus: docs/PAPERS.md."""
     model = make_bicycle_model(COMS, V_x)
     (from_delta, from_moment), _ = np.linalg.solve(model.A, -model.B)
     scale = max(abs(gain(COMS, V_x)), 1e3)  # near 20.73 km/h the numerator is a difference
@@ -221,7 +221,7 @@ def test_and_goes_there_from_straight_driving(V_x: float) -> None:
         state = kutta3(state, (load, load, load), CALM, make_car(COMS), ROAD, 0.001, PAPER)
         most = max(most, abs(state.v_y / V_x))
     assert most > 1e-6
-    # PAPERS section 3; at 45 km/h the slowest pole, 1.65 / s, leaves 7e-8 of some 1e-4 after 10 s
+    # at 45 km/h the slowest pole, 1.65 / s, leaves 7e-8 of some 1e-4 after 10 s
     assert abs(state.v_y / V_x) < 1e-9
 
 

@@ -1,4 +1,4 @@
-"""The claims of PAPERS section 3 on simulations whose seeds were not used for tuning."""
+"""The papers' claims on simulations whose seeds were not used for tuning."""
 
 from typing import Any
 
