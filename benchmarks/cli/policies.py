@@ -50,8 +50,11 @@ class _Export:
             estimator=self.estimator,
             command=get_command_line(),
         )
-        scaled = find_normaliser(self.zipped, self.normalise) or "nothing"
-        text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
+        network = policy.network
+        scales = (network.scale != 1.0).any() or network.mean.any()
+        normaliser = find_normaliser(self.zipped, self.normalise)
+        scaled = normaliser or ("the scales of its training" if scales else "nothing")
+        text = f"network: {_describe_sizes(network)}; observations normalised by: {scaled}"
         console = Console(soft_wrap=True)
         console.print(text, markup=False, highlight=False)
         print_written(console, target)

@@ -17,6 +17,8 @@ from ...envs.vehicle.parameters import make_vehicle
 from ...estimators.make import ESTIMATORS
 from ...estimators.registry import find_class, is_user_file
 from ..control.entries import (
+    ADAPTIVE,
+    JOINT,
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
     SETUPS,
@@ -105,6 +107,8 @@ def make_user_entries(
 def choose_estimator(agent: str) -> str:
     """Choose the estimator of an agent: a policy's own, none for what saw an env alone.
 
+    A controller that follows the tyres reads the filter that estimates them.
+
     Args:
         agent: Name, file's class or path.
 
@@ -113,7 +117,9 @@ def choose_estimator(agent: str) -> str:
     """
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
-    return "" if agent.endswith(ZIP) else REFERENCE_FILTER
+    if agent.endswith(ZIP):
+        return ""
+    return JOINT if agent in ADAPTIVE else REFERENCE_FILTER
 
 
 @dataclass(frozen=True)

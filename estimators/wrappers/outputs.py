@@ -15,7 +15,7 @@ from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum,
 from ...envs.task import ObservationEntry
 from ..core.filter import advance, compute_deviation, read_covariance
 from ..core.record import FILTER, FilterRecord, GainTables
-from ..core.update import is_healthy
+from ..core.update import compute_excess, is_healthy
 from ..estimator import compile_call
 from ..protocol import EstimatorLike, compute_std
 
@@ -163,7 +163,8 @@ def observe(
             gamma_at = state
     f = filters[0]
     summary[0], summary[1] = f.x[0], compute_deviation(f, gains, 0)
-    summary[2] = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
+    nees = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
+    summary[2] = nees / maximum(compute_excess(f), 1.0)  # lost, it is less sure
     summary[3] = 1.0 if is_healthy(f) else 0.0
     return done
 

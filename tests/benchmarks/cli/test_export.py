@@ -25,7 +25,11 @@ def test_a_zip_is_exported_and_drives(run: Run, zipped: Path, tmp_path: Path) ->
     trained = ("--env", GPS, "--estimator", "bicycle-kf")
     status, out, err = run("export", zipped, "-o", other, "--trust", *trained)
     assert status == 0, err
-    assert "x 8 x 4 x 1" in out and "normalised by: nothing" in out and str(other) in out
+    assert (
+        "x 8 x 4 x 1" in out
+        and "normalised by: the scales of its training" in out
+        and str(other) in out
+    )
     card = load_policy(other).card
     assert card.estimator == "bicycle-kf" and card.env_id == GPS
     for file, trust in ((other, ()), (zipped, ("--trust",))):

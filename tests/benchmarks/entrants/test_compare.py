@@ -248,6 +248,7 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
         ("lqr", "dakf"),
     ]
     assert make_user_entries([VISION], [])[0].estimator == ""
+    assert make_user_entries(["adaptive-lqr"], [])[0].estimator == "joint"
 
 
 def test_contests_are_those_of_the_id() -> None:

@@ -104,6 +104,16 @@ def test_nees_is_the_normalised_error_per_output() -> None:
         *_, info = env.step(still(env))
         e = env.estimator.x[i] - info[output]
         assert info["nees"] == pytest.approx(e * e / env.estimator.P[i, i], rel=1e-9)
+    fusion = gym.make("sideslip/YawFusion-v1", scenario={"base": "coms-slalom", "gyro_bias": 0.4})
+    lost: Any = EstimateObservation(fusion, "joint")
+    lost.reset(seed=0)
+    healthy = True
+    while healthy:
+        *_, info = lost.step(still(lost))
+        healthy = info["healthy"]
+    both = [lost.estimator.names.index(name) for name in ("beta", "gamma")]
+    e, P = lost.estimator.x[both] - [info["beta"], info["gamma"]], lost.estimator.P[both][:, both]
+    assert info["nees"] == pytest.approx(e @ np.linalg.solve(P, e) / 2.0, rel=1e-9)
     blind = EstimateObservation(gym.make(VISION), "multirate-kf", outputs=["psi"])
     assert "nees" not in blind.reset(seed=0)[1]
 
