@@ -224,9 +224,9 @@ def _make_headlines(root: Path) -> list[str]:
         for pair in pairs
     )
     return [
-        f"costs {best[0]} and {best[1]} % of LQG as designed. Tuned, LQG costs {tuned[0]} and "
-        f"{tuned[1]} %. At the limit it loses {best_lost[1]} % of the cars, tuned LQG "
-        f"{tuned_lost[1]} %.",
+        f"costs {best[0]} % of untuned LQG on the road and {best[1]} % at the limit. Tuned LQG "
+        f"costs {tuned[0]} and {tuned[1]} %. At the limit MPC loses {best_lost[1]} % of the "
+        f"cars, tuned LQG {tuned_lost[1]} %.",
         f"On {table['n']} of them it errs {whole['rms / deg']:.2f} deg (RMS), and its 95 % "
         f"interval holds {whole['in 95 % / %']:.0f} % of the time.",
         f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
