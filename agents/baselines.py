@@ -97,6 +97,8 @@ def make_noise_options(
     options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
     options["bank_sd"] = compute_range_rms(scenario, "bank")
     options |= {option: noise[key] for key, option in _NOISE.items() if key in noise}
+    if "course" in noise:
+        options["course_noise"] = noise["course"] / (0.5 * sum(scenario.range("speed")))
     if world.is_ideal:
         return options
     errors = _make_error_options(scenario, world)
@@ -232,8 +234,9 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
         world = dataclasses.replace(world, steer_offset=IDEAL.steer_offset)
     levels = make_noise_options(base.scenario, world, knows_tyres)
     levels |= {"slow": list(base.slow_sensors)}
-    if "gps" not in base.slow_sensors:
-        del levels["hdop_table"]
+    for sensor, option in (("gps", "hdop_table"), ("camera", "camera_yaw_sd")):
+        if sensor not in base.slow_sensors:
+            levels.pop(option, None)
     if has_tyre_filter:
         levels |= _TYRE_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
@@ -278,15 +281,15 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
     return dict(classes)
 
 
-def get_tuned_options(contest_class: str, name: str) -> Options:
+def get_tuned_options(task_class: str, name: str) -> Options:
     """Get the tuned options of an entry by part, empty where none was tuned.
 
     Args:
-        contest_class: Class of tasks.
+        task_class: Class of tasks.
         name: Name of the entry.
 
     Returns:
         Options by part.
     """
-    options = read_tuned().get(contest_class, {}).get(name, {})
+    options = read_tuned().get(task_class, {}).get(name, {})
     return {part: dict(options.get(part, {})) for part in PARTS}

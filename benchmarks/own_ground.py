@@ -1,7 +1,7 @@
 """Each of the five papers' systems on its own ground, beside the benchmark's common score.
 
 `python -m sideslip.benchmarks.own_ground` drives them in their papers' simulations and in the small
-car's contests, and writes docs/own_ground.json and the table in docs/PAPERS.md.
+car's tasks, and writes docs/own_ground.json and the table in docs/PAPERS.md.
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ class System:
         criterion: The metric in words.
         simulations: Drives of a paper without a controller, with its filters.
         label: The paper's filter among them.
-        contestant: Who drives the contests where its own filter takes no lost or uneven frames.
+        common_entry: Who drives the tasks where its own filter takes no lost or uneven frames.
     """
 
     paper: str
@@ -68,11 +68,11 @@ class System:
     criterion: str
     simulations: Sequence[EstimationSimulation] = ()
     label: str = ""
-    contestant: Entry | None = None
+    common_entry: Entry | None = None
 
     @property
     def rival(self) -> Entry:
-        """LQG with the same sensors, as the benchmark tuned it."""
+        """Tuned LQG with the same sensors; a filter stands beside `_INFORMED` instead."""
         sensor = "camera" if "Vision" in self.task.env_id else "gps"
         return Entry(REFERENCE_CONTROLLER, f"{FILTER}, {sensor}")
 
@@ -130,7 +130,7 @@ SYSTEMS = (
         _make_task("YawVision", tie_vision_control.FIG8, "zero-slip", control_period=1),
         "rms_slip",
         "sideslip angle",
-        contestant=Entry("two-dof", REFERENCE_FILTER),
+        common_entry=Entry("two-dof", REFERENCE_FILTER),
     ),
     System(*_FOLLOWING, "rms_slip_error", _SLIP),
     System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
@@ -150,7 +150,7 @@ SYSTEMS = (
 
 
 def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[ResultRow]:
-    """Drive every system on its own ground and, beside nominal, in the small car's contests."""
+    """Drive every system on its own ground and, beside nominal, in the small car's tasks."""
     suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, EPISODES)
     for system in SYSTEMS:
         original, recommended, rival = (x**2 for x in system.measure(seeds, jobs))
@@ -166,7 +166,7 @@ def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[Resu
                 paper=system.paper,
             )
     tasks = [x for x in list_scored_tasks() if (x.tier, x.env_id) == (_TIER, STEERING)]
-    systems = [x for y in SYSTEMS for x in (y.contestant or y.entry, y.recommended)]
+    systems = [x for y in SYSTEMS for x in (y.common_entry or y.entry, y.recommended)]
     pairs = [(task, entry) for task in tasks for entry in dict.fromkeys((Entry(NOMINAL), *systems))]
     common = measure(pairs, make_task_seeds(salt, EPISODES), jobs=jobs, console=console)
     check_driven(common)
@@ -196,8 +196,8 @@ def make_table(rows: Sequence[ResultRow]) -> str:
     for system in SYSTEMS:
         both = (system.entry, system.recommended)
         ground = [format_cell(system.scenario, entry, _RATIO) for entry in both]
-        contestants = (system.contestant or system.entry, system.recommended)
-        common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in contestants]
+        common_entries = (system.common_entry or system.entry, system.recommended)
+        common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in common_entries]
         names = [f"`{x.agent}` on `{x.estimator}`" for x in both]
         lines.append([f"{system.paper}, {system.scenario}", *names, *ground, *common])
     return format_table(lines, _HEADS)

@@ -1,6 +1,6 @@
 """The tables of results in README.md and docs/results/benchmark.md, and README's sentences.
 
-`python -m sideslip.benchmarks.readme` drives README's entries in every contest with steering, and
+`python -m sideslip.benchmarks.readme` drives README's entries in every task with steering, and
 writes the rows to docs/first.json and both tables. The columns of transfer are those of
 docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes.
 """
@@ -60,7 +60,7 @@ _TRANSFER = {
 }
 """Columns of transfer: scenario, metric, factor and format."""
 _RIVAL = (REFERENCE_CONTROLLER, "ratio")  # against whom costs are paired there
-EPISODES, _DOUBLED_EPISODES = 32, 16  # a contest
+EPISODES, _DOUBLED_EPISODES = 32, 16  # a task
 _DOUBLED = ", ranges doubled"
 
 
@@ -70,7 +70,7 @@ def _measure_entries(
     salt: str = "",
     keep: Path | None = None,
 ) -> list[ResultRow]:
-    """Drive the entries and nominal in every scored contest with steering; return their rows."""
+    """Drive the entries and nominal in every scored task with steering; return their rows."""
     policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
     pairs = [(NOMINAL, ""), *(pair for pairs in ENTRIES.values() for pair in pairs)]
     salt, rows = salt or make_salt(), list[ResultRow]()

@@ -26,7 +26,7 @@ SUITES = {
 """The module of each suite, whose `STUDY` it is."""
 
 SALTED = ("control",)
-"""The suites whose test seeds follow the contestants' sources."""
+"""The suites whose test seeds follow the entries' sources."""
 
 
 def check_salt(salt: str, names: Sequence[str]) -> None:

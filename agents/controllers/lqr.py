@@ -183,7 +183,7 @@ class Lqr(Controller):
         """Design the gains for a car, on knots of the stiffnesses (N/rad) or for its own."""
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle = car
-        speeds = SPEEDS[::2] if fronts or self._car_columns else SPEEDS
+        speeds = SPEEDS[::2] if fronts or self._car_columns else SPEEDS  # many tables: half of it
         self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
@@ -195,18 +195,19 @@ class Lqr(Controller):
         """List entries of an observation that a subclass reads behind `Inputs`."""
         return ()
 
-    def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
+    def gains(self, speed: float, front: float | None = None, rear: float | None = None) -> Array:
         """Compute the gains K, shape (m, n).
 
         Args:
             speed: Speed (m/s).
-            front: Front cornering stiffness of a tyre (N/rad), where the gains are scheduled on it.
+            front: Front cornering stiffness of a tyre (N/rad) for scheduled gains; None: the car's.
             rear: Rear cornering stiffness of a tyre (N/rad), likewise.
 
         Returns:
             Gains on the states of the design.
         """
-        return self._interpolate(speed, front, rear)[:, : len(self.design_spec.states)]
+        stiffness = front or self.vehicle.front_stiffness, rear or self.vehicle.rear_stiffness
+        return self._interpolate(speed, *stiffness)[:, : len(self.design_spec.states)]
 
     def _interpolate(self, speed: float, front: float, rear: float) -> Array:
         """Interpolate the table of [K S], shape (m, n + m)."""
@@ -262,7 +263,7 @@ class Lqr(Controller):
             return
         for i in range(len(inputs)):
             x, numbers, row = inputs[i], inputs[i, self._car_columns], slice(i, i + 1)
-            if not numbers.all():  # a row whose inputs are not finite
+            if not numbers.all():  # inputs that are not finite came as zeros
                 continue
             self._get_for_car(numbers)._compute_actions(inputs[row], state[row], action[row])
             left, right = numbers[-2:]

@@ -55,7 +55,7 @@ class Port(AbstractContextManager["Port"]):
         port: Number to bind, 0 for any.
 
     Raises:
-        OSError: The port is in use, or the host is unknown.
+        OSError: The port is in use or above 65535, or the host is unknown.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
@@ -64,10 +64,12 @@ class Port(AbstractContextManager["Port"]):
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             self._socket.close()
-            in_use = error.errno == errno.EADDRINUSE
-            reason = "is in use" if in_use else f"is none: {error.strerror}"
+            in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+            reason = (
+                "is in use" if in_use else f"is none: {getattr(error, 'strerror', None) or error}"
+            )
             raise OSError(f"UDP port {port} of {host} {reason}") from None
         self.address: Address = self._socket.getsockname()
         self._sent: dict[int, int] = {}
@@ -164,7 +166,7 @@ class _Histogram:
     def quantile(self, share: float) -> float:
         """Compute the upper edge of a quantile's bin, or the largest time (us)."""
         us = bisect.bisect_left(list(accumulate(self.counts)), math.ceil(share * self.number))
-        return us + 1.0 if us < _TOP else self.largest
+        return min(us + 1.0, self.largest) if us < _TOP else self.largest
 
     def summarise(self) -> dict[str, float]:
         """Compute median, 99.9 % quantile and maximum (us)."""

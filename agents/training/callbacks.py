@@ -54,12 +54,12 @@ def _make_evaluation_seeds(episodes: int) -> list[int]:
 
 
 class Evaluation(NamedTuple):
-    """An evaluation of the deterministic policy; of a mixture `of_none` is a mean of scenarios."""
+    """An evaluation of the deterministic policy; in a mixture scenarios are weighed alike."""
 
     steps: int  # of the training so far
     cpu_seconds: float  # of the training so far, without evaluations
-    cost: float  # mean cost J; of a mixture `of_none` times the scenarios' mean uncontrolled cost
-    of_none: float  # cost relative to the uncontrolled car's on these seeds
+    cost: float  # mean cost J; of a mixture its scenarios' by `equal_weights`
+    of_none: float  # `cost` over the uncontrolled car's on these seeds
     of_start: float | None = None  # geometric mean of costs over the initial policy's, if any
 
     @property

@@ -323,7 +323,7 @@ class _Lane:
 def _process_picture(
     picture: "Image", finder: "LaneFinder", out: Path | None
 ) -> tuple[list["Lane"], float]:
-    """Find the lane of a picture, draw it, and return it with the CPU seconds that it took."""
+    """Find the lane of a picture, draw it, and return it with its least CPU seconds."""
     import cv2
 
     from ...envs.sensors.camera.pictures import draw_lane
@@ -374,9 +374,7 @@ def _report(source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
     if len(lanes) == 1:
         lines = [f"{source.name}: {lanes[0].describe()}"]
     elif shown:
-        psi, y, quality = (
-            np.array([getattr(x, k) for x in shown]) for k in ("psi", "y", "quality")
-        )
+        psi, y, quality = np.array([(lane.psi, lane.y, lane.quality) for lane in shown]).T
         lines.append(
             f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
             f"{y.mean():+.2f} m (sd {y.std():.2f}), quality {np.mean(quality):.2f}"
@@ -385,5 +383,4 @@ def _report(source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
         f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "
         f"{1.0 / seconds:.0f} frames a second of one core"
     )
-    for line in lines:
-        _console.print(line, markup=False)
+    _console.print("\n".join(lines), markup=False)

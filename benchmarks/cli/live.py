@@ -1,6 +1,6 @@
 """`sideslip live`: an estimator on UDP datagrams in real time, the simulated car, relay, replay."""
 
-import json as writer  # a command's option is called json
+import json
 import os
 import signal
 import socket
@@ -97,7 +97,8 @@ class _Live:
                 title = f"{self.estimator}, {self.agent}"
                 viewer = stack.enter_context(Viewer(title, page, console.is_terminal))
                 loop.viewer = viewer.address
-                console.print(viewer.url and f"page: {viewer.url}")
+                if viewer.url:
+                    console.print(f"page: {viewer.url}")
             other = None
             if self.simulate:
                 arguments = setup["env"], setup["options"], port.address, setup["seed"]
@@ -167,6 +168,8 @@ class _Live:
         recorded = Session(path)
         setup = recorded.setup
         for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
+            if requested[kind] not in (None, "none", setup.get(kind)):
+                raise ValueError(f"{path} is of {kind} {setup[kind]}, not {requested[kind]}")
             if setup.get(kind) != requested[kind]:  # a file's text may not choose what code is run
                 name = f"{kind} in {path}, name it in the command to run it:"
                 check_choice(name, setup[kind], known)
@@ -180,7 +183,7 @@ class _Live:
 
     def _write(self, numbers: Mapping[str, Any]) -> None:
         if self.json is not None:
-            write_atomic(self.json, (writer.dumps(numbers, indent=1) + "\n").encode())
+            write_atomic(self.json, (json.dumps(numbers, indent=1) + "\n").encode())
             print_written(console, self.json)
 
 

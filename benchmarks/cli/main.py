@@ -134,7 +134,9 @@ class _Run:
             if self.beside is not None:
                 env = copy.deepcopy(driver.env)
                 name = "no control" if self.beside == "none" else self.beside
-                drivers.append(FilmDriver(name, env, make_agent(self.beside, env)))
+                drivers.append(
+                    FilmDriver(name, env, make_agent(self.beside, env, trust=self.trust))
+                )
             write_film(self.video, drivers, self.seed, console)
             print_written(console, self.video)
 
@@ -165,10 +167,10 @@ class _Bench:
     )
     estimator: Texts = take("FILE.py:Class, a name, none; repeatable.")
     scenario: Texts = take("A name or a file; repeatable.")
-    env_id: str = take("The contests of this id alone.", "", "--env")
+    env_id: str = take("The tasks of this id alone.", "", "--env")
     fresh: bool = take("Seeds drawn after your files are hashed: publishable.", False, "--fresh")
     salt: str = take("Salt of the test seeds, hexadecimal; default: made from the sources.", "")
-    limit: float | None = take("s of wall time for a contestant in a contest; default: 600.")
+    limit: float | None = take("s of wall time for an entry in a task; default: 600.")
     trust: bool
     engine_name: str
     address: str
@@ -192,7 +194,8 @@ class _Bench:
         for option, suite in (("keep", "control"), ("clairvoyant", "control"), ("data", "logs")):
             fits = suite in names and not (comparison and option != "keep")
             if getattr(self, option) is not None and not fits:
-                raise ValueError(f"--{option} goes with the suite {suite}, got {', '.join(names)}")
+                got = "--agent or --estimator" if suite in names else ", ".join(names)
+                raise ValueError(f"--{option} goes with the suite {suite}, got {got}")
         if self.episodes is not None and not {*names} - _FIXED:
             raise ValueError(f"--episodes: {', '.join(names)} has a number of its own")
         request = Request(

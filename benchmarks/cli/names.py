@@ -16,9 +16,9 @@ _ENVIRONMENTS = {
     "YawVisionUneven": "camera every 33 ms, 10 to 30 ms late, time-stamped",
     "YawGps": "GPS (course, speed, position) every 200 ms",
     "YawFusion": "the uneven camera and the GPS",
-    "AfsYawFusion": "the same; the action may steer too",
-    "LinearYawVision": "the first on a linear car whose best policy is known",
-    "LinearYawGps": "the same with the GPS",
+    "AfsYawFusion": "the uneven camera and the GPS; the action steers too",
+    "LinearYawVision": "camera, on a linear car whose best policy is known",
+    "LinearYawGps": "GPS, on a linear car whose best policy is known",
     "Highway": "camera and GPS on highway-env's roads; a driver swerves around one that brakes",
     "Outside": "camera and GPS around CommonRoad's single-track, drift and multi-body models",
 }
@@ -33,7 +33,7 @@ def _list_environments() -> dict[str, str]:
 
 
 def check_env(env_id: str) -> None:
-    """Check that an id is registered or, with a colon, has a module.
+    """Check that an id is registered, or names a module that registers it (MODULE:ID).
 
     Args:
         env_id: Id of the env.
@@ -98,7 +98,7 @@ def _list_estimators() -> dict[str, str]:
     behind = "a network behind the filter of its file, which corrects the sideslip angle"
     lines = {name: behind if name.startswith("learned") else "registered" for name in ESTIMATORS}
     for name, filter_ in FILTERS.items():
-        slow = " or ".join(filter_.slow) if len(filter_.slow) < 2 else "camera, GPS or both"
+        slow = "camera, GPS or both" if len(filter_.slow) > 1 else "".join(filter_.slow)
         lines[name] = f"{slow.replace('gps', 'GPS') or 'fast sensors alone'}; {filter_.source}"
     return lines
 

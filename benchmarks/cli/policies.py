@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ...agents.learned.network import Network
     from ...agents.learned.policy import Policy
 
-ENV = "sideslip/YawVision-v0"
+ENV = "sideslip/YawVision-v1"
 EPISODES = 256  # of a policy's test
 
 
@@ -50,11 +50,9 @@ class _Export:
             estimator=self.estimator,
             command=get_command_line(),
         )
-        network = policy.network
-        scales = (network.scale != 1.0).any() or network.mean.any()
-        normaliser = find_normaliser(self.zipped, self.normalise)
-        scaled = normaliser or ("the scales of its training" if scales else "nothing")
-        text = f"network: {_describe_sizes(network)}; observations normalised by: {scaled}"
+        default = "the scales of its training" if (policy.network.scale != 1.0).any() else "nothing"
+        scaled = find_normaliser(self.zipped, self.normalise) or default
+        text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
         console = Console(soft_wrap=True)
         console.print(text, markup=False, highlight=False)
         print_written(console, target)
@@ -146,8 +144,8 @@ def _show_card(console: Console, policy: "Policy") -> None:
     console.print(table)
 
 
-def make_task_table(file: Path, kind: str, episodes: int) -> Table:
-    """Make a table of a policy's costs on the tasks of its class, written into its card too.
+def evaluate_on_tasks(file: Path, kind: str, episodes: int) -> Table:
+    """Evaluate a policy on the tasks of its class, and write the costs into its card.
 
     Args:
         file: File of the policy.
@@ -159,7 +157,7 @@ def make_task_table(file: Path, kind: str, episodes: int) -> Table:
     """
     from ..studies.policies import record_evaluation
 
-    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
+    table = Table("task", "in % of nominal", "adaptive-nmpc", "better", "fails")
     with use_shared_bar(Console(), f"judge {file}"):
         written = record_evaluation(file, episodes, kind)
     for task, record in written["cost in % of nominal"].items():
@@ -172,29 +170,29 @@ def make_task_table(file: Path, kind: str, episodes: int) -> Table:
 
 @register("distill", "Train a policy to imitate a controller.")
 class _Distill:
-    """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
+    """Distil a policy by DAgger; its card says what it costs in each task, on unseen seeds."""
 
     name: str = take_argument("Name of the file, NAME.safetensors.", ...)
-    kind: str = take("Class of contests, as coms-model.", ..., "--class")
-    teacher: str = take("A rung, a controller of the matrix, or a policy.", "adaptive-nmpc")
+    kind: str = take("Class of tasks, as coms-model.", ..., "--class")
+    teacher: str = take("An oracle, a controller of the benchmark, or a policy.", "adaptive-nmpc")
     estimator: str = take("What the policy reads: joint, or nothing but the sensors.", "joint")
-    cars: int = take("Cars a contest and round; its varied lessons share as many.", 6, min=1)
+    cars: int = take("Cars a task and round; its varied lessons share as many.", 6, min=1)
     varied: int = take(
-        "Lessons of each contest with another car, late camera, wind and outages.", 0, min=0
+        "Lessons of each task with another car, late camera, wind and outages.", 0, min=0
     )
     rounds: int = take("Rounds of driving and learning.", 7)
     epochs: int = take("Passes over all drives in a round.", 12)
     cells: int = take("Of its GRU; 0: no memory.", 0)
     hidden: list[int] | None = take("Size of a dense layer (64, 64).")
     batch: int = take("Episodes, with a GRU or traces.", 16)
-    noise: float = take("That shakes the teacher, at most.", 0.02)
-    traces: int = take("Bent units whose running means it reads, instead of a GRU.", 0, min=0)
+    noise: float = take("Of the teacher's action, its largest standard deviation.", 0.02)
+    traces: int = take("Units whose running means it reads, instead of a GRU.", 0, min=0)
     auxiliary_weight: float = take(
-        "Weight of what the teacher reads, as its GRU or traces tell it.", 0.0, "--told"
+        "Weight of predicting what the teacher reads, from GRU or traces.", 0.0, "--told"
     )
     option: Texts = take("NAME=VALUE of what is observed: with_map, fast; repeatable.")
     seed: int = take("Of weights and episodes.", 0)
-    episodes: int = take("Episodes of each contest's test.", 32, min=5)
+    episodes: int = take("Episodes of each task's test.", 32, min=5)
     out: File = take("The file; default: NAME here.")
 
     def run(self) -> None:
@@ -224,5 +222,5 @@ class _Distill:
 
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
             distill(card, lessons.make_tasks(), config, target, show)
-        console.print(make_task_table(target, self.kind, self.episodes))
+        console.print(evaluate_on_tasks(target, self.kind, self.episodes))
         print_written(console, target)

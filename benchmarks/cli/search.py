@@ -16,8 +16,8 @@ from .common import get_command_line, handle_interrupt, print_written
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 tune_app = Typer(no_args_is_help=True)
-_SAID = ("scenario", "env", "target", "option", "search", "noise", "sampler")
-_ALWAYS_SAID = ("trials", "seeds")
+_RECORDED = ("scenario", "env", "target", "option", "search", "noise", "sampler")
+_ALWAYS_RECORDED = ("trials", "seeds")
 
 
 @tune_app.callback()
@@ -79,9 +79,9 @@ class _TuneEstimator:
         suite, result = run(task, SearchOptions(self.trials, *where, console), self.test_seeds)
         print_suite(console, suite)
         words = ["sideslip", "tune", "estimator", self.name]
-        for name in (*_SAID, *_ALWAYS_SAID, "seed"):
+        for name in (*_RECORDED, *_ALWAYS_RECORDED, "seed"):
             value = getattr(self, name)
-            if name in _ALWAYS_SAID or value != getattr(type(self), name, None):
+            if name in _ALWAYS_RECORDED or value != getattr(type(self), name, None):
                 values = value if isinstance(value, list) else [value]
                 words += [str(word) for item in values for word in (f"--{name}", item)]
         made = make_entry(task, result, shlex.join(words), self.note)
@@ -120,6 +120,7 @@ class _TuneController:
         from ..tuning.estimator import STORAGE, SearchOptions, write_tuned
 
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
+        check_writable(*filter(None, (self.out, shipped[0])))
         where = self.storage or STORAGE, "tpe", self.seed, self.jobs, console
         search = SearchOptions(self.trials, *where)
         for kind in self.kind or controllers.KINDS:
@@ -166,7 +167,7 @@ class _Calibrate:
         check_file(path, ".json")
         known = {item.name: item for item in list_scored_tasks()}
         for name in self.contest or []:
-            check_choice("contest", name, known)
+            check_choice("task", name, known)
         tasks = [known[name] for name in self.contest or known]
         console, folder = Console(), Path(f".{path.name}.cases").absolute()
         calibration = Calibration(tasks, folder, seeds)
@@ -181,7 +182,7 @@ class _Calibrate:
             records = calibration.run(get_command_line(), self.jobs, console)
         update(path, records)
         calibration.remove_cases()
-        table = Table("contest", "none", "clairvoyant", "a plan wins")
+        table = Table("task", "none", "clairvoyant", "a plan wins")
         for record in records:
             none = np.mean([episode.costs["none"] for episode in record.episodes])
             wins = sum(episode.winner.startswith("from") for episode in record.episodes)

@@ -16,14 +16,14 @@ from ..harness.parallel import Bar, use_shared_bar
 from .common import announce_torch, print_written
 from .names import check_env
 from .options import File, Text, Texts, parse_options, register, take
-from .policies import EPISODES, make_task_table
+from .policies import EPISODES, evaluate_on_tasks
 
 if TYPE_CHECKING:
     from ...agents.training.callbacks import Progress as TrainingProgress
     from ...agents.training.config import TrainingTask
     from ...agents.training.trainer import TrainResult
 
-_TASK_EPISODES = 32  # of each contest of a policy's class
+_TASK_EPISODES = 32  # of each task of a policy's class
 
 
 @register("train", "Train a policy.")
@@ -58,7 +58,7 @@ class _Train:
     device: str = take("Of the networks, as torch calls it.", "cpu")
     progress: bool = take("Show a bar.", True, "--progress/--no-progress", "-P")
     trained_agent: File = take("Begin with an sb3 zip or a policy.", None, "--trained-agent", "-i")
-    varied: int = take("With a policy: each contest so often, varied as in `distill`.", 0, min=0)
+    varied: int = take("With a policy: each task so often, varied as in `distill`.", 0, min=0)
     trust: bool
     out: File = take("Folder; default: train-ENV-ALGO...-SEED here.")
     log_folder: File = take("Instead of --out, as the zoo: FOLDER/ALGO/ENV_N.", None,
@@ -84,9 +84,7 @@ class _Train:
         if logs is not None and resume:
             raise ValueError(f"--log-folder {logs} is for a new training: name the old --out")
         if varied and resume:
-            raise ValueError(
-                f"--varied {varied} is for a new training: an old one keeps its contests"
-            )
+            raise ValueError(f"--varied {varied} is for a new training: an old one keeps its tasks")
         agent, new = prepare_start(self.trained_agent, varied)
         if logs is not None and isinstance(agent, Policy) and agent.network.memory:
             name = agent.name
@@ -106,10 +104,12 @@ class _Train:
         steps = record.steps if self.steps is None else self.steps
         eval_freq = record.eval_freq if self.eval_freq is None else self.eval_freq
         if resume:
-            command = f"{record.command}; sideslip train --resume --steps {steps}"
+            words = ["sideslip", "train", "--resume", "--out", folder.name, "--steps", str(steps)]
+            command = f"{record.command}; {shlex.join(words)}"
         else:
             names = ("conf_file", "trained_agent", "varied")
             more = {"eval_freq": eval_freq} | {name: getattr(self, name) for name in names}
+            more |= {"out": out.name if out else None}
             named = replace(task, scenarios=[]) if varied else task
             command = shlex.join(_make_command(named, steps, more))
         console = Console()
@@ -130,15 +130,14 @@ class _Train:
         console.print(_make_table(trained))
         kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
         if kind is not None:
-            console.print(make_task_table(folder / POLICY, kind, _TASK_EPISODES))
+            console.print(evaluate_on_tasks(folder / POLICY, kind, _TASK_EPISODES))
         else:
             costs = record_evaluation(folder / POLICY, EPISODES)["cost"]
             shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
             where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
             text = f"mean cost on test seeds{where}: {shown}"
             console.print(text, highlight=False, soft_wrap=True)
-        print_written(console, folder / POLICY)
-        print_written(console, folder / CURVE)
+        print_written(console, folder / POLICY, folder / CURVE)
 
 
 def _make_table(trained: "TrainResult") -> Table:

@@ -1,6 +1,6 @@
 """What tasks demand of a car, which decides what is scored, and what delay costs the baselines.
 
-Tasks (contests in the tables) are scored where a car without control slips or is lost, never by
+Tasks are scored where a car without control slips or is lost, never by
 who gains: `python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates on
 tuning seeds and writes the file.
 """
@@ -144,7 +144,7 @@ def _main(
     cases = [(task, entry) for task in candidates for entry in _BASELINES]
     results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console, keep=keep)
     measurements = [_measure_task(results, task) for task in candidates]
-    table = Table("contest", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
+    table = Table("task", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
     for m in measurements:
         lost = (f"{100.0 * share:.0f}" for share in (m.lost, m.lost_nominal, m.lost_oracle))
         table.add_row(m.task.name, f"{m.peak_slip:.1f}", ", ".join(lost), m.verdict)

@@ -51,7 +51,7 @@ class ClairvoyantEpisode:
 
 @dataclass(frozen=True)
 class CalibrationRecord(TaskRecord):
-    """A contest's episodes, and the command that made them."""
+    """A task's episodes, and the command that made them."""
 
     world_version: int
     command: str
@@ -205,7 +205,7 @@ def _read_calibration(
         if record.world_version != WORLD_VERSION:
             why = f"of world {record.world_version}, not {WORLD_VERSION}"
         elif seeds != _derive_seeds(record.task, len(seeds)):
-            why = "its seeds are not this contest's"
+            why = "its seeds are not this task's"
         if why and not stale:
             raise ValueError(f"{where}, {record.task.name}, is stale: {why}")
         if not why:

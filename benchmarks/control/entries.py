@@ -322,7 +322,7 @@ def make_cases(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[Co
 
     Args:
         tasks: Tasks that are driven.
-        quick: Whether slow contestants are left out.
+        quick: Whether slow entries are left out.
 
     Yields:
         Cases.

@@ -58,7 +58,7 @@ def compose_verdict(matrix: Matrix) -> str:
         f"Of the estimators, under one controller, {filters.describe_first()}.",
         _describe_reasons(matrix),
         f"{_describe_exceptions(matrix.by_tier)}{_describe_resolution(matrix)}Not covered: other "
-        f"cars and roads, and what {episodes} episodes a contest are too few to show.",
+        f"cars and roads, and what {episodes} episodes a task are too few to show.",
     )
 
 
@@ -169,7 +169,7 @@ def _describe_resolution(matrix: Matrix) -> str:
     if 2 * close <= len(pairs):
         return ""
     return (
-        f"In {close} of {len(pairs)} contests knowing everything saves less than 0.2 deg, 1 deg/s "
+        f"In {close} of {len(pairs)} tasks knowing everything saves less than 0.2 deg, 1 deg/s "
         "and 10 % of the cars. "
     )
 
@@ -245,7 +245,7 @@ def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
     """
     by_tier = matrix.by_tier
     questions = (
-        ("Which controller holds the car?", {"All contests": _group_agents(by_tier).costs}),
+        ("Which controller holds the car?", {"All tasks": _group_agents(by_tier).costs}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _name_agent)),
         (
             "Which estimator does a controller drive best with?",
@@ -319,7 +319,7 @@ def _draw_maps(
             if metric in standing.by_task.get(task, {}):
                 values[i, j] = standing.by_task[task][metric].value
         if np.isfinite(values).any():
-            title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
+            title = f"Tier {tier}: {metric.replace('_', ' ')} in every task"
             columns = [task.name for task in tasks]
             figures.append((title, draw.draw_heat_map(names, columns, values, metric, good), text))
     places = np.array([_compute_places(standings, *pair) for pair in CONSTANTS.values()]).T
@@ -374,7 +374,7 @@ def _make_explorer(matrix: Matrix) -> Explorer:
         keyed[task.tier, task.name, entry.label] = values
         bodies[task.tier, task.name] = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
     labels = (entry.label for _, entry in series if entry.agent == best and entry.is_default)
-    menus = ("tier", "contest")
+    menus = ("tier", "task")
     return make_time_explorer("Any two side by side", menus, keyed, next(labels, ""), bodies)
 
 
@@ -402,7 +402,7 @@ def make_time_explorer(
         signals = dict(zip(("t", *SIGNALS), values.T, strict=True))
         cells[key] = {name: _SCALES.get(name, 1.0) * signal for name, signal in signals.items()}
     caption = (
-        "The same seed in both: line the contestant's, dashed the reference. The arrow is where "
+        "The same seed in both: line the entry's, dashed the reference. The arrow is where "
         "the car goes in a quarter of a second, its angle to the body the sideslip."
     )
     return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})

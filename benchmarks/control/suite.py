@@ -75,13 +75,13 @@ STUDY = Study(
     "control",
     "Which controller and estimator hold the car",
     """\
-In a contest everybody drives the same salted seeds, with errors of car and sensors that nobody is \
+In a task everybody drives the same salted seeds, with errors of car and sensors that nobody is \
 told, after 20 s of gentle driving (4 s in a quick run), and everything is paired by drive. \
 `nominal` is the LQG that knows the nominal car, `oracle-parameters` knows car, friction and \
 errors, `oracle-state` the state too. r is log((J_nominal + J_0) / (J + J_0)), where J_0 is the \
 cost of 0.25 deg of slip and 0.5 deg/s, over drives that both finish; 2 where nominal alone loses \
 the car, -2 where the entry alone does. The score is the mean r. Entries that surely lose more \
-cars than nominal stand below a line. Intervals are 95 %. contests.json says what each contest \
+cars than nominal stand below a line. Intervals are 95 %. contests.json says what each task \
 demands.""",
     (EPISODES, QUICK_EPISODES),
     _measure,

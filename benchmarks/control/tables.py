@@ -71,7 +71,7 @@ _MAIN = (
     Column("cost_vs_nominal", "cost / nominal's, %", 100.0, ".1f"),
     Column("share_won", "won / %", 100.0, ".0f", interval=False),
     Column("worst_cost", "worst 5 %", form=".3g", interval=False),
-    Column("contests", form="{:.0f} of {:.0f}"),
+    Column("tasks", form="{:.0f} of {:.0f}"),
     Column("n", "episodes"),
     Column("us", "us a decision", form=".0f"),
 )
@@ -82,7 +82,7 @@ _MOTION = (
     Column("part", "of the period / %", form=".2f"),
 )
 _BASELINES = (
-    "contest",
+    "task",
     Column("peak", "none: peak slip / deg", form=".1f"),
     Column("lost", "lost: none, nominal, oracle / %", form="{:.0f}, {:.0f}, {:.0f}"),
     "oracle-state is",
@@ -101,7 +101,7 @@ _KNOWLEDGE = (
 )
 _MAIN_NOTE = (
     "score: mean r, 0 as nominal. cost, won: of the drives that nominal finishes too. worst 5 %: "
-    "their mean cost. contests: driven, with nominal. A decision is the estimator's step and the "
+    "their mean cost. tasks: driven, with nominal. A decision is the estimator's step and the "
     "controller's, of one car."
 )
 _LINE = "surely lose more cars than nominal:"
@@ -128,11 +128,11 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
         trainings = _describe_policies() if tier == "1" else []
         main.append(_make_main_table(title, ranked, *trainings))
         tasks = [task for task in matrix.tasks if task.tier == tier]
-        detail.append(make_task_table(f"{title}, contest by contest", ranked, tasks))
+        detail.append(make_task_table(f"{title}, task by task", ranked, tasks))
         detail.append(_make_motion_table(f"{title}: the motion", ranked))
     runs = ((0.0, matrix.results), *matrix.late)
     failures = [line for delay, results in runs for line in list_failures(results, delay)]
-    header = ("tier", "contest", "controller and estimator", "what happened")
+    header = ("tier", "task", "controller and estimator", "what happened")
     note = (
         "The share of a cell's episodes; the rest of a failed one is charged at the highest cost."
     )
@@ -145,7 +145,7 @@ def _make_main_table(title: str, ranked: Sequence[Standing], *notes: str) -> Res
     """Make the table of the entries, the best first."""
     lines: list[Line] = [
         {"label": standing.label, "n": standing.n, "us": standing.us}
-        | {"contests": (len(standing.pairs), len(standing.results))}
+        | {"tasks": (len(standing.pairs), len(standing.results))}
         | standing.overall
         for standing in ranked
     ]
@@ -277,7 +277,7 @@ def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
     )
     errors = [drive.error for drive in (none, nominal, state) if drive.error]
     if errors:
-        return {"contest": task.name, "falls": "; ".join(errors)}
+        return {"task": task.name, "falls": "; ".join(errors)}
     pair = PairedDrives(nominal, state, task.cost_floor)
     state_scores, foresight = pair.compute_scores(), matrix.foresight.get(task)
     scores = [np.zeros(pair.n), state_scores]
@@ -285,7 +285,7 @@ def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
         scores[1:1] = [PairedDrives(nominal, parameters, task.cost_floor).compute_scores()]
     slip, yaw = compute_gaps(pair, task)
     return {
-        "contest": task.name,
+        "task": task.name,
         "peak": float(np.degrees(np.median(none["peak_slip"]))),
         "lost": tuple(100.0 * float(np.mean(~x.survived)) for x in (none, nominal, state)),
         "oracle-state is": find_oracle(task),

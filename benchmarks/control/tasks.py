@@ -2,7 +2,7 @@
 
 Those of a tier are chosen once, on tuning seeds, by what they demand of a car without control
 (`baseline_gaps.py`); `contests.json` holds them with the measured demand. Test seeds follow a salt,
-a hash of the contestants' sources and the world's version, so that nobody can have tuned on them.
+a hash of the entries' sources and the world's version, so that nobody can have tuned on them.
 """
 
 import hashlib
@@ -175,14 +175,12 @@ def _read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
         if measurement.world_version != WORLD_VERSION:
             raise ValueError(
                 f"{where} was measured in world {measurement.world_version}, this is "
-                f"{WORLD_VERSION}; measure the contests anew: {COMMAND}"
+                f"{WORLD_VERSION}; measure the tasks anew: {COMMAND}"
             )
         check_choice(f"{where}: oracle", measurement.oracle, ORACLES[STATE])
         check_choice(f"{where}: knowing", measurement.knowing, ORACLES[PARAMETERS])
         if measurement.task not in list_candidates():
-            raise ValueError(
-                f"{where}: {measurement.task} is no contest of this version; {COMMAND}"
-            )
+            raise ValueError(f"{where}: {measurement.task} is no task of this version; {COMMAND}")
         measurements.append(measurement)
     return tuple(measurements)
 
@@ -217,13 +215,13 @@ def find_oracle(task: ControlTask, name: str = STATE) -> str:
 Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]  # of all tasks, or by task
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
+_ENTRY_SOURCES = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
 _LENGTH = 16
 _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash of the contestants' files, weights, the world's version and texts.
+    """Make the salt: a hash of the entries' files, weights, the world's version and texts.
 
     Args:
         more: Texts that belong to it.
@@ -232,7 +230,7 @@ def make_salt(*more: str) -> str:
         Hexadecimal digits.
     """
     digest = hashlib.sha256(str(WORLD_VERSION).encode())
-    for folder, endings in _CONTESTANTS.items():
+    for folder, endings in _ENTRY_SOURCES.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
             if path.suffix in endings:
                 digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())

@@ -163,7 +163,7 @@ class ComparisonRequest:
         if len(self.seeds or range(self.episodes)) < 2:
             raise ValueError("an interval needs two episodes or more")
         if self.fresh and not self.files:
-            raise ValueError("fresh seeds follow the files of the contestants, and there is none")
+            raise ValueError("fresh seeds follow the files of the entries, and there is none")
         if self.salt:
             make_salted_seeds(self.salt, 1)
             if self.fresh or self.seeds:

@@ -116,7 +116,7 @@ def main() -> None:
                 else:
                     answer = getattr(server, name)(*arguments)
             except MemoryError as error:
-                memory = f"a contestant has {_MEMORY / 2**30:g} GiB of memory"
+                memory = f"an entry has {_MEMORY / 2**30:g} GiB of memory"
                 refuse(f"{describe_error(error)}; {memory}")
             except Exception as error:
                 refuse(describe_error(error))
@@ -189,5 +189,5 @@ def _apply_landlock(libc: ctypes.CDLL, rights: Mapping[Path, int]) -> None:
         libc.syscall(_ADD, ruleset, 1, ctypes.c_char_p(rule), 0)
         os.close(descriptor)
     if libc.syscall(_RESTRICT, ruleset, 0):
-        raise OSError(ctypes.get_errno(), "Landlock refused the contestant's rules")
+        raise OSError(ctypes.get_errno(), "Landlock refused the entry's rules")
     os.close(ruleset)

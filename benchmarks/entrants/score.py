@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _TABLE = (
-    Column("label", "contestant"),
+    Column("label", "entry"),
     Column("score", "score [95 %]", form=".2f"),
     Column("failure_rate", "fails, %", 100.0, ".1f", interval=False),
     Column("cost_vs_nominal", "cost, % [95 %]", 100.0, ".0f"),
@@ -106,7 +106,7 @@ def _find_opened_files(
     return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))
 
 
-_MAX_SENTENCES = 4  # contestants with a sentence
+_MAX_SENTENCES = 4  # entries with a sentence
 
 
 def _compose_verdict(comparison: Comparison) -> list[str]:
@@ -145,7 +145,7 @@ def _make_sentence(standing: Standing) -> str:
         parts += [f"costs {cost} of nominal where both finish", f"and wins {won:.0f} % of these"]
     text = f"{standing.label}: {', '.join(parts)}"
     if errors:
-        text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
+        text += f"; not driven in {len(errors)} of {len(standing.results)} tasks: {errors[0]}"
     return text
 
 
@@ -162,7 +162,7 @@ def _describe_trust(comparison: Comparison) -> str:
     request = comparison.request
     n = len(request.seeds or range(request.episodes))
     count = len(request.tasks)
-    where = f"{count} contest{'s' if count > 1 else ''} x {n} episodes"
+    where = f"{count} task{'s' if count > 1 else ''} x {n} episodes"
     if request.fresh:
         files = ", ".join(path.name for path in request.files)
         return (
@@ -174,7 +174,7 @@ def _describe_trust(comparison: Comparison) -> str:
     seeds = f"of {whose} salt {comparison.salt}" if comparison.salt else "of the caller's choice"
     rows = "on file, a sample driven again" if comparison.on_file else "driven now"
     return (
-        f"Not publishable: {where} on seeds {seeds}, which a contestant can be tuned on; --fresh "
+        f"Not publishable: {where} on seeds {seeds}, which an entry can be tuned on; --fresh "
         f"draws new ones. Baselines {rows}. Not said: other cars, manoeuvres and sensors."
     )
 
@@ -192,10 +192,10 @@ def _make_table(comparison: Comparison) -> ResultTable:
     note = (
         "> yours. score: mean r, 0 as nominal, an LQG that knows the nominal car; a loss that "
         "nominal does not have counts -2. Who surely loses more cars than nominal comes last, and "
-        "who does not drive every contest. "
+        "who does not drive every task. "
         "cost, won: of the drives that nominal finishes too."
     )
-    return ResultTable("Your contestants and the package's", _TABLE, lines, note)
+    return ResultTable("Your entries and the package's", _TABLE, lines, note)
 
 
 @dataclass(frozen=True, repr=False)
@@ -210,7 +210,7 @@ class Score:
         won: Fraction of these that cost less than nominal's.
         failures: Fraction of all episodes that failed.
         n: Episodes that count.
-        contests: A row for each task with the same numbers.
+        tasks: A row for each task with the same numbers.
         error: Reason why a task was not driven, "" where all were.
         text: Sentence of the benchmark.
     """
@@ -222,7 +222,7 @@ class Score:
     won: Estimate
     failures: Estimate
     n: int
-    contests: tuple[dict[str, Any], ...]
+    tasks: tuple[dict[str, Any], ...]
     error: str
     text: str
 
@@ -234,7 +234,7 @@ class Score:
         with require_extra("report", "to_pandas needs pandas"):
             import pandas as pd
 
-        return pd.DataFrame(list(self.contests))
+        return pd.DataFrame(list(self.tasks))
 
 
 def score(
@@ -296,9 +296,9 @@ def score(
         rows.append(row | {"n": pairs.n if pairs else 0, "error": result.error})
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
     errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
-    n, contests, error = standing.n, tuple(rows), next(filter(None, errors), "")
+    n, tasks, error = standing.n, tuple(rows), next(filter(None, errors), "")
     text = _make_sentence(standing)
-    return Score(*names, total, cost, won, failures, n, contests, error, text)
+    return Score(*names, total, cost, won, failures, n, tasks, error, text)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
@@ -324,11 +324,11 @@ def run(
     comparison = _compare(request, jobs, console, keep)
     suite = Suite("control", "Your own beside the package's", _TEXT)
     suite.verdict = "\n".join(_compose_verdict(comparison))
-    by_task = make_task_table("Contest by contest", comparison.overall, request.tasks)
+    by_task = make_task_table("Task by task", comparison.overall, request.tasks)
     suite.tables += [_make_table(comparison), by_task]
     lines = [line[1:] for line in list_failures(comparison.results)]
     if lines:
-        header = ("contest", "contestant", "what happened")
+        header = ("task", "entry", "what happened")
         suite.tables.append(ResultTable("Cells that went wrong", header, lines, keyed=False))
     for tier in dict.fromkeys(task.tier for task in request.tasks):
         for standing in rank_entries(comparison.results, tier):

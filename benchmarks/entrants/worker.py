@@ -41,7 +41,7 @@ _LONGEST = 2**16  # bytes of an answer beside its numbers
 _START = f"from {__package__}.child import main; main()"
 
 
-class _ContestantError(Exception):
+class _EntryError(Exception):
     """Why an entry gave no answer."""
 
 
@@ -85,10 +85,10 @@ class _ChildProcess:
     def call(self, *message: object, length: int | None = None) -> bytes:
         """Ask for a method of `_EntryServer` by name; the answer's bytes, of a known length.
 
-        Raises _ContestantError where it failed, ended, was too slow or sent something else.
+        Raises _EntryError where it failed, ended, was too slow or sent something else.
         """
         if self.reason:
-            raise _ContestantError(self.reason)
+            raise _EntryError(self.reason)
         start_time, late = time.monotonic(), False
         try:
             self._pipe.send(message)
@@ -105,7 +105,7 @@ class _ChildProcess:
         elif length is not None and len(content) != length:
             self.reason = f"its process sent {len(content)} bytes where {length} are right"
         if self.reason:
-            raise _ContestantError(self.reason)
+            raise _EntryError(self.reason)
         return content
 
     def __deepcopy__(self, memo: object) -> "_ChildProcess":
@@ -283,7 +283,7 @@ class IsolatedDrive:
             chunk: Chunk whose entry has names and files.
 
         Returns:
-            Files that its contestants open.
+            Files that its entries open.
         """
         return _run_isolated_chunk(self, chunk)[1]
 
@@ -309,7 +309,7 @@ def _run_isolated_chunk(drive: IsolatedDrive, chunk: Chunk) -> tuple[DriveResult
         for child in children:
             if not child.reason:
                 opened.update(json.loads(child.call("opened")))
-    except _ContestantError as error:
+    except _EntryError as error:
         result = _make_failed_result(chunk, str(error))
     finally:
         spent = sum(child.close() for child in children)

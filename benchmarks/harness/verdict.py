@@ -46,7 +46,7 @@ class Explorer:
             raise ValueError(f"explorer {self.title!r} has no cells")
         for key, signals in self.cells.items():
             if len(key) != (n_names := len(self.menus) + 1):
-                text = f"{len(self.menus)} menus and a contestant make {n_names}"
+                text = f"{len(self.menus)} menus and an entry make {n_names}"
                 raise ValueError(f"cell {key} has {len(key)} names, {text}")
             missing = {name for panel in self.panels for name, _ in panel.lines} - set(signals)
             if missing or "t" not in signals:

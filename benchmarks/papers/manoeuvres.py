@@ -168,7 +168,7 @@ def measure_tracking(episode: Rollout) -> dict[str, float]:
 
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
-_CONTESTANTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+_ENTRIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "none": ("none", "", {}),
     "feedforward": ("feedforward", "", {}),
     "single-rate": ("two-dof", "single-rate-kf", {"rate": "camera"}),
@@ -185,16 +185,16 @@ class _AgentSimulation(Simulation):
 
     size: ClassVar[int] = 2
     scenario: str | Mapping[str, Any]
-    contestants: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
+    entries: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
 
     def prepare(self) -> SeedFunction:
-        """Return the function that drives every contestant."""
+        """Return the function that drives every entry."""
         return self._measure_seed
 
     def _measure_seed(self, seed: int) -> tuple[Numbers, Example]:
         numbers: Numbers = {}
         curves: dict[str, dict[str, Array]] = {}
-        for label in self.contestants:
+        for label in self.entries:
             episode, values = self._run_episode(label, seed)
             if episode.failed:  # fewer ticks are no better drive
                 raise RuntimeError(f"{label}: the car of seed {seed} failed")
@@ -211,7 +211,7 @@ class _AgentSimulation(Simulation):
 class SlipSimulation(_AgentSimulation):
     """tie-vision's controllers on a lane change, each with a filter that knows the camera's noise.
 
-    Contestants are those of `_CONTESTANTS`, or have a remark behind a comma. Numbers of each: RMS
+    Entries are those of `_ENTRIES`, or have a remark behind a comma. Numbers of each: RMS
     and peak of the slip, the largest change of the yaw moment in 1 ms, the sum of all its changes
     and the fraction of time at its limit.
     """
@@ -219,7 +219,7 @@ class SlipSimulation(_AgentSimulation):
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # more ones of the agent
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        agent, estimator, options = _CONTESTANTS[label.partition(",")[0]]
+        agent, estimator, options = _ENTRIES[label.partition(",")[0]]
         noise = make_scenario(self.scenario).noise
         known = {option: noise[name] for name, option in _NOISE.items() if name in noise}
         how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
@@ -242,13 +242,13 @@ class SlipSimulation(_AgentSimulation):
 class FollowingSimulation(_AgentSimulation):
     """dakf-stability's controller by wire, with and without parts of it, by `measure_tracking`.
 
-    Contestants are options of `run_episode` by label.
+    Entries are options of `run_episode` by label.
     """
 
-    contestants: Mapping[str, Mapping[str, Any]]
+    entries: Mapping[str, Mapping[str, Any]]
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        drive = run_episode(seed, self.scenario, **self.contestants[label])
+        drive = run_episode(seed, self.scenario, **self.entries[label])
         return drive, measure_tracking(drive)
 
 

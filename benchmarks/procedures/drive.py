@@ -193,14 +193,14 @@ class ProcedureCase:
 
     procedure: str
     car: str
-    contestant: int = 0
+    entry_index: int = 0
     seeds: tuple[int, ...] = ()
     quick: bool = False
 
     @property
     def agent(self) -> str:
         """The controller."""
-        return ENTRIES[self.contestant].agent
+        return ENTRIES[self.entry_index].agent
 
 
 CaseResults = dict[ProcedureCase, Any]

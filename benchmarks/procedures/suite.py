@@ -42,10 +42,10 @@ _TEXT = (
 def _measure_case(case: ProcedureCase) -> Any:
     """Drive a case; the result is one of its procedure's module."""
     if case.procedure == "outside":
-        return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
+        return outside.run_episodes(case.car, ENTRIES[case.entry_index], case.seeds)
     if case.procedure == "check":
         return outside.run_check()
-    car, entry = CARS[case.car], ENTRIES[case.contestant]
+    car, entry = CARS[case.car], ENTRIES[case.entry_index]
     if case.procedure == "fmvss-126":
         multiples, results = _QUICK_MULTIPLES if case.quick else None, []
         for seed in case.seeds:
@@ -131,7 +131,7 @@ class _Table(NamedTuple):
 
 def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
     """Make a line of a table, and the columns of its rows; output: if a case measures several."""
-    estimator = ENTRIES[case.contestant].get_configuration(case.car)[1]
+    estimator = ENTRIES[case.entry_index].get_configuration(case.car)[1]
     scenario = f"{case.procedure} {case.car}" + (f", {x}" if (x := more.get("output")) else "")
     names = {"controller": case.agent, "car": case.car, "estimator": estimator}
     return {"scenario": scenario, "salt": "", **names, **more}

@@ -1,7 +1,7 @@
 """Figures as plotly figures: time series, curves, tracks, groups, heat maps.
 
 Every axis carries its unit, every name has its colour (`envs.rendering.palette`). Lines longer than
-`POINTS` are thinned so that no peak is lost, and numbers are stored in single precision.
+`POINTS` are thinned: those over time keep their peaks and gaps, tracks take even steps.
 Importing this module needs plotly, the extra `report`.
 """
 
@@ -44,17 +44,20 @@ def _choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def _find_peaks(y: Array) -> npt.NDArray[np.intp]:
-    """Find at most POINTS indices of y (n,) that draw the same line: extremes of stretches."""
+    """Find at most POINTS indices of y (n,): extremes and a gap (NaN) of each stretch."""
     n = len(y)
     if n <= POINTS:
         return np.arange(n)
-    size = -(-n // (POINTS // 2 - 1))
+    missing = np.isnan(y)
+    size = -(-n // (POINTS // (3 if missing.any() else 2) - 1))
     starts = np.arange(0, n, size)
     padding = np.full(len(starts) * size - n, np.nan)
     table = np.append(y, padding).reshape(len(starts), size)
     low = np.where(np.isnan(table), np.inf, table).argmin(axis=1)
     high = np.where(np.isnan(table), -np.inf, table).argmax(axis=1)
-    return np.unique(np.concatenate([starts + low, starts + high, [0, n - 1]]))
+    gaps = np.flatnonzero(missing)
+    gaps = gaps[np.unique(gaps // size, return_index=True)[1]]
+    return np.unique(np.concatenate([starts + low, starts + high, gaps, [0, n - 1]]))
 
 
 def draw_time_series(

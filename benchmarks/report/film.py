@@ -42,6 +42,7 @@ def check_film(path: Path | None) -> None:
 
     Raises:
         ValueError: The file has another ending.
+        OSError: The file cannot be written.
         ModuleNotFoundError: The extra `render` is not installed.
     """
     if path is None:

@@ -38,7 +38,7 @@ class Request:
     keep: Path | None = None  # folder of finished cases, so that a stopped run goes on
     clairvoyant: Path | None = None  # file of `sideslip calibrate`, None for the package's
     data: Path | None = None  # folder of downloaded logs, for the suite logs
-    salt: str = ""  # of the seeds of salted suites, "" for the one of the contestants' sources
+    salt: str = ""  # of the seeds of salted suites, "" for the one of the entries' sources
 
     def choose(self, usual: Choice, quick: Choice) -> Choice:
         """Choose by whether the run is quick.

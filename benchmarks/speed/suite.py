@@ -129,7 +129,7 @@ def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
 STUDY = Study(
     "speed",
     "What a step costs",
-    "CPU time on one thread, median and range of rounds in which the contestants of a table "
+    "CPU time on one thread, median and range of rounds in which the entries of a table "
     "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
     (0, 0),
     _measure,

@@ -1,5 +1,6 @@
 """CPU times of workloads that take turns in one process, on one thread, and the table of them."""
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -35,7 +36,7 @@ _MAX_SLOW_ROUNDS = 5
 
 
 class Taken(list[float]):
-    """CPU microseconds a unit or seconds, round by round."""
+    """CPU times of rounds (us a unit, or s), or the ratios of two workloads'."""
 
     @property
     def range(self) -> Estimate:
@@ -98,7 +99,7 @@ def _count_calls(workload: Workload, seconds: float) -> int:
     """Count the calls that take so many seconds, by the second one: the first may compile."""
     _measure_calls(workload, 1)
     once = _measure_calls(workload, 1) * workload.units * 1e-6
-    return max(1, round(seconds / max(once, 1e-9)))
+    return max(1, math.ceil(seconds / max(once, 1e-9)))
 
 
 @contextmanager
@@ -124,7 +125,7 @@ class WorkloadSet:
     title: str  # title of the table
     unit: str  # unit of the workloads, "step" or "tick"
     note: str  # note of the table
-    is_slow: bool = False  # whether few rounds have to do
+    is_slow: bool = False  # whether few rounds suffice
     workloads: dict[str, Workload] = field(default_factory=dict)
     absent: dict[str, str] = field(default_factory=dict)
 

@@ -180,7 +180,7 @@ def record_evaluation(path: Path, episodes: int = 256, kind: str = "") -> JsonMa
     record: JsonMap = {"salt": evaluation.salt, "episodes": len(evaluation.seeds), "cost": costs}
     if kind:
         tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
-        of_nominal = run_cases(evaluate, tasks, "contests", jobs=1)
+        of_nominal = run_cases(evaluate, tasks, "tasks", jobs=1)
         names = (task.scenario for task in tasks)
         record["cost in % of nominal"] = dict(zip(names, of_nominal, strict=True))
     save_policy(path, policy.network, replace(policy.card, evaluation=record))
@@ -203,7 +203,7 @@ FILTERS = ("", JOINT)
 def _list_tasks(kind: str) -> list[ControlTask]:
     """List the scored tasks of a class; ValueError for an unknown one."""
     tasks = list_scored_tasks()
-    check_choice("class of contests", kind, list(dict.fromkeys(task.kind for task in tasks)))
+    check_choice("class of tasks", kind, list(dict.fromkeys(task.kind for task in tasks)))
     return [task for task in tasks if task.kind == kind]
 
 
@@ -321,14 +321,14 @@ def prepare_start(
     policy = load_policy(agent) if agent is not None and is_policy(str(agent)) else None
     kind = policy.card.algorithm_options.get("class") if policy else None
     if varied and kind is None:
-        raise ValueError(f"--varied is for a policy of a class of contests, got {agent}")
+        raise ValueError(f"--varied is for a policy of a class of tasks, got {agent}")
     if policy is None:
         return agent, TrainingTask
 
     def make_task(**fields: Any) -> TrainingTask:
         has_scenarios = "scenarios" in fields or "scenario" in fields.get("env_options", {})
         if has_scenarios and varied:
-            raise ValueError("--varied is of a policy's own contests: without other scenarios")
+            raise ValueError("--varied is of a policy's own tasks: without other scenarios")
         if kind is not None and not has_scenarios:
             tasks, rng = _list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:

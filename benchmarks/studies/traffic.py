@@ -28,8 +28,9 @@ _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = ORACLES[STATE][0]
 _READS = {"none": "", ORACLE: ""}
 CONTROLLERS = ("none", "two-dof", "lqr", "nmpc", ORACLE)
-_SEEDS, _DRIVES, _CHUNK = (64, 16), (4, 1), 8  # of a usual and of a quick run
-FIRST_SEED = 2**29
+_SEEDS, _DRIVES = (64, 16), (4, 1)  # of a usual and of a quick run
+_CHUNK = 8  # seeds a process
+FIRST_SEED = 2**29  # far from other seeds
 _ENDS = ("spin", "collision", "departure")
 
 KEEPING = "lane-keeping-v0"
@@ -136,7 +137,7 @@ def _add_tables(suite: Suite, results: Results) -> None:
         record = {"estimator": reader, "rmse": slip, "offset": offset}
         records.append(record | dict(zip(("rate", "heading", "y_l"), errors, strict=True)))
     drives = len(lanes[_NEWEST])
-    suite.add_rows(records, ID, controller="lane-keeping", scenario=KEEPING, n=drives)
+    suite.add_rows(records, controller="lane-keeping", scenario=KEEPING, n=drives)
     note = "RMS errors of what the controller reads, and where the car was, from half time on."
     suite.tables.append(ResultTable("highway-env's lane keeping", _LANE_COLUMNS, records, note))
 

@@ -1,1 +1,1 @@
-"""The search with Optuna for a filter's noise levels and for a contestant's options."""
+"""The search with Optuna for a filter's noise levels and for an entry's options."""

@@ -98,7 +98,7 @@ class ControllerTuning:
 
     name: str
     kind: str
-    contests: tuple[ControlTask, ...]
+    tasks: tuple[ControlTask, ...]
     seeds: tuple[int, ...]
     numbers: tuple[SearchNumber, ...]
 
@@ -153,21 +153,21 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
     changes = {"lead_in": QUICK_LEAD_IN}
     tasks = [replace(t, changes=changes) for t in list_scored_tasks() if t.kind == kind]
     if not tasks or not seeds:
-        raise ValueError(f"{kind}: {len(tasks)} contests, {len(seeds)} seeds; both are needed")
+        raise ValueError(f"{kind}: {len(tasks)} tasks, {len(seeds)} seeds; both are needed")
     return ControllerTuning(name, kind, tuple(tasks), tuple(seeds), numbers)
 
 
-def _run_contestant(
-    contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
+def _run_entry(
+    driven: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
     """Run a controller on a task with some options, an episode for each seed."""
     estimator = "" if name == NOMINAL else JOINT if name in ADAPTIVE else REFERENCE_FILTER
-    return run_chunk(Chunk(contest, Entry(name, estimator, options), seeds))
+    return run_chunk(Chunk(driven, Entry(name, estimator, options), seeds))
 
 
 @lru_cache(maxsize=64)
-def _drive_nominal(contest: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
-    return _run_contestant(contest, NOMINAL, _UNTUNED, seeds)
+def _drive_nominal(driven: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
+    return _run_entry(driven, NOMINAL, _UNTUNED, seeds)
 
 
 def _compute_objective(
@@ -175,12 +175,12 @@ def _compute_objective(
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
     options, scores = task._make_options(values), []
-    for contest in task.contests:
-        result = _run_contestant(contest, task.name, options, seeds)
+    for driven in task.tasks:
+        result = _run_entry(driven, task.name, options, seeds)
         if result.error:
             return math.inf
-        nominal = _drive_nominal(contest, seeds)
-        scores.append(PairedDrives(nominal, result, contest.cost_floor).compute_scores())
+        nominal = _drive_nominal(driven, seeds)
+        scores.append(PairedDrives(nominal, result, driven.cost_floor).compute_scores())
     return -float(np.mean(scores))
 
 
@@ -217,9 +217,9 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
             all seeds is finite.
     """
     options = task._make_options(task.start)
-    for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
-        if error := _run_contestant(contest, task.name, options, task.seeds[:1]).error:
-            raise ValueError(f"{task.name} in {contest.name}: {error}")
+    for driven in task.tasks:  # what cannot be driven at all; kernels are compiled once
+        if error := _run_entry(driven, task.name, options, task.seeds[:1]).error:
+            raise ValueError(f"{task.name} in {driven.name}: {error}")
     study = create_study(task, search.storage, "tpe", search.seed)
     if not study.trials:
         study.enqueue_trial(task.start)
@@ -248,7 +248,7 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
         "contestant": task.name,
         "class": task.kind,
         "world_version": WORLD_VERSION,
-        "contests": [item.name for item in task.contests],
+        "contests": [item.name for item in task.tasks],
         "seeds": list(task.seeds),
         "start": start,
         "best": best,
@@ -282,7 +282,7 @@ def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
     best, start = log["best"], log["start"]
     before = "it cannot be driven" if start is None else f"{-start:.3f}"
     text = (
-        f"{len(log['trials'])} trials over {len(task.contests)} contests of {task.kind} on "
+        f"{len(log['trials'])} trials over {len(task.tasks)} tasks of {task.kind} on "
         f"{len(task.seeds)} tuning seeds: score {-best['objective']:.3f}; at the start {before}."
     )
     table = make_result_table(best["numbers"], task.search)

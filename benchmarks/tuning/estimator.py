@@ -234,7 +234,7 @@ def simulate(
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
 _TUNED = """\
-# Options of contestants as [class.name.part]; found by `sideslip tune controller NAME`.
+# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.
 """
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
@@ -284,10 +284,10 @@ def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> Non
     classes = read_tuned(target) if target.exists() else {}
     classes = classes | {kind: classes.get(kind, {}) | {name: options}}
     tables = [
-        f"[{class_name}.{contestant}.{part}]\n"
+        f"[{class_name}.{entry}.{part}]\n"
         + "".join(f"{option} = {to_toml(value)}\n" for option, value in part_options.items())
         for class_name, names in sorted(classes.items())
-        for contestant, parts in sorted(names.items())
+        for entry, parts in sorted(names.items())
         for part, part_options in parts.items()
         if part_options
     ]

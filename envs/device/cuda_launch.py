@@ -55,7 +55,7 @@ def get_ptx(
     path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
     if path and (data := kernel_cache.read_trusted(path)):
         header, _, text = data.partition(b"\n")
-        if header == _make_header(key, text):  # else it is of another GPU, or not whole
+        if header == _make_header(key, text):  # else it is not whole, or another's
             return text.decode()
     ptx = _compile_ptx(constants, real, capability)
     if path:

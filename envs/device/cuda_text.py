@@ -17,7 +17,7 @@ from ..numerics.jit import as_python
 from ..numerics.packed import load_element, read, store_element, write
 
 with require_extra("cuda", "the CUDA engine needs numba-cuda"):
-    import numba_cuda as numba_cuda  # numba's own `cuda` is another
+    import numba_cuda as numba_cuda  # makes sure of it: numba's own `cuda` is an older one
 
 _Function = Callable[..., Any]
 SIMULATED = bool(cuda.config.ENABLE_CUDASIM)

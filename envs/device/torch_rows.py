@@ -129,7 +129,8 @@ class _AttachedParameters:
     """Tensors in the packed parameters of some rows."""
 
     def __init__(self) -> None:
-        self._held: list[tuple[Tensor, list[EpisodeConfig], dict[str, Any]]] = []
+        # rows of one scenario, its config, the configs of all rows, and the parameters
+        self._held: list[tuple[Tensor, EpisodeConfig, list[EpisodeConfig], dict[str, Any]]] = []
 
     def put(
         self, rows: Tensor, configs: Sequence[EpisodeConfig], parameters: dict[str, Any]
@@ -137,30 +138,36 @@ class _AttachedParameters:
         """Put parameters, () or (N,), of some rows (M,) in place of those that they had."""
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
-        remaining = [(mask & ~selected, old, values) for mask, old, values in self._held]
-        self._held = [entry for entry in remaining if entry[0].any()]
-        if parameters:
-            self._held.append((selected, list(configs), parameters))
+        held = [(mask & ~selected, base, old, x) for mask, base, old, x in self._held]
+        self._held = [entry for entry in held if entry[0].any()]
+        texts = {id(config.scenario): repr(config.scenario) for config in configs}
+        groups: dict[str, list[int]] = {}
+        for row in rows.tolist() if parameters else ():
+            groups.setdefault(texts[id(configs[row].scenario)], []).append(row)
+        for members in groups.values():
+            mask = torch.zeros_like(selected)
+            mask[members] = True
+            self._held.append((mask, configs[members[0]], list(configs), parameters))
 
     def insert_tensors(self, params: Tensor) -> Tensor:
         """Insert the tensors into packed parameters (PARAMS_WIDTH, N)."""
         columns, count = list(params.unbind(0)), params.shape[1]
-        for mask, configs, parameters in self._held:
+        for mask, base, configs, parameters in self._held:
             values = {
                 name: params.new_tensor([getattr(config.vehicle, name) for config in configs])
                 for name in _FIELDS
             }
             for name, tensor in parameters.items():
                 values[name] = _expand_rows(name, tensor, count, params)
-            packed = _pack_vehicle(_replace_values(configs[0].vehicle, values), configs[0])
-            for place in _find_places(parameters, configs[0]):
+            packed = _pack_vehicle(_replace_values(base.vehicle, values), base)
+            for place in _find_places(parameters, base):
                 columns[place] = torch.where(mask, packed[place], columns[place])
         return torch.stack(columns) if self._held else params
 
     def write(self, params: Tensor, packed: Array) -> None:
         """Write the tensors' numbers into parameters (N, PARAMS_WIDTH) on the host."""
-        for mask, configs, parameters in self._held:
-            places = _find_places(parameters, configs[0])
+        for mask, base, _, parameters in self._held:
+            places = _find_places(parameters, base)
             where = np.ix_(mask.cpu().numpy(), np.array(places))
             packed[where] = params.detach()[places].T[mask].cpu()
 

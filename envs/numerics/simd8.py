@@ -2,9 +2,9 @@
 # mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
 """Loads and stores of eight neighbours of a matrix's row, for the matrices of filters.
 
-A matrix of lanes, one of each of several filters, has an axis more: there the same functions take
-the lanes of one place, and `vector_width` is 1. Of a symmetric matrix of lanes only what is on and
-above the diagonal counts. Records of such matrices begin on cache lines (`pad_to_cache_line`).
+In an array (rows, columns) a load moves eight columns. An array (rows, columns, LANES) holds a
+matrix of each of eight filters: there it moves one element of all, `vector_width` is 1, and of a
+symmetric matrix only the upper triangle counts. The Python bodies serve the first kind alone.
 """
 
 import math
@@ -52,7 +52,7 @@ def load8_symmetric(matrix: Matrix, k: int, j: int) -> Scalar:
 
 
 def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
-    """Count the rows of a symmetric matrix that count in its last columns.
+    """Count the rows to process in eight columns: all, or of lanes those above the diagonal.
 
     Args:
         matrix: Symmetric matrix.

@@ -90,8 +90,7 @@ def _draw_strips(canvas: Canvas, box: Box, strips: list[_Strip], first: float, s
         inside = left + 48.0, y + _ROW, width - 60.0, strip.share * high - _ROW - 4.0
         _draw_strip(canvas, inside, strip, first, span)
         y += strip.share * high
-    step = 1.0 if span <= 10.0 else 2.0
-    for t in np.arange(math.ceil(first / step) * step, first + span + 1e-6, step):
+    for t in np.arange(math.ceil(first), first + span + 1e-6):
         x = left + 48.0 + (width - 60.0) * (t - first) / span
         canvas.draw_text((x, top + height - 10.0), f"{t:g}", road.SOFT, 11, 0.5)
     canvas.draw_text((left, top + height - 10.0), "time / s", road.SOFT, 11)

@@ -139,11 +139,12 @@ def compute_acceleration_command(
 ) -> tuple[Scalar, Scalar]:
     """Compute the driver's acceleration command: PI on the speed with feedforward.
 
-    The wanted acceleration is fed forward; the integral part is held at the limit.
+    The wanted acceleration is fed forward; the integral part is held at the limit. A profile that
+    does not hold its speed gives the wanted acceleration alone.
 
     Args:
         tick: Tick since the start of the episode.
-        v_x: Measured speed (m/s).
+        v_x: Speed (m/s).
         integral: Integral part of the command (m/s2).
         profile: `SpeedProfile`.
         limit: Largest acceleration of the motors (m/s2).

@@ -179,24 +179,24 @@ def transform_path(path: TrackPath, start: Scalar, scale: Scalar, side: Scalar) 
     )  # fmt: skip
 
 
-_WEAVE, _WEAVE_TIME = 1.0, 5.0  # m, s: gentle, 0.8 m/s2
+_WEAVE, _WEAVE_TIME = 1.0, 5.0  # m from side to side, s: gentle, 0.8 m/s2
 
 
 @jit
-def add_weave(path: TrackPath, start: Scalar, speed: Scalar, length: Scalar) -> TrackPath:
+def add_weave(path: TrackPath, start: Scalar, speed: Scalar, duration: Scalar) -> TrackPath:
     """Add a gentle weave before the track, in whole waves.
 
     Args:
         path: `TrackPath`.
         start: Place along the road where it begins (m).
         speed: Speed of the car (m/s).
-        length: Time that it takes (s), positive.
+        duration: Time that it takes (s), positive.
 
     Returns:
         The `TrackPath`.
     """
-    distance = maximum(speed, _MIN_SPEED) * length
-    rate = 2.0 * PI * maximum(floor(length / _WEAVE_TIME + 0.5), 1.0) / distance
+    distance = maximum(speed, _MIN_SPEED) * duration
+    rate = 2.0 * PI * maximum(floor(duration / _WEAVE_TIME + 0.5), 1.0) / distance
     weave = (_WEAVE, start, start + distance, rate)
     return TrackPath(*(path[:6] + weave))
 

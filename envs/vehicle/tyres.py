@@ -147,7 +147,9 @@ def compute_tyre_load(
 class Tyre(NamedTuple):
     """One tyre at one instant."""
 
-    tangent: Scalar  # t, tangent of its slip angle; on the small-angle plant the angle itself
+    # t, tangent of its slip angle, or on the small-angle plant the angle; where load moves, its
+    # lateral speed (m/s), and `slope` is over the forward speed: the product counts
+    tangent: Scalar
     limit: Scalar  # N, F_max: what the drive force leaves of mu F_z on the friction circle
     slope: Scalar  # C / (3 F_max)
     load: Scalar = 1.0  # F_z over the standing load; the Magic Formula alone reads it
@@ -186,8 +188,9 @@ def _apply_magic_formula(tyre: Tyre) -> Scalar:
     x = tyre.slope * ((3.0 / _P_CY1) * tyre.tangent)
     E = (_P_EY1 - _P_EY2) + _P_EY2 * tyre.load
     y = x - (E * x) * compute_arctan_gap(x)
-    z = 1.0 + y * y  # sin(C atan y) / y is smooth in its root; even powers do not wait for that
+    z = 1.0 + y * y
     s = sqrt(z)
+    # a rational fit of sin(C atan y) / y for C = _P_CY1 alone, to 2e-12: faster than both functions
     above = (0.95439677509688102 * z + 1.8352163560088414) * z + 0.042236923574876198
     above = above + s * (2.3193336981700569 * z + 0.52958079101713026)
     below = (2.0569790286145251 * z + 0.31982684439427181) * z - 0.00010492429988359089
@@ -405,7 +408,7 @@ def _compute_magic_tyres(
     fronts, rears = per_a * per_b, per_c * per_d
     inv_product = (p2 + 1.0) / (fronts * rears)
     front, rear = rears * inv_product, fronts * inv_product
-    C_f, C_r = load.slope_f * load.load_f, car.C_r * (1.0 / 3.0)
+    C_f, C_r = load.slope_f * load.load_f, car.C_r * (1.0 / 3.0)  # thirds of stiffnesses, scaled
     return (
         Tyre(t_f, load.limit_f * (1.0 - e_f) * mu_a, C_f * per_b * front, a),
         Tyre(t_f, load.limit_f * (1.0 + e_f) * mu_b, C_f * per_a * front, b),

@@ -74,7 +74,7 @@ class DualRate:
         if a.shape != (m, m) or len(b) != m or c.shape[1] != m:
             shapes = f"{a.shape}, {b.shape}, {c.shape}"
             raise ValueError(f"A, B and C have shapes (m, m), (m, p) and (q, m), got {shapes}")
-        if not ratio >= 1 or int(ratio) != ratio:
+        if not (ratio >= 1 and ratio % 1 == 0):
             raise ValueError(f"ratio is a whole number of steps, at least 1, got {ratio!r}")
         n, d, q = m + len(rows), len(rows), len(c)
         F, self._B, self._drift = np.zeros((n, n)), np.zeros((n, b.shape[1])), np.zeros(n)

@@ -112,10 +112,10 @@ def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> t
 def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
     for j in range(3):  # the factors of front and rear stiffness, then 1/friction
-        if j < 2 or f.grip > 0:
+        if j < 2 or f.inverse_friction > 0:
             front = f.per_tyre[0, j // 2] if j != 1 else 0.0
             rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
-            column = (f.tyres + j if j < 2 else f.grip) - f.dense
+            column = (f.tyres + j if j < 2 else f.inverse_friction) - f.dense
             beta, gamma, phi_rate = _compute_rates(f, V, front, rear)
             f.B[0, N_INPUTS + column], f.B[1, N_INPUTS + column] = beta, gamma
             if f.rolling > 0:

@@ -64,7 +64,7 @@ def _filter_speed(f: FilterRecord, sample: float) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds (m/s); a bad sample is skipped."""
     if not is_finite(sample):
         return f.speed
-    if f.model_speed == 0.0:
+    if f.model_speed == 0.0:  # no sample yet
         return sample
     return f.speed + f.smoothing * (sample - f.speed)
 
@@ -114,7 +114,7 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         steer = f.u_new[0]
         if absolute(steer - f.steer_before) > f.steer_jump or absolute(steer) > _MAX_STEER:
             f.u_new[0] = np.nan
-        f.steer_before = steer
+        f.steer_before = steer if is_finite(steer) else f.steer_before
     for i in range(f.inputs):
         is_sound = is_sound and is_finite(f.u_new[i])
     if is_sound:
@@ -141,31 +141,32 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
 
 @jit
 def _compute_axle_force(
-    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
+    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, inverse_friction: Scalar
 ) -> tuple[Scalar, ...]:
-    """Compute an axle's force (N) and its slopes by alpha, factor, grip: Fiala, friction 1/grip."""
-    # F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 linear.
+    """Compute an axle's force (N) and its slopes by alpha, factor, 1/friction, by Fiala's law."""
+    # F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha / (3 friction F_z) within +-1.
     # stiffness: C (N/rad), load: F_z (N) of the axle. Source: Pacejka, Tire and Vehicle Dynamics, 3
     total_stiffness = stiffness * factor
     slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
-    z = minimum(slip_ratio * grip, 1.0)
+    z = minimum(slip_ratio * inverse_friction, 1.0)
     saturation = 1.0 - z + z * z * (1.0 / 3.0)
-    if z >= 1.0:  # it slides: |F| = F_z / grip
-        force = load / grip if alpha > 0.0 else 0.0 - load / grip
-        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / grip
+    if z >= 1.0:  # it slides: |F| = friction F_z
+        limit = load / inverse_friction
+        force = limit if alpha > 0.0 else 0.0 - limit
+        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / inverse_friction
     slope = (1.0 - z) * (1.0 - z)
-    grip_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
+    friction_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
     return (
         total_stiffness * alpha * saturation,
         maximum(slope, _MIN_SLOPE) * total_stiffness,
         stiffness * alpha * slope,
-        grip_slope,
+        friction_slope,
     )
 
 
 @jit
 def linearise(f: FilterRecord, steer: Scalar) -> None:
-    """Expand both axles' forces at the present state.
+    """Expand both axles' forces at the present state, and set the process noise that follows it.
 
     Args:
         f: Memory of the filter.
@@ -176,14 +177,14 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         steer = steer - x[f.steered]
     for i in range(2):
         x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
-    grip = 0.0
-    if f.grip > 0:
-        grip = minimum(maximum(x[f.grip], 0.0), _MAX_INVERSE_FRICTION)
-        x[f.grip] = grip
+    inverse = 0.0  # 1 / friction
+    if f.inverse_friction > 0:
+        inverse = minimum(maximum(x[f.inverse_friction], 0.0), _MAX_INVERSE_FRICTION)
+        x[f.inverse_friction] = inverse
     beta, gamma = x[0], x[1]
     total_force, moves = 0.0, f.speed > MIN_SPEED
-    for i in range(3 if f.grip > 0 else 2):  # tyres walk while the car moves
-        index = f.tyres + i if i < 2 else f.grip
+    for i in range(3 if f.inverse_friction > 0 else 2):  # tyres walk while the car moves
+        index = f.tyres + i if i < 2 else f.inverse_friction
         walks = moves and f.P[index, index] < f.prior[index, index]
         f.Q[index, index] = f.q_tyres[i] if walks else 0.0
     if f.mapped > 0:  # a map that is late errs by the road's turn in that time
@@ -194,25 +195,26 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
         factor = x[f.tyres + i]
-        force, slope, per_factor, per_grip = _compute_axle_force(
-            f.stiffness[i], f.load[i], alpha, factor, grip
+        force, slope, per_factor, per_friction = _compute_axle_force(
+            f.stiffness[i], f.load[i], alpha, factor, inverse
         )
-        f.car[CAR.front_stiffness + i] = 0.5 * slope
+        f.car[CAR.front_stiffness + i] = 0.5 * slope  # of one tyre
         if not moves:  # the tyres are unobservable
-            per_factor, per_grip = 0.0, 0.0
-        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
-        f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
+            per_factor, per_friction = 0.0, 0.0
+        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_friction
+        f.rest[i] = force - slope * alpha - per_factor * factor - per_friction * inverse
         total_force += absolute(force)
     if f.model_error > 0.0:
         force_error = f.model_error * total_force
+        # the axles err independently: half a wheelbase is their mean arm
         moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
         f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share[0] * force_error * force_error
         f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share[1] * moment_error * moment_error
 
 
 @jit
-def _predict(f: FilterRecord, v: Vector) -> None:
-    """Predict v <- F v on the states of a vector (n,) or longer."""
+def _apply_transition(f: FilterRecord, v: Vector) -> None:
+    """Predict v <- F v, F = diag(keep) + G, on the states of a vector (n,) or longer."""
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
         total = load8(f.keep, j) * load8(v, j)
@@ -225,14 +227,14 @@ def _predict(f: FilterRecord, v: Vector) -> None:
 
 @jit
 def propagate(f: FilterRecord, u: Vector) -> None:
-    """Predict x <- F x + H u, and P with it.
+    """Predict x <- F x + H u + drift and, without tables of gains, P.
 
     Args:
         f: Memory of the filter, or a block of lanes.
         u: Inputs, shape (N_INPUTS,).
     """
     step = vector_width(f.P)
-    _predict(f, f.x)
+    _apply_transition(f, f.x)
     for j in range(0, f.dense, step):
         total = load8(f.x, j)
         for k in range(f.inputs):
@@ -277,19 +279,19 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
         if f.scaled > 0:  # the column of the scale's error is what a_y predicts, 0 at standstill
             row = f.C_fast[f.accel_row]
             row[f.scaled] = 0.0
-            if not f.speed <= MIN_SPEED:
+            if f.speed > MIN_SPEED:
                 specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
                 for k in range(f.n):
                     specific_force += row[k] * f.x[k]
                 row[f.scaled] = specific_force
     propagate(f, u)
     if f.between == PSEUDO:
-        _predict(f, f.e)
+        _apply_transition(f, f.e)
     if f.periodic == 0 and f.late == LARSEN:
         for s in range(N_SLOW):
             if f.stamp[s, 0] >= 0:
                 for i in range(f.rows[s]):
-                    _predict(f, f.larsen_gain[s, i])
+                    _apply_transition(f, f.larsen_gain[s, i])
 
 
 @jit

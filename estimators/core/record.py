@@ -95,7 +95,7 @@ _FIELDS = [
     ("preview", _FLOAT),  # m
     # tyres that are estimated: `car` has their slopes by slip at the present state
     ("tyres", _INT),  # where the factors of front and rear stiffness stand; 0: they are known
-    ("grip", _INT),  # where the reciprocal of friction stands; 0: tyres without a limit
+    ("inverse_friction", _INT),  # state 1 / friction; 0: tyres without a limit
     ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("per_tyre", _FLOAT, (2, 2)),  # N, slopes of each axle's force: by its factor, by 1/friction

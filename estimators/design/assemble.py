@@ -224,7 +224,10 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     names = model.names
     if TYRES[0] not in names:
         return
-    f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
+    f.tyres, f.inverse_friction = (
+        names.index(TYRES[0]),
+        names.index(TYRES[2]) if TYRES[2] in names else 0,
+    )
     f.again = max(1, round(_EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
@@ -232,9 +235,9 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
     f.first[f.tyres : f.tyres + 2] = 1.0
     f.q_tyres[:2] = np.diag(f.Q)[f.tyres : f.tyres + 2]
-    if f.grip:
-        f.q_tyres[2] = f.Q[f.grip, f.grip]
-        f.first[f.grip] = 1.0 / vehicle.friction
+    if f.inverse_friction:
+        f.q_tyres[2] = f.Q[f.inverse_friction, f.inverse_friction]
+        f.first[f.inverse_friction] = 1.0 / vehicle.friction
 
 
 def _make_signals(vehicle: Vehicle) -> dict[str, tuple[tuple[int, float], tuple[int, float]]]:

@@ -100,6 +100,8 @@ class BatchEstimator:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy: its records lie on cache lines, too, and its lanes are empty."""
         self.__dict__.update(state)
+        if "filters" not in state:  # estimators of a user's, each an object of its own
+            return
         filters, self.filters = self.filters, allocate_aligned(self.filters.shape, FILTER)
         self.filters[:], self._lanes = filters, make_blocks(len(filters))
 

@@ -48,6 +48,14 @@ def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: st
         obs, one = envs.step(action)[0], env.step(single)[0]
 
 
+def test_nominal_knows_the_noise_of_the_sensors_that_are_there() -> None:
+    env, _ = make_oracle("nominal", "sideslip/YawGps-v1")  # whose world has a camera that is askew
+    env.reset(seed=0)
+    noisy = {"base": "random-steering", "noise": {"course": 1.0}, "speed": 8.0}
+    env, _ = make_oracle("nominal", "sideslip/YawGps-v0", scenario=noisy)
+    assert env.estimator.config.noise["course"] == pytest.approx(1.0 / 8.0)
+
+
 def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
     """Interpolated over speed and both stiffnesses, against a design for the car at hand."""
     _, agent = make_oracle("oracle-parameters-lqr", FUSION)

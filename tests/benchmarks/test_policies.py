@@ -145,7 +145,9 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     save_policy(path, other, policy.card)
     assert not np.array_equal(cached(chunk).numbers, first.numbers)
     salt = make_salt()
-    monkeypatch.setattr(tasks, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
+    monkeypatch.setattr(
+        tasks, "_ENTRY_SOURCES", {"estimators": (".py", ".toml"), "agents": (".py",)}
+    )
     assert make_salt() != salt
 
 

@@ -307,7 +307,7 @@ class LaneFinder:
         return self.rows_ahead[row], self._y[column + 1] - _CELL * shift, strength
 
     def _compute_quality(self, lane_fit: _LaneFit, x: Array) -> float:
-        """Fraction of the expected rows with a marking, less for bad light and uncertain fits."""
+        """The rarer marking's rows, of those that suffice; less in bad light or if uncertain."""
         uncertainty = float(np.max(lane_fit.error / _WORST))
         if uncertainty > 1.0:
             return 0.0

@@ -139,6 +139,8 @@ def test_quantiles_are_those_of_the_times() -> None:
         assert exact <= histogram.quantile(share) <= exact + 1.0
     histogram.add(1e9)
     assert histogram.largest == histogram.quantile(1.0) == 1e9
+    (once := _Histogram()).add(5.3)
+    assert once.summarise() == {"median": 5.3, "p999": 5.3, "max": 5.3}
 
 
 def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
@@ -147,6 +149,8 @@ def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
             Port(port=port.address[1])
         with pytest.raises(OSError, match=r"of 192.0.2.1 is none"):
             Port("192.0.2.1", 0)
+        with pytest.raises(OSError, match=r"UDP port 70000 of 127.0.0.1 is none: .*0-65535"):
+            Port(port=70000)
         assert port.address[0] == "127.0.0.1"
         for _ in range(MAX_BATCH + 100):
             other.send(port.address, DatagramKind.END, 0)

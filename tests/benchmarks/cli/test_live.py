@@ -34,6 +34,8 @@ def test_both_ends_in_lock_step_and_the_session_again(
     assert found["same"] and found["ticks"] == 301 and found["counts"]["lost"] == 0
     status, out, _ = run("live", "--replay", session)
     assert status == 0 and "301 ticks; the estimates are those of the session bit for bit" in out
+    status, _, err = run("live", "dakf", "--replay", session)
+    assert status == 2 and "is of estimator exact-kf, not dakf" in err
 
 
 def test_in_real_time_what_was_measured_is_printed(run: Run, short: Path, tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ CASES = [
          ("--varied 2", "varied", 2),
          ("--option fast=true", "observation_options", {"fast": True}),
          ("--seed 7", "seed", 7)),
-    *_of(DISTIL, f"{CLI}.policies.make_task_table", ("--episodes 8", "episodes", 8)),
+    *_of(DISTIL, f"{CLI}.policies.evaluate_on_tasks", ("--episodes 8", "episodes", 8)),
     *_of("tune estimator exact-kf --scenario gust", "benchmarks.tuning.study.run",
          ("--seed 4", "search.seed", 4)),
     *_of("tune controller lqr", "benchmarks.tuning.controllers.make_controller_tuning",
@@ -202,7 +202,7 @@ RETURNED: dict[str, dict[str, Any]] = {
         "benchmarks.studies.policies.Lessons.make_card": None,
         "benchmarks.studies.policies.Lessons.make_tasks": None,
         "agents.training.distill.distill": None,
-        f"{CLI}.policies.make_task_table": "",
+        f"{CLI}.policies.evaluate_on_tasks": "",
     },
     "tune": {
         "benchmarks.tuning.estimator.make_estimator_tuning": NOTHING,

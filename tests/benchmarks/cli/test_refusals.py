@@ -49,7 +49,7 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("inspect", "nowhere.csv", "--html", "page.txt"), "a file that ends in .html"),
     (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),
     (("replay", "nowhere.csv", "--kml", "a.kml"), "--kml are for a receiver's log"),
-    (("calibrate", "--contest", "moon"), "unknown contest 'moon'"),
+    (("calibrate", "--contest", "moon"), "unknown task 'moon'"),
     (("calibrate", "--seeds", "1"), "two seeds or more, got 1"),
     (("calibrate", "nowhere/mine.json"), "cannot write nowhere/mine.json"),
     (("live",), "name an ESTIMATOR, or --simulate, --relay or --replay"),

@@ -157,7 +157,7 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
         asked.append(about)
         return "judged"
 
-    monkeypatch.setattr(train_command, "make_task_table", judged)
+    monkeypatch.setattr(train_command, "evaluate_on_tasks", judged)
     small = ("--num-envs", 7, "--n-eval-envs", 7, "--steps", 448, "--out", "on")
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err
@@ -167,7 +167,7 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     known = [each.scenario for each in _list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
     words = shlex.split(load_policy(f"on/{POLICY}").card.command)[2:]
-    assert words[-2:] == ["--trained-agent", "distill-coms-yaw"]
+    assert words[-4:] == ["--trained-agent", "distill-coms-yaw", "--out", "on"]
     status, _, err = run("-i", "distill-coms-yaw", "--algo", "sac", "--out", "off")
     assert status == 2 and "sac begins with a zip, not with policy distill-coms-yaw" in err
     status, _, err = run("-i", "distill-coms", "--out", "off")

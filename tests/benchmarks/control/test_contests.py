@@ -121,8 +121,8 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
     assert _read_tasks(path) == (entry,)
     for change, message in (
         ({"world_version": 0}, "measured in world 0, this is 1"),
-        ({"scenario": "moon"}, "is no contest of this version"),
-        ({"tier": "road"}, "is no contest of this version"),
+        ({"scenario": "moon"}, "is no task of this version"),
+        ({"tier": "road"}, "is no task of this version"),
         ({"oracle": "nobody"}, "nobody"),
         ({"knowing": "oracle-state-lqr"}, "oracle-state-lqr"),
         ({"lost": "many"}, "lost is 'many', not float"),

@@ -245,7 +245,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     assert all("nobody-kf" in line[-1] for line in wrong) and len(wrong) == 2
     first = next(iter(suite.tables))
     assert list(first.header)[1] == "score" and len(first.cells) == 7
-    assert {line["contests"] for line in first.cells} == {(1, 1), (0, 1)}
+    assert {line["tasks"] for line in first.cells} == {(1, 1), (0, 1)}
     assert "is not calibrated" in tables["The ladder"].note
     assert len(suite.explorers) == 1 and len(suite.explorers[0].cells) == len(some) - 2
     assert len(suite.files) == 2
@@ -253,5 +253,5 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     assert all(text in titles for text in ("score in every", "failure rate", "constants"))
     assert [title.split()[0] for title, *_ in suite.answers] == ["Which", "Which", "Which", "What"]
     (everywhere,) = suite.answers[0][1].layout.annotations[:1]
-    assert "All contests" in everywhere.text
+    assert "All tasks" in everywhere.text
     assert suite.explorers[0].pair[0] == "none"

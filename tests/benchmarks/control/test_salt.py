@@ -148,7 +148,7 @@ def test_the_salt_follows_every_file_of_the_contestants(
 def test_the_contestants_are_this_packages() -> None:
     """Where `tasks.py` lies must not decide it."""
     assert Path(sideslip.__file__ or "").resolve().parent == tasks._PACKAGE
-    for folder in tasks._CONTESTANTS:
+    for folder in tasks._ENTRY_SOURCES:
         assert (tasks._PACKAGE / folder / "__init__.py").is_file()
 
 

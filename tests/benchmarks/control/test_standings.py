@@ -212,7 +212,7 @@ def test_the_answer_names_the_best_and_by_how_much() -> None:
     assert "controllers lqr costs least, 33 % [" in controller and "as much as esc" in controller
     assert ", and 16 % as much as no control." in controller  # 2 / 12
     assert "true car and road saves 50 %, then its exact motion saves 7" in why
-    assert "40 episodes a contest" in rest
+    assert "40 episodes a task" in rest
 
 
 def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:

@@ -97,7 +97,7 @@ def test_a_hang_ends_with_what_it_started(tmp_path: Path) -> None:
 
 def test_memory_ends_at_a_stated_limit(tmp_path: Path) -> None:
     driven = IsolatedDrive()(cheat(tmp_path, "self.kept = bytearray(5 * 2**30)"))
-    stated = r"MemoryError: .mine.py, line \d+.; a contestant has 4 GiB of memory"
+    stated = r"MemoryError: .mine.py, line \d+.; an entry has 4 GiB of memory"
     assert re.fullmatch(stated, driven.error)
 
 

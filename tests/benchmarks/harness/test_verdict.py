@@ -141,7 +141,7 @@ def test_cells_that_do_not_fit_an_explorer_are_refused() -> None:
     t, panels = np.zeros(3), (Panel("slip / mrad", (("beta", "true"),)),)
     with pytest.raises(ValueError, match="no cells"):
         Explorer("x", ("a",), {}, panels)
-    with pytest.raises(ValueError, match="has 1 names, 1 menus and a contestant make 2"):
+    with pytest.raises(ValueError, match="has 1 names, 1 menus and an entry make 2"):
         Explorer("x", ("a",), {("p",): {"t": t, "beta": t}}, panels)
     with pytest.raises(ValueError, match="lacks beta"):
         Explorer("x", (), {("p",): {"t": t}}, panels)

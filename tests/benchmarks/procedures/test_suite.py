@@ -15,7 +15,7 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     cases = suite._make_cases(quick=False)
     assert len(set(cases)) == len(cases)
     for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
-        mine = {(case.car, case.contestant) for case in cases if case.procedure == procedure}
+        mine = {(case.car, case.entry_index) for case in cases if case.procedure == procedure}
         assert mine == {(car, k) for car in CARS for k in range(len(ENTRIES))}
     driven = {case.car: case.seeds for case in cases if case.procedure == "outside"}
     assert set(driven) == set(OUTSIDE_PLANTS)
@@ -35,7 +35,7 @@ def test_each_contestant_has_what_it_reads(car: str) -> None:
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:
-    driven = {ENTRIES[case.contestant].agent for case in suite._make_cases(quick=True)}
+    driven = {ENTRIES[case.entry_index].agent for case in suite._make_cases(quick=True)}
     assert "adaptive-nmpc" not in driven
     assert {"adaptive-lqr", "policy on joint"} <= driven
 
@@ -58,7 +58,7 @@ def test_the_check_on_the_drift_model_is_reproduced() -> None:
 @pytest.mark.long
 def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("plotly")
-    known = [case for case in suite._make_cases(quick=True) if case.contestant == 0]
+    known = [case for case in suite._make_cases(quick=True) if case.entry_index == 0]
     cases = [case for case in known if case.car != "multi-body"]
     monkeypatch.setattr(suite, "_make_cases", lambda quick: cases)
     found = suite.STUDY.run(Request(quick=True, jobs=1))

@@ -105,6 +105,7 @@ def test_time_series_keep_every_peak_and_gap() -> None:
     y = np.sin(t)
     y[54_321], y[77_777] = 5.0, -4.0
     y[20_000:30_000] = np.nan
+    y[40_010:40_013] = np.nan
     figure = figures.draw_time_series(t, {"dakf": y, "truth": np.sin(t)}, "angle / rad")
     line, truth = figure.data  # the truth on top of the estimate
     assert (truth.name, truth.line.color) == ("truth", INK)
@@ -114,6 +115,7 @@ def test_time_series_keep_every_peak_and_gap() -> None:
     inside = (line.x > 20.2) & (line.x < 29.8)
     assert inside.any()
     assert np.isnan(line.y[inside]).all()
+    assert np.isnan(line.y[(line.x > 40.0) & (line.x < 40.1)]).any()  # three samples of 100 000
     assert (line.x[0], line.x[-1]) == (0.0, np.float32(t[-1]))
     assert figure.layout.xaxis.title.text == "time / s"
     assert figure.layout.yaxis.title.text == "angle / rad"

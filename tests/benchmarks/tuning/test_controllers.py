@@ -21,7 +21,7 @@ from sideslip.benchmarks.tuning.controllers import (
     ControllerTuning,
     SearchNumber,
     _compute_objective,
-    _run_contestant,
+    _run_entry,
     tune,
 )
 from sideslip.benchmarks.tuning.estimator import SearchOptions, write_tuned
@@ -60,8 +60,8 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
 def test_the_objective_is_minus_the_mean_score() -> None:
     gain = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
-    costs = _run_contestant(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
-    nominal = _run_contestant(SHORT, "nominal", nothing, SEEDS).costs
+    costs = _run_entry(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
+    nominal = _run_entry(SHORT, "nominal", nothing, SEEDS).costs
     floor = SHORT.cost_floor
     wanted = np.log((costs + floor) / (nominal + floor)).mean()
     assert _compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
@@ -74,7 +74,7 @@ def test_an_adaptive_contestant_is_tuned_on_the_filter_it_follows(
     asked: list[ControlCase] = []
     monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
     tuning = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
-    _run_contestant(tuning.contests[0], tuning.name, tuning._make_options(tuning.start), (1,))
+    _run_entry(tuning.tasks[0], tuning.name, tuning._make_options(tuning.start), (1,))
     (case,) = asked
     assert case.entry.estimator == "joint" and case.estimate_options["options"] == {}
     assert case.agent_options["horizon"] == 0.5
@@ -88,7 +88,7 @@ def test_a_drive_that_is_lost_alone_counts_two(monkeypatch: pytest.MonkeyPatch) 
         numbers[:, NUMBERS.index("failure")] = [0.0, 1.0] if name == "two-dof" else 0.0
         return DriveResult(numbers, 0.0)
 
-    monkeypatch.setattr(controllers, "_run_contestant", fake)
+    monkeypatch.setattr(controllers, "_run_entry", fake)
     controllers._drive_nominal.cache_clear()
     found = _compute_objective(task(SearchNumber("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
     controllers._drive_nominal.cache_clear()
@@ -112,9 +112,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
         return abs(math.log(found["grip"] / 0.5)) + float(seeds[0] == first)
 
     monkeypatch.setattr(controllers, "_compute_objective", fake)
-    monkeypatch.setattr(
-        controllers, "_run_contestant", lambda *_: DriveResult(np.zeros((1, 1)), 0.0)
-    )
+    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1)), 0.0))
     slow = task(SearchNumber("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(make_tuning_seeds(16)))
     first = slow.seeds[0]
     log = tune(slow, SearchOptions(16, storage(tmp_path), jobs=1))
@@ -155,7 +153,7 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
     for name in SPACES:
         tuning = controllers.make_controller_tuning(name, kind, (1,))
-        assert len(tuning.contests) >= 3
+        assert len(tuning.tasks) >= 3
         numbers = tuning.numbers
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)

@@ -86,6 +86,17 @@ def test_a_row_that_starts_anew_knows_nothing_of_before(mode: str) -> None:
     assert env.get_state()["params"][1, P.car.C_f] == 2e4
 
 
+def test_a_friction_stands_where_a_rows_scenario_has_none_of_its_own() -> None:
+    for right in ([0.3, None], [None, 0.3]):
+        env, friction = made(scenario="gust"), leaf(0.77, 0.77)
+        scenarios = [{"base": "gust", "friction_right": value} for value in right]
+        options = {"scenario": scenarios, "parameters": {"friction": friction}}
+        env.reset(seed=0, options=options)
+        expected = [value or 0.77 for value in right]
+        assert env.get_state()["params"][:, P.car.mu_r].tolist() == pytest.approx(expected)
+        assert env.get_state()["params"][:, P.car.mu].tolist() == pytest.approx([0.77, 0.77])
+
+
 def test_a_reset_by_a_mask_leaves_the_other_rows_their_graph() -> None:
     env, first, second = made(), leaf(0.1, 0.2), leaf(0.3, 0.4)
     env.reset(seed=0, options={"state": {"v_y": first, "gamma": 0.1}})

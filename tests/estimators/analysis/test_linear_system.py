@@ -50,6 +50,7 @@ GOOD: dict[str, Any] = {
         ({"C": [[1.0]]}, r"got \(2, 2\), \(2, 1\), \(1, 1\)"),
         ({"ratio": 0}, "ratio is a whole number of steps, at least 1, got 0"),
         ({"ratio": 2.5}, "whole number"),
+        ({"ratio": np.inf}, "whole number"),
         ({"Q": [[1.0, 2.0], [2.0, 1.0]]}, "Q is indefinite"),
         ({"Q": [1.0, 2.0, 3.0]}, r"Q is finite and has shape \(2,\)"),
         ({"R": -1.0}, "R is indefinite"),

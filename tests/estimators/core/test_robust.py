@@ -133,6 +133,18 @@ def test_a_filter_says_when_it_is_lost() -> None:
     assert all(health[:4]) and not any(health[9:])
 
 
+def test_a_steering_angle_that_jumps_behind_a_gap_waits_for_the_next_row() -> None:
+    _, log = drive()
+    filter_, rows = built("joint", log), log.record.fast[:6].copy()
+    filter_.reset(log.slow, 0)
+    used = []
+    rows[:, FAST.steer] = (0.0, 0.0, np.nan, 0.9, 0.0, 0.001)
+    for row in rows:
+        filter_.take(row[None], 1, log.record.packets[:0], 0)
+        used.append(float(filter_.filters[0].u[0]))
+    assert used == [0.0, 0.0, 0.0, 0.0, 0.0, 0.001]
+
+
 @pytest.mark.parametrize("fault", ["degrees", "backward"])
 def test_a_steering_angle_in_degrees_and_a_car_that_reverses_are_said(fault: str) -> None:
     """Within a second, and where the steering is wrong the deviation grows."""

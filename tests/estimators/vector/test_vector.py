@@ -151,8 +151,9 @@ def test_the_spec_builds_environments_wrapped_one_by_one(count: Any) -> None:
     assert EstimateObservation(fleet(VISION, 2, "NextStep"), "bicycle-kf").spec is None
 
 
-def test_copies_continue_bit_for_bit() -> None:
-    _, env = pair(UNEVEN, 3, "SameStep", [{"estimator": "exact-kf"}])
+@pytest.mark.parametrize("options", [{}, {"latency": {"gyro": 0.005}}])
+def test_copies_continue_bit_for_bit(options: dict[str, Any]) -> None:
+    _, env = pair(UNEVEN, 3, "SameStep", [{"estimator": "exact-kf", "options": options}])
     env.reset(seed=2)
     for step in range(8):
         env.step(actions(env, step))
