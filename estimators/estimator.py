@@ -168,7 +168,7 @@ class Estimator:
 
     def design_missing(self) -> None:
         """Compute the table of gains that compiled code has just asked for."""
-        self._design_cell(int(self._f.wanted))
+        self._design_cell(int(self._f.missing_cell))
 
     def _design_cell(self, cell: int) -> None:
         f = self._f

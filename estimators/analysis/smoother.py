@@ -81,7 +81,7 @@ def smooth(
 def _remove_delay(estimator: Estimator) -> Estimator:
     """Copy the filter for samples that are never late; ValueError where there is none."""
     f = estimator.filters[0]
-    is_plain = f.between == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
+    is_plain = f.intersample_rule == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
     if len(estimator.filters) > 1 or not is_plain:
         raise ValueError(
             f"{estimator.name}: a smoother needs one layer with gains='covariance', samples used "
@@ -90,7 +90,7 @@ def _remove_delay(estimator: Estimator) -> Estimator:
     undelayed = copy.copy(estimator)
     undelayed.filters = estimator.filters.copy()
     f = undelayed.filters[0]
-    f.late, f.total, f.store_predictions = IGNORE, f.n, 1
+    f.delay_rule, f.total, f.store_predictions = IGNORE, f.n, 1
     f.frames[:] = 0
     return undelayed
 

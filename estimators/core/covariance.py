@@ -112,7 +112,7 @@ def predict_covariance(f: FilterRecord) -> None:
         f: Memory of the filter.
     """
     n, dense, N = f.n, f.dense, f.total
-    P, Q, GT, keep, step = f.P, f.Q, f.GT, f.keep, vector_width(f.P)
+    P, Q, GT, keep, step = f.P, f.Q, f.GT, f.own_decay, vector_width(f.P)
     FP = allocate_scratch(P, N_CORE, N_TOTAL)
     states = (n + step - 1) // step * step  # columns with a state among them
     for j in range(0, N, step):

@@ -32,7 +32,7 @@ def _fill(vector: Vector, value: Scalar) -> None:
 def _reset_filter(f: FilterRecord, first: int) -> None:
     """Reset a filter to its start, before the fast row of the tick `first`."""
     f.start, f.tick, f.has_started, f.at = first, first - 1, 0, 0
-    f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
+    f.cell, f.missing_cell, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
     f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
     for vector in (f.x, f.e, f.gain):
         _fill(vector, 0.0)
@@ -49,7 +49,7 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
     for s in range(N_SLOW):
         _fill(f.scale[s], 1.0)
         _fill(f.last[s], np.nan)
-        f.believed[s], f.doubts[s] = -1, 0
+        f.last_accepted[s], f.rejections[s] = -1, 0
         _fill(f.stamp[s], -1)
         _fill(f.known_stamps[s], -1)
         if f.period[s] > 0:
@@ -59,24 +59,24 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
     f.lost = -1
     for i in range(len(f.recent)):
         f.recent[i, PACKET.captured] = -1  # an empty place
-    for i in range(len(f.keep)):
-        f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
+    for i in range(len(f.own_decay)):
+        f.own_decay[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
     _fill(f.surprise, 1.0)
     if f.r_share > 0.0:
         f.blocks, f.block_rows = 0, 0
         _fill(f.block_sum, 0.0)
         for i in range(f.fasts):
-            f.r_fast[i] = FIRST_VARIANCE * f.r_told[i]
+            f.r_fast[i] = FIRST_VARIANCE * f.r_nominal[i]
     f.steer_before = np.nan
-    if f.scaled > 0:
-        f.C_fast[f.accel_row, f.scaled] = 0.0
+    if f.accel_scale_state > 0:
+        f.C_fast[f.accel_row, f.accel_scale_state] = 0.0
     if f.tyres > 0:
         linearise(f, 0.0)
     if f.measured == 1:
         f.speed, f.model_speed = 0.0, 0.0
     else:
         build_model(f, f.speed, 0.0)
-    f.stretch = 1.0
+    f.beta_scale = 1.0
 
 
 @jit
@@ -116,7 +116,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
             f.predicted[f.tick % WINDOW, i] = f.x[i]
     if listens:
         correct_fast(f, gains)
-    if f.late == BUFFER:
+    if f.delay_rule == BUFFER:
         store_history(f)
     for i in range(f.inputs):
         f.u_sum[i] = 0.0
@@ -264,7 +264,7 @@ def advance(
         if f.periodic == 1:
             cell = find_next_cell(f, wheel_speed)
             if gains[cell, 0, 0] == 0.0:
-                f.wanted, f.cursor = cell, position
+                f.missing_cell, f.cursor = cell, position
                 return j
         for layer in range(len(layers)):
             read_fast_row(layers[layer], fast[j], wheel_speed)

@@ -105,7 +105,7 @@ def store_due_captures(f: FilterRecord, last: int) -> None:
             is_unknown = f.known_stamps[s, frame % N_STAMPS] != last
             if f.frames[s] > 0 and last == f.next[s] and is_unknown:
                 slot = frame % f.frames[s]
-                if f.late == LARSEN:
+                if f.delay_rule == LARSEN:
                     _update_covariance(f, s)
                 else:
                     _clone_states(f, s, slot)
@@ -154,16 +154,16 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]
     target = DROPPED
-    if f.late == CONSTANT:
+    if f.delay_rule == CONSTANT:
         target = STORED_ONE
-    elif f.late == IGNORE or captured == f.tick:
+    elif f.delay_rule == IGNORE or captured == f.tick:
         target = DIRECT
-    elif f.late == STORED and f.tick - captured < WINDOW:
+    elif f.delay_rule == STORED and f.tick - captured < WINDOW:
         target = STORED_ONE
     elif f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
         slot = frame % f.frames[s]
         f.stamp[s, slot] = -1
-        target = STORED_ONE if f.late == LARSEN else f.first_clone[s] + slot * f.rows[s]
+        target = STORED_ONE if f.delay_rule == LARSEN else f.first_clone[s] + slot * f.rows[s]
     if target == DROPPED:
         f.counts[COUNTERS.refused] += 1
     else:
@@ -234,7 +234,7 @@ def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> 
     """
     factor, variance = interpolate_hdop(f, s, packet), f.r[s, i]
     captured = int(packet[PACKET.captured])
-    if f.late == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
+    if f.delay_rule == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
         slot = (captured - f.phase[s]) // f.period[s] % f.frames[s]
         variance = compute_row_variance(f, s, i, f.speed_captured[s, slot])
     return variance * f.scale[s, i] * factor * factor
@@ -270,7 +270,7 @@ def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> boo
 def _is_consistent(f: FilterRecord, s: int) -> bool:
     """Return whether every residual is within `_AGREEMENT_SD` deviations of the last gated one."""
     for i in range(f.rows[s]):
-        difference, row_variance = f.residual[i] - f.doubt[s, i], 0.0
+        difference, row_variance = f.residual[i] - f.rejected_residual[s, i], 0.0
         if f.angle[s, i] == 1:
             difference = wrap(difference)
         for j in range(i + 1):
@@ -285,7 +285,7 @@ def _is_consistent(f: FilterRecord, s: int) -> bool:
 def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
     """Return whether another sensor of a state was accepted since s was first gated."""
     for other in range(N_SLOW):
-        if other != s and f.rows[other] > 0 and f.believed[other] >= f.doubted[s]:
+        if other != s and f.rows[other] > 0 and f.last_accepted[other] >= f.first_rejected[s]:
             for i in range(f.rows[other]):
                 if f.C[other, i, state] != 0.0:
                     return True
@@ -299,14 +299,14 @@ def _inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
     for i in range(f.total):
         v[i] = 0.0
     v[state] = 1.0
-    if f.late == CLONE:
+    if f.delay_rule == CLONE:
         for s in range(N_SLOW):
             for k in range(f.frames[s] * f.rows[s]):
                 v[f.first_clone[s] + k] = f.C[s, k % f.rows[s], state]
     for i in range(f.total):
         for j in range(f.total):
             f.P[i, j] += variance * (v[i] * v[j])
-    if f.late == BUFFER:
+    if f.delay_rule == BUFFER:
         for i in range(N_SNAPSHOTS + 1):
             f.snapshot_P[i, state, state] += variance
 
@@ -340,15 +340,15 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
         True for a sample to use.
     """
     passed = _test_innovation(f, s, first, packet)
-    if f.wary == 0:
+    if f.recovery_count == 0:
         return passed
-    if not passed and f.believed[s] >= 0:
-        if f.doubts[s] == 0 or not _is_consistent(f, s):
-            f.doubts[s], f.doubted[s] = 0, f.tick
-        f.doubts[s] += 1
+    if not passed and f.last_accepted[s] >= 0:
+        if f.rejections[s] == 0 or not _is_consistent(f, s):
+            f.rejections[s], f.first_rejected[s] = 0, f.tick
+        f.rejections[s] += 1
         for i in range(f.rows[s]):
-            f.doubt[s, i] = f.residual[i]
-        if f.doubts[s] < f.wary or not _reset_sensor_states(f, s):
+            f.rejected_residual[s, i] = f.residual[i]
+        if f.rejections[s] < f.recovery_count or not _reset_sensor_states(f, s):
             return False
-    f.believed[s], f.doubts[s] = f.tick, 0
+    f.last_accepted[s], f.rejections[s] = f.tick, 0
     return True

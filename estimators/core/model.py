@@ -31,7 +31,7 @@ SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is 
 def _build_lateral(f: FilterRecord, V: Scalar) -> None:
     """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
-    rolling = 2 if f.rolling > 0 else 0
+    rolling = 2 if f.roll_state > 0 else 0
     write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
     if f.forces == 1:
         B[0, N_INPUTS], B[1, N_INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
@@ -41,16 +41,16 @@ def _build_lateral(f: FilterRecord, V: Scalar) -> None:
         _write_accel(f, V)
     if f.tyres > 0:
         _write_tyres(f, V)
-    if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
-        B[0, N_INPUTS + f.banked] = -GRAVITY / V
-    if f.mapped > 0:
-        B[Y_L, N_INPUTS + f.mapped - f.dense] = V
-    if f.steered > 0:  # the input is the measured angle, with the offset in it
+    if f.bank_state >= 0:  # gravity: no accelerometer feels it, and the body does not roll by it
+        B[0, N_INPUTS + f.bank_state] = -GRAVITY / V
+    if f.map_heading_state > 0:
+        B[Y_L, N_INPUTS + f.map_heading_state - f.dense] = V
+    if f.steer_offset_state > 0:  # the input is the measured angle, with the offset in it
         felt = 1.0 if is_steering_felt(V) else 0.0
         for i in range(f.dense):
-            B[i, N_INPUTS + f.steered - f.dense] = 0.0 - felt * B[i, 0]
+            B[i, N_INPUTS + f.steer_offset_state - f.dense] = 0.0 - felt * B[i, 0]
         if f.accel_row > 0:
-            f.C_fast[f.accel_row, f.steered] = 0.0 - felt * f.D_fast[f.accel_row, 0]
+            f.C_fast[f.accel_row, f.steer_offset_state] = 0.0 - felt * f.D_fast[f.accel_row, 0]
 
 
 @jit
@@ -69,7 +69,7 @@ def is_steering_felt(V: Scalar) -> Scalar:
 @jit
 def _write_body(f: FilterRecord, V: Scalar) -> None:
     """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
-    A, B, i = f.A, f.B, f.rolling
+    A, B, i = f.A, f.B, f.roll_state
     # phi'' enters F_y, hence phi'' itself: with S = M_s h_s all divides by 1 - S^2 / (M I_x)
     inverse = 1.0 / (1.0 - f.roll_arm * f.sway)
     lift, beta_per_roll = inverse * f.roll_arm, f.sway / V  # 1/m, s
@@ -92,8 +92,8 @@ def _write_accel(f: FilterRecord, V: Scalar) -> None:
     row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
     if f.pushed[0] >= 0:  # the first state behind the dense ones is no bias
         row[f.dense] = V * f.B[0, N_INPUTS]
-    if f.rolling > 0:
-        row[f.rolling] += GRAVITY
+    if f.roll_state > 0:
+        row[f.roll_state] += GRAVITY
     f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
 
 
@@ -102,7 +102,7 @@ def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> t
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
-    if f.rolling == 0:
+    if f.roll_state == 0:
         return beta, gamma, 0.0
     phi_rate = f.roll_arm / (1.0 - f.roll_arm * f.sway) * V * beta
     return beta + f.sway / V * phi_rate, gamma, phi_rate
@@ -113,20 +113,20 @@ def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
     for j in range(3):  # the factors of front and rear stiffness, then 1/friction
         if j < 2 or f.inverse_friction > 0:
-            front = f.per_tyre[0, j // 2] if j != 1 else 0.0
-            rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
+            front = f.force_slopes[0, j // 2] if j != 1 else 0.0
+            rear = f.force_slopes[1, j // 2] if j != 0 else 0.0
             column = (f.tyres + j if j < 2 else f.inverse_friction) - f.dense
             beta, gamma, phi_rate = _compute_rates(f, V, front, rear)
             f.B[0, N_INPUTS + column], f.B[1, N_INPUTS + column] = beta, gamma
-            if f.rolling > 0:
-                f.B[f.rolling + 1, N_INPUTS + column] = phi_rate
+            if f.roll_state > 0:
+                f.B[f.roll_state + 1, N_INPUTS + column] = phi_rate
             if f.accel_row > 0:
                 f.C_fast[f.accel_row, f.dense + column] = V * beta
     beta, gamma, phi_rate = _compute_rates(f, V, f.rest[0], f.rest[1])
     f.push[0], f.push[1] = beta, gamma
-    if f.rolling > 0:
-        f.push[f.rolling + 1] = phi_rate
-    if f.mapped > 0:  # y_l' = V sin(course); without the state the papers' law stays, linear
+    if f.roll_state > 0:
+        f.push[f.roll_state + 1] = phi_rate
+    if f.map_heading_state > 0:  # y_l' = V sin(course); without it the papers' linear law stays
         course = f.x[BETA] + f.x[PSI]
         f.push[Y_L] = V * (sincos(course)[0] - course)
     f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0
@@ -251,7 +251,7 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     """
     V = maximum(speed, MIN_SPEED)
     if f.kind == LATERAL and f.model_speed > 0.0:
-        f.stretch *= f.model_speed / V
+        f.beta_scale *= f.model_speed / V
     f.model_speed, f.turning = V, turning
     _build_continuous(f, V, turning)
     discretise(f)

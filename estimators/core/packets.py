@@ -118,7 +118,7 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
             if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
                 slot = _find_slot(f, tick)
                 _copy_moments(f.n, f.x, f.P, x[slot], P[slot])
-        f.stretch = 1.0  # the restored beta belongs to this tick's speed
+        f.beta_scale = 1.0  # the restored beta belongs to this tick's speed
         # no snapshot was changed before a refusal
         if not _apply_tick_samples(f, gains, tick, count, new_place):
             passed = False
@@ -127,7 +127,7 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
     if not passed:
         _restore_history(f, now)
         _copy_moments(f.n, x[_NOW_SLOT], P[_NOW_SLOT], f.x, f.P)
-        f.stretch = 1.0
+        f.beta_scale = 1.0
     return passed
 
 
@@ -158,7 +158,7 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
 @jit
 def _apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
     """Correct by a sound packet according to its age; return whether it was used."""
-    if f.late == BUFFER:
+    if f.delay_rule == BUFFER:
         return _rewind_update(f, gains, s, packet)
     first = find_clone(f, s, int(packet[PACKET.captured]))
     is_usable = first != DROPPED  # True where update_filter's is_gated reads it
@@ -224,7 +224,7 @@ def _is_valid(f: FilterRecord, packet: Vector) -> bool:
     if packet[PACKET.quality] <= 0.0 or has_few:
         f.counts[COUNTERS.poor] += 1
         return False
-    if f.wary > 0 and _is_frozen(f, s, packet):
+    if f.recovery_count > 0 and _is_frozen(f, s, packet):
         f.counts[COUNTERS.stuck] += 1
         return False
     return True

@@ -173,8 +173,8 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         steer: Measured steering angle of the front wheels (rad).
     """
     x, V = f.x, maximum(f.model_speed, MIN_SPEED)
-    if f.steered > 0 and is_steering_felt(V):
-        steer = steer - x[f.steered]
+    if f.steer_offset_state > 0 and is_steering_felt(V):
+        steer = steer - x[f.steer_offset_state]
     for i in range(2):
         x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
     inverse = 0.0  # 1 / friction
@@ -187,10 +187,10 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         index = f.tyres + i if i < 2 else f.inverse_friction
         walks = moves and f.P[index, index] < f.prior[index, index]
         f.Q[index, index] = f.q_tyres[i] if walks else 0.0
-    if f.mapped > 0:  # a map that is late errs by the road's turn in that time
+    if f.map_heading_state > 0:  # a map that is late errs by the road's turn in that time
         error = f.map_lag * V * f.u[CURVATURE]
-        share = 1.0 - f.decay[f.mapped] * f.decay[f.mapped]
-        f.Q[f.mapped, f.mapped] = share * (f.prior[f.mapped, f.mapped] + error * error)
+        i = f.map_heading_state
+        f.Q[i, i] = (1.0 - f.decay[i] * f.decay[i]) * (f.prior[i, i] + error * error)
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
@@ -201,23 +201,23 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
         f.car[CAR.front_stiffness + i] = 0.5 * slope  # of one tyre
         if not moves:  # the tyres are unobservable
             per_factor, per_friction = 0.0, 0.0
-        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_friction
+        f.force_slopes[i, 0], f.force_slopes[i, 1] = per_factor, per_friction
         f.rest[i] = force - slope * alpha - per_factor * factor - per_friction * inverse
         total_force += absolute(force)
     if f.model_error > 0.0:
         force_error = f.model_error * total_force
         # the axles err independently: half a wheelbase is their mean arm
         moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
-        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share[0] * force_error * force_error
-        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share[1] * moment_error * moment_error
+        f.Q[f.dense, f.dense] = f.q_nominal[0] + f.q_share[0] * force_error * force_error
+        f.Q[f.dense + 1, f.dense + 1] = f.q_nominal[1] + f.q_share[1] * moment_error * moment_error
 
 
 @jit
 def _apply_transition(f: FilterRecord, v: Vector) -> None:
-    """Predict v <- F v, F = diag(keep) + G, on the states of a vector (n,) or longer."""
+    """Predict v <- F v, F = diag(own_decay) + G, on the states of a vector (n,) or longer."""
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
-        total = load8(f.keep, j) * load8(v, j)
+        total = load8(f.own_decay, j) * load8(v, j)
         for k in range(n):
             total = total + load_element(v, k) * load8(f.GT, k, j)
         store8(new, total, 0, j)
@@ -250,17 +250,17 @@ def propagate(f: FilterRecord, u: Vector) -> None:
 @jit
 def _scale_beta(f: FilterRecord) -> None:
     """Scale beta = v_y / V to the model's new speed V, since v_y is what stays."""
-    f.x[BETA] *= f.stretch
-    f.e[BETA] *= f.stretch
+    f.x[BETA] *= f.beta_scale
+    f.e[BETA] *= f.beta_scale
     if f.periodic == 0:
         for i in range(f.total):
-            f.P[BETA, i] *= f.stretch
+            f.P[BETA, i] *= f.beta_scale
         for i in range(f.total):
-            f.P[i, BETA] *= f.stretch
+            f.P[i, BETA] *= f.beta_scale
         for s in range(N_SLOW):
             for i in range(f.rows[s]):
-                f.larsen_gain[s, i, BETA] *= f.stretch
-    f.stretch = 1.0
+                f.larsen_gain[s, i, BETA] *= f.beta_scale
+    f.beta_scale = 1.0
 
 
 @noinline
@@ -271,23 +271,23 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
         f: Memory of the filter.
         u: Inputs of the step, shape (N_INPUTS,).
     """
-    if f.stretch != 1.0:
+    if f.beta_scale != 1.0:
         _scale_beta(f)
-    if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
+    if f.tyres > 0 and (f.tick % f.linearise_every == 0 or f.delay_rule == BUFFER):
         linearise(f, u[0])
         build_model(f, f.model_speed, f.turning)
-        if f.scaled > 0:  # the column of the scale's error is what a_y predicts, 0 at standstill
+        if f.accel_scale_state > 0:  # its column is what a_y predicts, 0 at standstill
             row = f.C_fast[f.accel_row]
-            row[f.scaled] = 0.0
+            row[f.accel_scale_state] = 0.0
             if f.speed > MIN_SPEED:
                 specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
                 for k in range(f.n):
                     specific_force += row[k] * f.x[k]
-                row[f.scaled] = specific_force
+                row[f.accel_scale_state] = specific_force
     propagate(f, u)
-    if f.between == PSEUDO:
+    if f.intersample_rule == PSEUDO:
         _apply_transition(f, f.e)
-    if f.periodic == 0 and f.late == LARSEN:
+    if f.periodic == 0 and f.delay_rule == LARSEN:
         for s in range(N_SLOW):
             if f.stamp[s, 0] >= 0:
                 for i in range(f.rows[s]):

@@ -1,8 +1,8 @@
 """One filter's memory: a single record that compiled code reads and writes in place.
 
 A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
-so every filter runs on the same compiled code. The codes `kind` (of model), `late` (rule for late
-samples), `between` (rule between samples) and `periodic` (1: gains from a table, 0: from P) say
+so every filter runs on the same compiled code. The codes `kind` (of `core.model`), `delay_rule` and
+`intersample_rule` (of `core.innovation`) and `periodic` (1: gains from a table, 0: from P) say
 which fields are used. `design.assemble` writes what options and vehicle decide; `reset_filters` and
 the ticks write the rest. A missing place is 0 where place 0 is always taken, else -1.
 """
@@ -82,11 +82,11 @@ _FIELDS = [
     ("total", _INT),  # states and clones
     ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
     ("pushed", _INT, (N_CORE,)),  # the state that each state behind the dense ones pushes; -1: none
-    ("banked", _INT),  # place of the road's bank behind the dense states; -1: none
-    ("steered", _INT),  # where the steering sensor's offset stands; 0: none
-    ("mapped", _INT),  # where the error of the map's heading stands; 0: none
+    ("bank_state", _INT),  # the road's bank, counted from the last dense state; -1: none
+    ("steer_offset_state", _INT),  # 0: none
+    ("map_heading_state", _INT),  # error of the map's heading; 0: none
     ("map_lag", _FLOAT),  # s, deviation of the time by which the road's curvature is late
-    ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
+    ("roll_state", _INT),  # a bicycle's phi, followed by phi_rate; 0: it does not roll
     ("car", _FLOAT, (len(CarIndex._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
     ("roll_damping", _FLOAT),  # C_x / I_x
@@ -98,12 +98,12 @@ _FIELDS = [
     ("inverse_friction", _INT),  # state 1 / friction; 0: tyres without a limit
     ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
     ("load", _FLOAT, (2,)),  # N, on the axles
-    ("per_tyre", _FLOAT, (2, 2)),  # N, slopes of each axle's force: by its factor, by 1/friction
+    ("force_slopes", _FLOAT, (2, 2)),  # N, of each axle's force: by its factor, by 1/friction
     ("rest", _FLOAT, (2,)),  # N, force of each axle that its linear terms leave over
-    ("again", _INT),  # ticks after which the tyres' forces are expanded again
+    ("linearise_every", _INT),  # ticks after which the tyres' forces are expanded again
     ("q_tyres", _FLOAT, (3,)),  # variances of a step of factors and 1/friction, while it moves
     ("model_error", _FLOAT),  # fraction of the axles' forces by which the tyres' law errs
-    ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without `model_error`
+    ("q_nominal", _FLOAT, (2,)),  # variances of a step of F_d, N_d without `model_error`
     ("q_share", _FLOAT, (2,)),  # fractions of their variances that come in a step
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # fraction by which the delayed states follow in a step
@@ -116,7 +116,7 @@ _FIELDS = [
     ("decay", _FLOAT, (N_CORE,)),  # fraction of a state that is left after a step
     ("GT", _FLOAT, (N_CORE, N_CORE)),  # G and H transposed; zeros beyond the dense states
     ("HT", _FLOAT, (N_INPUTS, N_CORE)),
-    ("keep", _FLOAT, (N_TOTAL,)),  # `decay`, but 0 for dense states and 1 for clones
+    ("own_decay", _FLOAT, (N_TOTAL,)),  # F = diag(own_decay) + G: 0 for dense states, 1 for clones
     ("Q", _FLOAT, (N_CORE, N_CORE)),  # process noise of one step
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
@@ -133,10 +133,10 @@ _FIELDS = [
     ("C_fast", _FLOAT, (N_FAST, N_CORE)),
     ("D_fast", _FLOAT, (N_FAST, N_INPUTS)),
     ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
-    ("scaled", _INT),  # where the error of the accelerometer's scale stands; 0: none
+    ("accel_scale_state", _INT),  # 0: none
     ("rest_fast", _FLOAT, (N_FAST,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (N_FAST,)),  # variances of the fast measurements
-    ("r_told", _FLOAT, (N_FAST,)),  # configured variances, the least that may be found
+    ("r_nominal", _FLOAT, (N_FAST,)),  # configured variances, the least that may be found
     ("r_share", _FLOAT),  # weight of a new block in these variances; 0: fixed
     ("block", _INT),  # rows of a block whose mean innovations show the noise
     ("blocks", _INT),  # blocks so far
@@ -161,16 +161,16 @@ _FIELDS = [
     ("hdop_factor", _FLOAT, (N_KNOTS,)),
     ("least_satellites", _FLOAT),  # packets with fewer are refused
     ("gate", _FLOAT, (N_ROWS + 1,)),  # by dimension, the largest NIS; 0: no gate
-    ("wary", _INT),  # gated samples in agreement that restore a sensor's trust; 0: never
-    ("adapt", _FLOAT),  # weight of a new innovation in the scale of R; 0: R as configured
+    ("recovery_count", _INT),  # gated samples in agreement that restore a sensor's trust; 0: never
+    ("r_scale_weight", _FLOAT),  # weight of a new innovation in the scale of R; 0: R as configured
     ("first_slow", _INT),  # index of the first slow sensor that is used; -1: none
     ("period", _INT, (N_SLOW,)),  # ticks; 0: not used
     ("phase", _INT, (N_SLOW,)),  # tick of the first capture
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # tick, phase of a single-rate filter's steps
-    # the rule for late samples
-    ("late", _INT),  # code of the rule, such as CLONE
+    # the rule for late samples: codes of these and of intersample rules stand in `innovation`
+    ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
@@ -178,7 +178,7 @@ _FIELDS = [
     # gains
     ("periodic", _INT),
     ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
-    ("between", _INT),
+    ("intersample_rule", _INT),  # code of the rule between slow samples, such as PSEUDO
     ("cycle", _INT),  # steps after which the schedule repeats
     ("pattern", _INT),  # frames in the schedule's cycle
     ("low", _FLOAT),  # m/s, speed of the first table of gains
@@ -190,11 +190,11 @@ _FIELDS = [
     ("smoothing", _FLOAT),  # weight of a new sample in the low-pass
     ("speed", _FLOAT),  # m/s, low-passed
     ("model_speed", _FLOAT),  # m/s, speed of the present model
-    ("stretch", _FLOAT),  # old speed over new, by which beta = v_y / V is scaled before a step
+    ("beta_scale", _FLOAT),  # old speed over new, by which beta = v_y / V is scaled before a step
     ("speed_before", _FLOAT),  # m/s, speed of the model at the row before
     ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
     ("cell", _INT),  # the present table of gains
-    ("wanted", _INT),  # the table that is missing; -1: none
+    ("missing_cell", _INT),  # the table that is missing; -1: none
     # state of the filter now
     ("start", _INT),  # tick of the first row
     ("tick", _INT),  # tick of the last row
@@ -214,12 +214,12 @@ _FIELDS = [
     # of the last second, of the last dozen slow samples; 1 where the filter knows how it errs
     ("surprise", _FLOAT, (2,)),
     ("nis", _FLOAT),  # normalised innovation squared of the last packet; NaN: unknown
-    # of each slow sensor, where `wary` is above 0
+    # of each slow sensor, where `recovery_count` is above 0
     ("last", _FLOAT, (N_SLOW, PACKET_WIDTH)),  # its last packet
-    ("believed", _INT, (N_SLOW,)),  # tick of the last sample that was used; -1: none was
-    ("doubts", _INT, (N_SLOW,)),  # gated samples since then that agree with each other
-    ("doubted", _INT, (N_SLOW,)),  # tick of the first of them
-    ("doubt", _FLOAT, (N_SLOW, N_ROWS)),  # residual of the last of them
+    ("last_accepted", _INT, (N_SLOW,)),  # tick of the last sample that was used; -1: none was
+    ("rejections", _INT, (N_SLOW,)),  # gated samples since then that agree with each other
+    ("first_rejected", _INT, (N_SLOW,)),  # tick of the first of them
+    ("rejected_residual", _FLOAT, (N_SLOW, N_ROWS)),  # residual of the last of them
     ("first_fix", _INT),  # captured tick of the first heading fix; -1: none yet
     ("next", _INT, (N_SLOW,)),  # tick of the next capture
     ("known_stamps", _INT, (N_SLOW, N_STAMPS)),  # captured ticks of frames that came

@@ -131,14 +131,14 @@ _HEADING_TOLERANCE = 0.5  # rad, residual of the first heading fix above which i
 @jit
 def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Scalar:
     """Predict row i of a sample."""
-    if first == STORED_ONE and f.late == LARSEN:
+    if first == STORED_ONE and f.delay_rule == LARSEN:
         return f.larsen_expected[s, i]
     if first == STORED_ONE:
-        stored = maximum(f.tick - f.assumed, f.start) if f.late == CONSTANT else captured
+        stored = maximum(f.tick - f.assumed, f.start) if f.delay_rule == CONSTANT else captured
         stored_prediction = dot(f.C[s, i], f.predicted[stored % WINDOW], f.n)  # uneven-delay (15)
         turn = f.past_road_turn[stored % WINDOW]
         return stored_prediction + turn if f.ground[s, i] == 1 else stored_prediction
-    if f.between == PSEUDO:
+    if f.intersample_rule == PSEUDO:
         return f.expected[i]  # before this tick's corrections
     if first >= 0:
         return f.x[first + i]
@@ -154,7 +154,7 @@ def _align_heading(f: FilterRecord, s: int, turn: float) -> None:
         for slot in range(f.frames[s]):
             f.x[f.first_clone[s] + slot * f.rows[s]] += turn
     f.larsen_expected[s, 0] += turn
-    if f.late == BUFFER:
+    if f.delay_rule == BUFFER:
         for i in range(N_SNAPSHOTS + 1):
             f.snapshot_x[i, PSI] += turn
 
@@ -198,14 +198,14 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
         residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
-        if f.adapt > 0.0 and r > 0.0:  # R follows the mean of residual^2 - C P C^T
+        if f.r_scale_weight > 0.0 and r > 0.0:  # R follows the mean of residual^2 - C P C^T
             projected = project_row(f, s, i, first)
             sample_scale = (residual * residual - projected) / r * f.scale[s, i]
-            scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
+            scale = f.scale[s, i] + f.r_scale_weight * (sample_scale - f.scale[s, i])
             f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
         correct_scalar(f, project_row(f, s, i, first) + r, residual)
         _reduce_residuals(f, s, first, i, f.gain)
-        if f.late == LARSEN:
+        if f.delay_rule == LARSEN:
             propagate_larsen_gains(f, f.C[s, i])
 
 
@@ -230,18 +230,18 @@ def update_filter(
         f.nis = np.nan
     previous_fix = f.first_fix
     _compute_residuals(f, s, first, packet)
-    if f.between == PSEUDO and f.periodic == 1:
+    if f.intersample_rule == PSEUDO and f.periodic == 1:
         _correct_sample(f, gains, s)
-    elif f.between == PSEUDO:
+    elif f.intersample_rule == PSEUDO:
         _split_sample_gain(f, s, first, packet)
-    elif f.between != NONE:
+    elif f.intersample_rule != NONE:
         for i in range(f.rows[s]):
             f.innovation[i] = f.residual[i]
         f.since = 0
         _apply_share(f, gains, s)
     elif f.periodic == 1:
         _correct_periodic(f, gains, s, first, packet)
-    elif first == STORED_ONE and f.late == LARSEN:  # x <- x + M K residual
+    elif first == STORED_ONE and f.delay_rule == LARSEN:  # x <- x + M K residual
         for i in range(f.rows[s]):
             for k in range(f.n):
                 f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
@@ -305,7 +305,7 @@ def _find_variance(f: FilterRecord, i: int, residual: float, projected: Scalar) 
     f.block_sum[i] = 0.0
     share = maximum(f.r_share, 1.0 / (f.blocks + 1.0))
     sample = minimum(maximum(sample, 0.0), 9.0 * r)  # more is an outlier's
-    f.r_fast[i] = maximum(r + share * (sample - r), f.r_told[i])
+    f.r_fast[i] = maximum(r + share * (sample - r), f.r_nominal[i])
 
 
 @noinline
@@ -320,7 +320,7 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
     for i in range(f.fasts):
         if not is_finite(f.y[i]):
             f.counts[COUNTERS.invalid] += 1
-    if f.between == PSEUDO:
+    if f.intersample_rule == PSEUDO:
         for i in range(f.rows[s]):
             is_cloned = f.frames[s] > 0
             f.expected[i] = f.x[f.first_clone[s] + i] if is_cloned else predict_measurement(f, s, i)
@@ -329,7 +329,7 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
         for i in range(f.fasts):
             residual = compute_residual(f, i)
             f.eps[i] = residual if is_finite(residual) else 0.0
-        if f.between == PSEUDO:
+        if f.intersample_rule == PSEUDO:
             _correct_between(f, gains, s)
             return
         for i in range(f.fasts):
@@ -352,23 +352,23 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
         correct_scalar(f, variance, residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
-        if f.between == PSEUDO:
+        if f.intersample_rule == PSEUDO:
             projected = dot(f.C_fast[i], f.e, f.n)
             f.eps[i] = residual
             for j in range(f.total):
                 f.e[j] -= f.share[i, j] * projected
-        if f.late == LARSEN:
+        if f.delay_rule == LARSEN:
             propagate_larsen_gains(f, f.C_fast[i])
     if f.r_share > 0.0:
         f.block_rows += 1
         if f.block_rows == f.block:
             f.block_rows, f.blocks = 0, f.blocks + 1
-    if f.between == PSEUDO:  # the even fraction of the last sample's gain
+    if f.intersample_rule == PSEUDO:  # the even fraction of the last sample's gain
         for i in range(f.fasts, f.fasts + f.rows[s]):
             for j in range(f.total):
                 f.x[j] += f.share[i, j] * f.eps[i]
                 f.e[j] -= f.share[i, j] * f.eps[i]
-    elif f.between == DUAL_RATE and f.since >= 0:
+    elif f.intersample_rule == DUAL_RATE and f.since >= 0:
         f.since += 1
         if f.since < f.cycle:
             _apply_share(f, gains, s)

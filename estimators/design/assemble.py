@@ -31,7 +31,7 @@ def _refuse(label: str, checks: Iterable[tuple[object, str]]) -> None:
 def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     delay = config.delay
-    f.late = rule.IGNORE if delay in ("literal", "lag") else rule.RULES.index(delay)
+    f.delay_rule = rule.IGNORE if delay in ("literal", "lag") else rule.RULES.index(delay)
     f.total = f.n
     max_frames = 1 if delay == "larsen" else size.N_FRAMES
     for name, sensor in config.sensors.items() if delay in ("clone", "larsen") else ():
@@ -56,16 +56,16 @@ def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
 
 def _check_window(f: FilterRecord, config: FilterConfig) -> None:
     """Check that the window holds the longest delay and that rules go together; else ValueError."""
-    dt, sensors, is_buffer = float(f.step / f.stride), config.sensors, f.late == rule.BUFFER
+    dt, sensors, is_buffer = float(f.step / f.stride), config.sensors, f.delay_rule == rule.BUFFER
     window = size.WINDOW - size.SNAPSHOT_INTERVAL if is_buffer else size.WINDOW - 1
     checks = [
         (
-            f.late == rule.CONSTANT and f.assumed >= size.WINDOW,
+            f.delay_rule == rule.CONSTANT and f.assumed >= size.WINDOW,
             f"assumed_delay of {f.assumed * dt:g} s is not within the window of "
             f"{size.WINDOW * dt:g} s ({size.WINDOW} ticks)",
         ),
         (
-            f.late == rule.LARSEN and (f.gate.any() or f.knots > 0),
+            f.delay_rule == rule.LARSEN and (f.gate.any() or f.knots > 0),
             "delay='larsen' weighs a sample before it is here, so it takes no gate and no "
             "hdop_table",
         ),
@@ -77,10 +77,10 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
         ),
     ]
     n_samples = 0
-    for name, sensor in sensors.items() if f.late in (rule.BUFFER, rule.STORED) else ():
+    for name, sensor in sensors.items() if f.delay_rule in (rule.BUFFER, rule.STORED) else ():
         text = (
-            f"the {name} can be {sensor.longest_delay:g} s late; delay={rule.RULES[f.late]!r} has "
-            f"a window of {window * dt:g} s ({window} ticks)"
+            f"the {name} can be {sensor.longest_delay:g} s late; "
+            f"delay={rule.RULES[f.delay_rule]!r} has a window of {window * dt:g} s ({window} ticks)"
         )
         checks.append((sensor.longest_delay > (window + 1e-6) * dt, text))
         n_samples += 2 + math.ceil(
@@ -161,13 +161,13 @@ def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
 
 def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
     """Write what is known of a sample's noise, and which ones are skipped."""
-    f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
+    f.least_satellites, f.r_scale_weight, f.robust = config.satellites, config.adapt, config.robust
     f.steer_jump, f.map_lag = config.steer_rate * f.step, config.map_lag_sd
-    f.model_error, f.r_told[:] = config.model_error, f.r_fast
+    f.model_error, f.r_nominal[:] = config.model_error, f.r_fast
     if config.noise_time > 0.0:
         f.block = max(1, round(_BLOCK_TIME / f.step))
         f.r_share = 1.0 - math.exp(-f.block * f.step / config.noise_time)
-    f.wary = config.wary
+    f.recovery_count = config.wary
     if config.gate is not None:
         from scipy.stats import chi2  # slow to load
 
@@ -189,10 +189,10 @@ def _write_model(
     for j, (_, pushed) in enumerate(model.disturbances):
         f.pushed[j] = names.index(pushed)
     f.pushed[n - len(model.biases) - dense : n - dense] = -1
-    f.banked = names.index("bank") - dense if "bank" in model.biases else -1
-    f.steered = names.index("steer_offset") if "steer_offset" in model.biases else 0
-    f.mapped = names.index("map_heading") if "map_heading" in model.biases else 0
-    f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
+    f.bank_state = names.index("bank") - dense if "bank" in model.biases else -1
+    f.steer_offset_state = names.index("steer_offset") if "steer_offset" in model.biases else 0
+    f.map_heading_state = names.index("map_heading") if "map_heading" in model.biases else 0
+    f.roll_state = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
     f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
     body = make_roll_model(vehicle)
     f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
@@ -212,7 +212,7 @@ def _write_model(
         both = range(dense, dense + 2)
         f.decay[both], f.q_share[:] = decay, 1.0 - decay * decay
         f.Q[both, both] += f.q_share * np.square([force_sd, moment_sd])
-        f.q_known[:] = f.Q[both, both]
+        f.q_nominal[:] = f.Q[both, both]
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, config.noise)
@@ -228,7 +228,7 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
         names.index(TYRES[0]),
         names.index(TYRES[2]) if TYRES[2] in names else 0,
     )
-    f.again = max(1, round(_EXPANSION_TIME / f.step))
+    f.linearise_every = max(1, round(_EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])
@@ -264,7 +264,7 @@ def _write_signals(
         f.r_fast[i] = noise[name] ** 2
         if name in measured_state:
             f.C_fast[i, names.index(measured_state[name])] = 1.0
-    f.scaled = names.index(models.SCALE) if models.SCALE in model.biases else 0
+    f.accel_scale_state = names.index(models.SCALE) if models.SCALE in model.biases else 0
     for bias in models.WANDER.keys() & model.biases:
         if models.WANDER[bias] in model.fast:
             f.C_fast[model.fast.index(models.WANDER[bias]), names.index(bias)] = 1.0
@@ -296,8 +296,8 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
         if name == "camera" and "camera_yaw" in model.biases:  # it turns about the car, not y_l
             f.C[s, :2, model.names.index("camera_yaw")] = 1.0, f.preview
-        if name == "camera" and f.mapped > 0:
-            f.C[s, :2, f.mapped] = 1.0, f.preview
+        if name == "camera" and f.map_heading_state > 0:
+            f.C[s, :2, f.map_heading_state] = 1.0, f.preview
         if is_second_layer:
             f.r_speed = f.r[s, 0]
 
@@ -334,10 +334,10 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
     shared = config.row.intersample == "dual-rate"
-    f.between = rule.PSEUDO if pseudo else rule.DUAL_RATE if shared else rule.NONE
+    f.intersample_rule = rule.PSEUDO if pseudo else rule.DUAL_RATE if shared else rule.NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
-    f.store_predictions = f.late in (rule.STORED, rule.CONSTANT)
+    f.store_predictions = f.delay_rule in (rule.STORED, rule.CONSTANT)
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
@@ -349,7 +349,8 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
         f"correction between samples; got gate={config.gate}, adapt={config.adapt}, "
         f"latency={dict(config.latency)}, delay={config.delay!r}"
     )
-    is_contradiction = _is_covariance_needed(config) and (f.periodic or f.between != rule.NONE)
+    has_gains = f.periodic or f.intersample_rule != rule.NONE
+    is_contradiction = _is_covariance_needed(config) and has_gains
     cannot_adapt = config.adapt > 0.0 and config.delay in ("larsen", "buffer")
     needed = f"adapt needs delay='clone', got delay={config.delay!r}"
     _refuse(config.name, [(is_contradiction, text), (cannot_adapt, needed)])
@@ -363,13 +364,13 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
 
-    if f.between == rule.DUAL_RATE or config.row.gains == "placed":
+    if f.intersample_rule == rule.DUAL_RATE or config.row.gains == "placed":
         return True
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
     if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
         impossible = "its model changes with the yaw rate"
-    elif f.between == rule.PSEUDO:
+    elif f.intersample_rule == rule.PSEUDO:
         early = f"a sample must arrive before the next one is captured, got {config.sensors}"
         is_covariance = config.gains == "covariance"
         refusal = "no gains='covariance': it has one constant gain"

@@ -145,7 +145,7 @@ def _copy_gain(source: Vector, target: Vector, size: int) -> Scalar:
 def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
     """Compute the shape of a table of gains: rows and columns."""
     p, m = int(f.rows.max()), int(f.fasts)
-    extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
+    extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.intersample_rule)]
     rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
     return rows, int(f.total + f.n * (f.n + 1) // 2)
 
@@ -168,11 +168,11 @@ def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> Fil
     """Copy a filter (1,) as one that takes steps of a schedule at a held speed, gains from P."""
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
-    copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
+    copy.periodic = copy.measured = copy.origin = copy.joint = copy.intersample_rule = 0
     copy.pace = 1 if f.stride > 1 else f.pace
     copy.stride, copy.speed = 1, speed
-    copy.late = CLONE if f.late == CLONE else IGNORE
-    copy.frames[:] = f.frames * (f.late == CLONE)  # other rules have no clones
+    copy.delay_rule = CLONE if f.delay_rule == CLONE else IGNORE
+    copy.frames[:] = f.frames * (f.delay_rule == CLONE)  # other rules have no clones
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
@@ -189,20 +189,20 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
     s = int(f.first_slow)
     table = np.zeros(_compute_table_shape(f, schedule))
     table[0, 0] = 1.0
-    if f.between == DUAL_RATE or config.poles:
+    if f.intersample_rule == DUAL_RATE or config.poles:
         reset_filters(filters, 0)
         G: Array = copy.G[: copy.dense, : copy.n].copy()
-        if f.between == DUAL_RATE:
+        if f.intersample_rule == DUAL_RATE:
             _write_shares(copy, G, schedule, config, table)
         else:
             _write_placed_gains(copy, G, config.poles, table)
     else:
-        lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
+        lags = np.array(schedule.lags, np.int64) * int(f.delay_rule == CLONE)
         cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
         before = np.zeros((int(f.total), int(f.total)))
         tolerance = _GAIN_TOLERANCE if f.periodic else _CHECK_TOLERANCE
         _iterate_gains(filters, lags, cycles, tolerance, table, before, np.zeros((1, 1, 1)))
-        if f.between == PSEUDO:
+        if f.intersample_rule == PSEUDO:
             C = build_measurement_rows(f)
             R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
             inverse = compute_inverse(config.inverse, C, before, R)
@@ -223,7 +223,7 @@ def build_measurement_rows(f: FilterRecord) -> Array:
     p = int(f.rows[s]) if s >= 0 else 0
     C = np.zeros((m + p, int(f.total)))
     C[:m, : f.n] = f.C_fast[:m, : f.n]
-    if s >= 0 and f.late == CLONE and f.frames[s] > 0:
+    if s >= 0 and f.delay_rule == CLONE and f.frames[s] > 0:
         first = int(f.first_clone[s])
         C[m:, first : first + p] = np.eye(p)
     elif s >= 0:
@@ -318,10 +318,11 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
     cycle, period, lags = schedule.cycle, schedule.period, schedule.lags
     filters = _copy_for_schedule(f, schedule, speed)
     g = filters.view(np.recarray)[0]
-    g.late = f.late if f.late in (CLONE, STORED, CONSTANT) else IGNORE
-    g.between, g.periodic, g.joint = f.between, 1, int(f.joint or f.between == PSEUDO)
+    g.delay_rule = f.delay_rule if f.delay_rule in (CLONE, STORED, CONSTANT) else IGNORE
+    g.intersample_rule, g.periodic = f.intersample_rule, 1
+    g.joint = int(f.joint or f.intersample_rule == PSEUDO)
     latest, g.heading_fix[:] = max(lags, default=0), 0
-    g.assumed, g.spacing, g.wary, g.speed_state = latest, 0.0, 0, -1
+    g.assumed, g.spacing, g.recovery_count, g.speed_state = latest, 0.0, 0, -1
     reset_filters(filters, 0)
     start = (latest // cycle + 1) * cycle  # until then the first samples arrive
     captured = np.arange(0, start + cycle, period) if lags else np.zeros(0)
@@ -339,15 +340,15 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
 
     def list_errors(tick: int) -> list[Array]:
         """List what holds an error before a tick's step, as views of the filter's memory."""
-        spans, vectors = [slice(0, f.n)], (g.x, g.e) if f.between == PSEUDO else (g.x,)
-        if f.late == CLONE and lags:
+        spans, vectors = [slice(0, f.n)], (g.x, g.e) if f.intersample_rule == PSEUDO else (g.x,)
+        if f.delay_rule == CLONE and lags:
             s, p = int(f.first_slow), int(f.rows[f.first_slow])
             is_carried = (g.stamp[s, : f.frames[s]] >= 0) | (
-                f.between == PSEUDO
+                f.intersample_rule == PSEUDO
             )  # e's is read later
             firsts = f.first_clone[s] + p * np.flatnonzero(is_carried)
             spans += [slice(first, first + p) for first in firsts]
-        late = latest // period if f.late in (STORED, CONSTANT) else 0
+        late = latest // period if f.delay_rule in (STORED, CONSTANT) else 0
         captures = [(tick - i * period) % WINDOW for i in range(1, late + 1)]
         parts = [vector[span] for vector in vectors for span in spans]
         return parts + [g.predicted[row, : f.n] for row in captures]

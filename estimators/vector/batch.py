@@ -167,7 +167,7 @@ class BatchEstimator:
         bank = FilterBank(self.filters, self._designs.pool, self._places)
         while compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
             missing = np.flatnonzero(done < record.rows)  # without gains; each design is made once
-            keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
+            keys = [(self._design_keys[i], int(self.filters[i, 0].missing_cell)) for i in missing]
             for i in dict(zip(keys, missing.tolist(), strict=True)).values():
                 self[i].design_missing()
 

@@ -62,7 +62,8 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """Load what a filter's ticks read and do not write."""
     n, dense = f.n, f.dense
     for i in range(n):
-        b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
+        b.own_decay[i, lane], b.decay[i, lane] = f.own_decay[i], f.decay[i]
+        b.drift[i, lane] = f.drift[i]
         for j in range(n):
             b.GT[i, j, lane] = f.GT[i, j]
         for j in range(i, n):
@@ -71,7 +72,7 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
         for j in range(n):
             b.G[i, j, lane] = f.G[i, j]
     for i in range(n, f.total):
-        b.keep[i, lane] = f.keep[i]
+        b.own_decay[i, lane] = f.own_decay[i]
     for k in range(f.inputs):
         b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
         for j in range(dense):

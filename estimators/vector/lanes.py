@@ -40,7 +40,7 @@ _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 _MAX_STATES = 16  # states and clones
 _ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
 _FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
-    ((_ROW_LENGTH,), ("x", "keep", "decay", "drift", "PC", "gain")),
+    ((_ROW_LENGTH,), ("x", "own_decay", "decay", "drift", "PC", "gain")),
     ((_MAX_STATES, _ROW_LENGTH), ("P",)),  # on and above the diagonal, as Q
     ((N_CORE, _ROW_LENGTH), ("G", "GT", "Q")),
     ((N_INPUTS, _ROW_LENGTH), ("HT",)),
@@ -99,9 +99,9 @@ def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
     # without rules between samples, and store nothing of the past but predictions
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
-        is_plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0
+        is_plain = f.stride == 1 and f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
         has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
-        is_supported = f.late != BUFFER and f.late != LARSEN and f.total <= _MAX_STATES
+        is_supported = f.delay_rule != BUFFER and f.delay_rule != LARSEN and f.total <= _MAX_STATES
         is_supported = is_supported and is_steady and is_plain and has_fixed_noise
         if is_supported and b.n == 0:
             _set_shape(b, f)

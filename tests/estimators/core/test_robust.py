@@ -90,7 +90,7 @@ def test_the_moment_forgets_in_a_time_of_its_own() -> None:
     f = filter_with_tyres(log, disturbance_time=0.5, moment_time=0.1, moment_sd=20.0).filters[0]
     assert f.decay[f.dense] == pytest.approx(math.exp(-0.001 / 0.5))
     assert f.decay[f.dense + 1] == pytest.approx(math.exp(-0.001 / 0.1))
-    assert f.q_known[1] == pytest.approx((1.0 - math.exp(-0.002 / 0.1)) * 20.0**2)
+    assert f.q_nominal[1] == pytest.approx((1.0 - math.exp(-0.002 / 0.1)) * 20.0**2)
 
 
 def test_a_late_map_errs_by_the_turn_of_the_road_in_that_time() -> None:
@@ -205,8 +205,8 @@ def test_forces_come_in_shares_of_the_weight() -> None:
     f, car = filter_.filters[0], base.nominal
     weight, arm = car.mass * GRAVITY, 0.5 * (car.front_arm + car.rear_arm)
     share = 1.0 - math.exp(-2.0 * 0.001 / 0.3)
-    assert f.q_known[0] == pytest.approx(share * (30.0**2 + (0.05 * weight) ** 2))
-    assert f.q_known[1] == pytest.approx(share * (20.0**2 + (0.01 * weight * arm) ** 2))
+    assert f.q_nominal[0] == pytest.approx(share * (30.0**2 + (0.05 * weight) ** 2))
+    assert f.q_nominal[1] == pytest.approx(share * (20.0**2 + (0.01 * weight * arm) ** 2))
 
 
 def test_a_bias_that_wanders_keeps_its_deviation() -> None:

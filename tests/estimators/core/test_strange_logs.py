@@ -79,6 +79,6 @@ def test_the_scale_of_the_accelerometer_is_found(wrong: float) -> None:
 def test_tyres_are_expanded_every_row_of_a_slow_log() -> None:
     """Every 4 ms, or every row where rows are further apart."""
     _, log = drive()
-    assert built("exact-kf", log, **WITH_TYRES).filters[0].again == 4
+    assert built("exact-kf", log, **WITH_TYRES).filters[0].linearise_every == 4
     facts = {"vehicle": drive()[0].nominal, "sensors": {}, "slow": []}
-    assert make_estimator("joint", dt=0.01, **facts).filters[0].again == 1
+    assert make_estimator("joint", dt=0.01, **facts).filters[0].linearise_every == 1
