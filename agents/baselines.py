@@ -184,10 +184,10 @@ def make_oracle(
         ValueError: The name is unknown.
         TypeError: The options have another key.
     """
-    check_choice("rung", name, ORACLES)
+    check_choice("oracle", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
     if len(chosen) != 2:
-        raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
+        raise TypeError(f"options of an oracle are 'filter' and 'controller', got {sorted(chosen)}")
     single_env: Any = gym.make(env_id, **env_kwargs)
     world: World = single_env.unwrapped.config.world
     if name in PARAMETER_ORACLES:

@@ -74,7 +74,8 @@ _JOINT = (
     ("map_heading_time", 1.2),
     ("map_lag_sd", 0.19),
 )
-"""For a car that nobody has measured: `benchmarks.tuning.levels` finds them on simulated drives."""
+"""For an unknown car; `benchmarks.tuning.levels` finds them on simulated drives. Meaning and unit of
+each stand in `design.options`."""
 
 FILTERS: dict[str, FilterDefinition] = {
     "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),
@@ -112,8 +113,8 @@ FILTERS: dict[str, FilterDefinition] = {
         hdop_table=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
-    # the poles of both have the least error of beta of a grid from 1 to 200 rad/s, on the training
-    # seeds of double-layer-fig9 and dakf-fig6
+    # linear observers: the poles of `lob-2` and `lob` have the least error of beta of a grid from 1
+    # to 200 rad/s, on the training seeds of double-layer-fig9 and dakf-fig6
     "lob-2": FilterDefinition(
         gains="placed", poles=(-60.0, -120.0), source="double-layer-gps 6.1, Aoki 2005"
     ),

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Actions = npt.NDArray[np.float32]
 
 STEP_LENGTHS = (1.0, 0.4, 0.1)  # fractions of the step d that are tried in turn
-_FIRST_DAMPING = 1e-2  # damping of the first sweep, as for `_run_backward_pass`
+_FIRST_DAMPING = 1e-2  # damping of the first pass, as for `_run_backward_pass`
 _DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
 _DAMPING_FACTOR = 4.0  # from one damping to the next
 MAX_ITERATIONS = 60
@@ -55,7 +55,7 @@ class _ManoeuvreEnv(gym.Wrapper[Actions, Actions, Actions, Actions]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, object] | None = None
     ) -> tuple[Actions, dict[str, object]]:
-        """Return to the start of the manoeuvre."""
+        """Return to the start of the manoeuvre; the first reset's seed holds."""
         base = _get_base(self)
         if self.snapshot is not None:
             base.set_state(self.snapshot)
@@ -191,7 +191,7 @@ def _simulate_run(
     actions: Array | Actions,
     feedback: tuple[Array, Array] | None = None,
 ) -> PlanRun:
-    """Simulate an episode; feedback: states (K + 1, n) and gains (K, width, n) for corrections."""
+    """Simulate an episode; feedback (x, G): states (K + 1, n) and gains, on what they are missed by."""
     env.reset(seed=seed)
     base = _get_base(env)
     applied = np.array(actions, np.float32)

@@ -73,7 +73,7 @@ def _lqr_law(
         interpolate_gains(table, axes, v, front, rear, KS)
         make_design_state(x[row], share, z)
         if remembers:
-            copy_into(state[row, first:], z[n - 2 :])
+            copy_into(state[row, first:], z[n - 2 :])  # N_z before, commanded N_z
             state[row, first] = z[2]
         u, w = 0.0, 0.0
         for j in range(n):

@@ -268,7 +268,7 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
         summary = f"below it: {below}" if below else "nobody is below it (Holm-corrected)"
         note += f" On the clairvoyant's seeds {summary}."
     lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
-    return ResultTable("The ladder", _BASELINES, lines, note, keyed=False)
+    return ResultTable("The oracles", _BASELINES, lines, note, keyed=False)
 
 
 def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
