@@ -74,8 +74,8 @@ _JOINT = (
     ("map_heading_time", 1.2),
     ("map_lag_sd", 0.19),
 )
-"""For an unknown car; `benchmarks.tuning.levels` finds them on simulated drives. Meaning and unit of
-each stand in `design.options`."""
+"""For an unknown car; `benchmarks.tuning.levels` finds them on simulated drives. Meaning and
+unit of each stand in `design.options`."""
 
 FILTERS: dict[str, FilterDefinition] = {
     "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),

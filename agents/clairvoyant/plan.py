@@ -191,7 +191,7 @@ def _simulate_run(
     actions: Array | Actions,
     feedback: tuple[Array, Array] | None = None,
 ) -> PlanRun:
-    """Simulate an episode; feedback (x, G): states (K + 1, n) and gains, on what they are missed by."""
+    """Simulate an episode; feedback: states (K + 1, n), gains (K, width, n) on the miss."""
     env.reset(seed=seed)
     base = _get_base(env)
     applied = np.array(actions, np.float32)
