@@ -35,12 +35,13 @@ HEAVY = {
     "vehiclemodels",
 }
 
-SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "scipy.stats", "torch")
-"""Modules that a command without a drive does not load."""
-
-
-DRIVEN = (*SLOW, "scipy.optimize")
+DRIVEN = (
+    *("control", "cv2", "matplotlib", "pandas", "plotly", "torch"),
+    *("scipy.optimize", "scipy.signal", "scipy.stats"),
+)
 """Modules that `sideslip run` does not load."""
+SLOW = (*DRIVEN, "scipy.linalg", "scipy.special")
+"""Modules that a command without a drive does not load."""
 
 
 def python(code: str, cwd: Path) -> str:
@@ -109,7 +110,13 @@ def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path
 
 
 @pytest.mark.parametrize(
-    "agent", ["none", "lqr --estimator exact-kf", "two-dof --estimator multirate-kf"]
+    "agent",
+    [
+        "none",
+        "lqr --estimator exact-kf",
+        "lqr --estimator joint",
+        "two-dof --estimator multirate-kf",
+    ],
 )
 def test_a_drive_loads_nothing_slow_that_it_does_not_use(agent: str, tmp_path: Path) -> None:
     code = (

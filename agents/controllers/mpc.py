@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
-from scipy.sparse import csc_matrix
 
 from ...envs.record import Array
 from ...envs.ticks import TICK
@@ -58,9 +56,9 @@ def _condense_program(
         rows, next_rows = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
         Sx[next_rows], Su[next_rows] = model.G @ Sx[rows], model.G @ Su[rows]
         Su[next_rows, i * m : (i + 1) * m] += model.H
-    Q = block_diag(*[model.Q] * horizon, model.solve()[1])
-    R = block_diag(*[model.R] * horizon)
-    N = np.vstack([block_diag(*[model.N] * horizon), np.zeros((n, horizon * m))])
+    Q, R = np.kron(np.eye(horizon + 1), model.Q), np.kron(np.eye(horizon), model.R)
+    Q[-n:, -n:] = model.solve()[1]
+    N = np.vstack([np.kron(np.eye(horizon), model.N), np.zeros((n, horizon * m))])
     scale = np.tile(limits[: len(design_spec.inputs)], horizon)
     P = scale[:, None] * (Su.T @ Q @ Su + Su.T @ N + N.T @ Su + R) * scale
     F = scale[:, None] * ((Su.T @ Q + N.T) @ Sx)
@@ -200,6 +198,8 @@ class Mpc(Lqr):
     def _get_solver(self, speed: float) -> tuple[_QuadraticProgram, Any]:
         """Get the program of a speed of `SPEEDS` and its solver, set up at its first use."""
         if speed not in self._ready_for:
+            from scipy.sparse import csc_matrix  # slow to load
+
             design = self.prediction, self.horizon, self.authority
             program, solver = _condense_program(self.nominal, speed, *design), self._osqp.OSQP()
             solver.setup(

@@ -169,9 +169,9 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
         f.r_share = 1.0 - math.exp(-f.block * f.step / config.noise_time)
     f.recovery_count = config.wary
     if config.gate is not None:
-        from scipy.stats import chi2  # slow to load
+        from scipy.special import gammaincinv  # chi-square's quantiles: scipy.stats loads long
 
-        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, size.N_ROWS + 1))
+        f.gate[1:] = 2.0 * gammaincinv(0.5 * np.arange(1, size.N_ROWS + 1), config.gate)
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
     f.knots = len(knots)
     for i, (hdop, factor) in enumerate(knots):
@@ -349,11 +349,10 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
         f"correction between samples; got gate={config.gate}, adapt={config.adapt}, "
         f"latency={dict(config.latency)}, delay={config.delay!r}"
     )
-    has_gains = f.periodic or f.intersample_rule != rule.NONE
-    is_contradiction = _is_covariance_needed(config) and has_gains
+    is_refused = (f.periodic or f.intersample_rule) and _is_covariance_needed(config)
     cannot_adapt = config.adapt > 0.0 and config.delay in ("larsen", "buffer")
     needed = f"adapt needs delay='clone', got delay={config.delay!r}"
-    _refuse(config.name, [(is_contradiction, text), (cannot_adapt, needed)])
+    _refuse(config.name, [(is_refused, text), (cannot_adapt, needed)])
 
 
 def _is_covariance_needed(config: FilterConfig) -> bool:

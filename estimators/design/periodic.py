@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
@@ -249,6 +248,8 @@ def _write_shares(
 
 def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
     """Write the gains of the fast rows for poles (rad/s), and the covariance, into a table."""
+    from scipy.linalg import solve_discrete_lyapunov  # slow to load
+
     n, m = int(f.n), int(f.fasts)
     F, C = transition_matrix(f, G), f.C_fast[:m, :n]
     K = observer_gain(F, C, np.exp(np.array(poles) * float(f.step)))
