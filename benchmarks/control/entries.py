@@ -286,9 +286,9 @@ def check_agent(agent: Agent, rows: int, width: int) -> Agent:
 
 
 LEARNED: dict[str, tuple[Entry, ...]] = {
-    "car-steering": (Entry("distill-car-steering", JOINT),),
+    "car-steering": (Entry("distill-car-steering", JOINT), Entry("raw-car-steering", "")),
     "car-yaw": (Entry("distill-car-yaw", JOINT),),
-    "coms-model": (Entry("distill-coms-steering", JOINT),),
+    "coms-model": (Entry("distill-coms-steering", JOINT), Entry("raw-coms-steering", "")),
     "coms-zero-slip": (Entry("distill-coms-yaw", JOINT),),
 }
 """Policies by the class of their tasks; verdicts speak of the first."""

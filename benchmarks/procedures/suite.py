@@ -159,8 +159,8 @@ def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
         failed = [run for run in weakest.runs if not run.passed]
         numbers = {"amplitude": interval(highest, np.median), "n": len(results)}
         numbers |= {"A": np.degrees(np.median([result.A for result in results]))}
-        last = max(run.multiple for result in results for run in result.runs)
-        ends = float(np.median(highest)), last, int(np.sum(highest < last))
+        last = np.array([max(run.multiple for run in result.runs) for result in results])
+        ends = float(np.median(highest)), float(np.median(last)), int(np.sum(highest < last))
         text = "passes"
         if failed:
             text = f"fails at {failed[0].multiple:.3g} A: {_describe_failure(failed[0])}"
@@ -245,7 +245,7 @@ def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
 _KEYS, _PAIR = ("controller", "car"), "{:.3g} ({:.3g})"
 _PER_G = float(np.degrees(GRAVITY))
 _CLAIM = "no control fails at 5 A, a yaw moment of 500 N m passes at 6.5 A"
-_OF = Column("passed", "median car passes up to / A", form="{:.3g} of {:.3g}; {:.0f} cars fail")
+_OF = Column("passed", "median car passes up to / A", form="{:.3g} of {:.3g}; {:.0f} fail")
 _CIRCLE = {"understeer_gradient": "measured / (deg/g)", "theory": "linear model / (deg/g)"}
 _STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s", "peak_time": "peak after / s"}
 _SHARES = {"ratio": "at 1.00 s / %", "later": "at 1.75 s / %"}

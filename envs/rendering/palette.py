@@ -29,6 +29,7 @@ CONTROLLERS = {
     "lane-keeping": "#486C3F", "learned": "#D8636C",
     "distill-coms-steering": "#8C6D1F", "distill-coms-yaw": "#2E8B9E",
     "distill-car-steering": "#B0603A", "distill-car-yaw": "#5E8F2E",
+    "raw-car-steering": "#7A7F1B", "raw-coms-steering": "#A0527D",
 }  # fmt: skip
 ORACLES = {
     "nominal": "#CF00B4", "oracle-parameters": "#63905A", "oracle-parameters-lqr": "#48905A",

@@ -16,6 +16,7 @@ from ..vehicle.actuators import apply_lag, limit_rate
 from ..vehicle.dynamics import Motion, RoadParams, compute_curvature
 from ..vehicle.tyres import MIN_SPEED
 from .road import TrackPath, compute_path_offset
+from .steering import MIN_STEER_FACTOR
 
 if TYPE_CHECKING:
     from ..task import ReferenceParams
@@ -55,15 +56,15 @@ def compute_target_angle(
         Angle at the wheels (rad), within +-stop.
     """
     v = motion.v_x
-    preview = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
+    distance = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
     slope = (v * sin_r + motion.v_y * cos_r) / maximum(v, MIN_SPEED)
     # the double integral of the curvature, exact on a clothoid too
-    bend = 0.5 * preview * preview * compute_curvature(road, motion.s + preview * (1.0 / 3.0))
+    bend = 0.5 * distance * distance * compute_curvature(road, motion.s + distance * (1.0 / 3.0))
     # how far the path lies to the left of the car's course at the preview distance
-    error = compute_path_offset(path, motion.s + preview) + bend - motion.y - preview * slope
-    curvature = driver.gain * 2.0 * error / (preview * preview)
-    angle = curvature * maximum(1.0 + target.G * v * v, 0.2) / target.per_l  # dakf-stability (23)
+    error = compute_path_offset(path, motion.s + distance) + bend - motion.y - distance * slope
+    curvature = driver.gain * 2.0 * error / (distance * distance)
+    angle = curvature * maximum(1.0 + target.G * v * v, MIN_STEER_FACTOR) / target.per_l
     return minimum(maximum(angle, 0.0 - stop), stop)
 
 

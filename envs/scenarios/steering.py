@@ -27,6 +27,7 @@ WANDER_START = _SWEEP_START + 5
 _LEAD_START = WANDER_START + 3
 STEERING_WIDTH = _LEAD_START + 4
 _RISE = 0.2  # s, of a step
+MIN_STEER_FACTOR = 0.2  # of 1 + G v^2, dakf-stability (23): at an oversteering car's limit it is 0
 
 
 @jit
@@ -229,7 +230,7 @@ def write_gentle_steering(
         profile: Array of the profile, at least STEERING_WIDTH long.
     """
     k, seconds, v = _LEAD_START, length * TICK, maximum(speed, 1.0)
-    gain = maximum(1.0 + target.G * v * v, 0.2) / (target.per_l * v * v)  # dakf-stability (23)
+    gain = maximum(1.0 + target.G * v * v, MIN_STEER_FACTOR) / (target.per_l * v * v)
     profile[k], profile[k + 3] = _LEAD_ACCELERATION * gain, length
     for i in range(2):
         waves = maximum(floor(_LEAD_FREQUENCIES[i] * seconds + 0.5), 1.0)

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.harness.drives import make_env
-from sideslip.benchmarks.procedures import outside, suite
+from sideslip.benchmarks.procedures import fmvss126, outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
 from sideslip.benchmarks.suites import SUITES, Request
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
@@ -32,6 +32,19 @@ def test_each_contestant_has_what_it_reads(car: str) -> None:
         options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
         env = make_env(ENV_ID, estimator, estimate, **options)
         each.make_agent(car, env)
+
+
+def test_a_car_that_passes_its_own_series_does_not_fail_beside_one_with_a_longer_one() -> None:
+    """The smaller A, the more of it is in 270 degrees."""
+    (case, *_) = suite._make_cases(quick=True)
+    results = [
+        fmvss126.SineDwellResult(
+            1.0, tuple(fmvss126.SineDwellRun(k, k, 0.0, 0.0, 9.0) for k in multiples)
+        )
+        for multiples in ((1.5, 6.5), (1.5, 6.5, 8.5), (1.5, 7.5))
+    ]
+    (record,) = suite._make_sine_records({case: results})
+    assert record["passed"] == (7.5, 7.5, 0) and record["text"] == "passes"
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:
