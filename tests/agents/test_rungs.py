@@ -85,7 +85,7 @@ def test_options_go_to_the_filter_and_the_controller() -> None:
     assert recorded["force_sd"] == 7.0 and recorded["slow"] == ["gps"] and agent.grip == 0.3
     with pytest.raises(TypeError, match="'filter' and 'controller'"):
         make_oracle("nominal", FUSION, options={"gains": {}})
-    with pytest.raises(ValueError, match="rung"):
+    with pytest.raises(ValueError, match="oracle"):
         make_oracle("clairvoyant", FUSION)
 
 

@@ -158,7 +158,7 @@ def test_every_contest_is_in_one_class() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--class", "coms"), "unknown class of contests 'coms'; known: coms-model"),
+        (("--class", "coms"), "unknown class of tasks 'coms'; known: coms-model"),
         (("--class", "coms-model", "--estimator", "dakf"), "unknown estimator 'dakf'"),
         (("--class", "coms-model", "--teacher", "oracle"), "unknown agent 'oracle'"),
         (("--class", "coms-model", "--teacher", "lane-keeping"), "needs psi_hat, y_l_hat"),
@@ -207,7 +207,7 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     ]
     assert outages[0] and not outages[0] & outages[1]
     for agent, fields, said in (
-        (None, {}, "for a policy of a class of contests, got None"),
+        (None, {}, "for a policy of a class of tasks, got None"),
         (Path("here/best_model.zip"), {}, "got here/best_model.zip"),
         (Path(TRACES), {"scenarios": ["coms-step"]}, "without other scenarios"),
         (Path(TRACES), {"env_options": {"scenario": "coms-step"}}, "without other"),
