@@ -3,8 +3,8 @@
 A filter is a model x a rule between slow samples x a rule for late ones x a tuning. A bicycle has
 the states that the slow sensor measures. Where the papers differ: every model is discretised
 exactly (double-layer-gps (38), (42) take A T + I); disturbances and process noise are per second
-(double-layer-gps (34) and dual-rate (5) count them per step); misprints of docs/PAPERS.md are
-corrected; with pseudo-residuals every tick takes an even fraction of the gain that the filter
+(double-layer-gps (34) and dual-rate (5) count them per step); misprints (docs/reference/papers.md)
+are corrected; with pseudo-residuals every tick takes an even fraction of the gain that the filter
 without them applies at a sample.
 """
 
@@ -155,7 +155,7 @@ FILTERS: dict[str, FilterDefinition] = {
         slow=SLOW_NAMES,
         gains="covariance",
         disturbances="forces",
-        source="docs/PAPERS.md",
+        source="docs/reference/papers.md",
     ),
     "joint": FilterDefinition(
         slow=SLOW_NAMES,

@@ -223,8 +223,8 @@ CLAIMS = (
         note="The pseudo measurements of a frame all repeat one innovation; taken for independent "
         "ones they are used a hundred times. The error grows where all three extended states are "
         "driven hard (we looked for such a tuning; the paper gives none), and mostly stays "
-        "bounded else. As corrected in docs/PAPERS.md; as printed (29) does the same (in the "
-        "tests)."),
+        "bounded else. As corrected in docs/reference/papers.md; as printed (29) does the same (in "
+        "the tests)."),
     claim("Sec. 4.3", "the extended model's rank (the paper only checks that C C^T is invertible)",
         ClaimPart("rank, of 6 states", RANKS, "dual-rate", "rank", None, Bound("=", 4.0), "rank")),
 )

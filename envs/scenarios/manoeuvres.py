@@ -1,12 +1,12 @@
 """The scenarios by name, and a recorded drive's steering trace as a scenario.
 
-Scored are those of two tiers: the seed draws cars, manoeuvres and sensor faults. Tier 1 is the COMS
-at 18 to 28 km/h, tier 2 the passenger car at 60 to 80 km/h: on a dry road (2a), on one of any
-friction (2b), and at the limit of its tyres (2c). Sensors have biases, a late GPS, and an uneven
-camera that may lose the lane. The env names the car, a task the reference.
+Scored are those of three tiers, whose cars, manoeuvres and sensor faults the seed draws: the small
+car (COMS) at 18 to 28 km/h, the passenger car on the road at 60 to 90 km/h, and at the limit of its
+tyres. Sensors have biases, a late GPS, and an uneven camera that may lose the lane. The env names
+the car, a task the reference.
 
-No score contains those of the papers, listed in docs/PAPERS.md; the comment above each one says
-what its paper gives. The rest is chosen here: by default the vehicle of tie-vision's Table I at
+No score contains those of the papers, listed in docs/reference/papers.md; the comment above each
+one says what its paper gives. The rest is chosen here: by default the vehicle of tie-vision's Table I at
 25 km/h, with the default Ornstein-Uhlenbeck disturbance and noise. GPS noise is that at HDOP 1 in
 the simulations; in the road tests half of it follows a varying HDOP.
 """

@@ -1,4 +1,4 @@
-"""The papers' simulations by name, exactly as docs/PAPERS.md gives them."""
+"""The papers' simulations by name, exactly as docs/reference/papers.md gives them."""
 
 import math
 from typing import Any
@@ -42,7 +42,7 @@ def noise(psi: float, y: float) -> dict[str, float]:
     return {"camera_psi": psi, "camera_y": y}
 
 
-# docs/PAPERS.md: fields, real tyres, nominal tyres, OU, noise
+# docs/reference/papers.md: fields, real tyres, nominal tyres, OU, noise
 TABLE: dict[str, tuple[Fields, float, float, bool, dict[str, float]]] = {
     "tie-vision-fig7": (SINE, 7200.0, 6000.0, True, {}),
     "tie-vision-fig8": (FIG8, 6000.0, 6000.0, False, noise(0.0005, 0.003)),

@@ -185,7 +185,7 @@ def gain(vehicle: Vehicle, V_x: float) -> float:
 
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_it_is_minus_the_ratio_of_the_static_gains(V_x: float) -> None:
-    """The middle of (24) lacks this minus: docs/PAPERS.md."""
+    """The middle of (24) lacks this minus: docs/reference/papers.md."""
     model = make_bicycle_model(COMS, V_x)
     (from_delta, from_moment), _ = np.linalg.solve(model.A, -model.B)
     scale = max(abs(gain(COMS, V_x)), 1e3)  # near 20.73 km/h the numerator is a difference
