@@ -6,9 +6,9 @@ tyres. Sensors have biases, a late GPS, and an uneven camera that may lose the l
 the car, a task the reference.
 
 No score contains those of the papers, listed in docs/reference/papers.md; the comment above each
-one says what its paper gives. The rest is chosen here: by default the vehicle of tie-vision's Table I at
-25 km/h, with the default Ornstein-Uhlenbeck disturbance and noise. GPS noise is that at HDOP 1 in
-the simulations; in the road tests half of it follows a varying HDOP.
+one says what its paper gives. The rest is chosen here: by default the vehicle of tie-vision's Table
+I at 25 km/h, with the default Ornstein-Uhlenbeck disturbance and noise. GPS noise is that at HDOP 1
+in the simulations; in the road tests half of it follows a varying HDOP.
 """
 
 import dataclasses
