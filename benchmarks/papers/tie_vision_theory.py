@@ -4,7 +4,7 @@ The appendix is checked term by term on random time-varying systems with random 
 and as docs/reference/papers.md corrects it. The one-step lines of cases 1 and 2 are no equations
 between vectors as printed (K times w, H u times w) and cannot be checked. The paper leaves open
 which gain (16) and (21) use between samples. Two are tried: the Kalman gain of (13) at 1 ms, with
-every row corrected at every step, and the shipped filter's, the multirate gain spread over the frame.
+every row corrected at every step, and the shipped one, the multirate gain spread over the frame.
 """
 
 from dataclasses import dataclass
