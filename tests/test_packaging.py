@@ -129,6 +129,17 @@ def test_a_drive_loads_nothing_slow_that_it_does_not_use(agent: str, tmp_path: P
     assert python(code, tmp_path).splitlines()[-1] == "loaded []"
 
 
+@pytest.mark.parametrize("own", [None, "3"])
+def test_a_command_takes_one_thread_for_small_matrices_unless_told(
+    own: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if own:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", own)
+    code = "import os, sideslip.__main__; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    assert python(code, tmp_path).strip() == (own or "1")
+
+
 @pytest.mark.smoke
 def test_lazy_names_are_listed_and_others_refused() -> None:
     assert {"rollout", "make_agent", "make_estimator"} <= set(dir(sideslip))
