@@ -158,16 +158,16 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
 
 
 def _run_entry(
-    driven: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
+    control_task: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
     """Run a controller on a task with some options, an episode for each seed."""
     estimator = "" if name == NOMINAL else JOINT if name in ADAPTIVE else REFERENCE_FILTER
-    return run_chunk(Chunk(driven, Entry(name, estimator, options), seeds))
+    return run_chunk(Chunk(control_task, Entry(name, estimator, options), seeds))
 
 
 @lru_cache(maxsize=64)
-def _drive_nominal(driven: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
-    return _run_entry(driven, NOMINAL, _UNTUNED, seeds)
+def _drive_nominal(control_task: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
+    return _run_entry(control_task, NOMINAL, _UNTUNED, seeds)
 
 
 def _compute_objective(
@@ -175,12 +175,12 @@ def _compute_objective(
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
     options, scores = task._make_options(values), []
-    for driven in task.tasks:
-        result = _run_entry(driven, task.name, options, seeds)
+    for control_task in task.tasks:
+        result = _run_entry(control_task, task.name, options, seeds)
         if result.error:
             return math.inf
-        nominal = _drive_nominal(driven, seeds)
-        scores.append(PairedDrives(nominal, result, driven.cost_floor).compute_scores())
+        nominal = _drive_nominal(control_task, seeds)
+        scores.append(PairedDrives(nominal, result, control_task.cost_floor).compute_scores())
     return -float(np.mean(scores))
 
 
@@ -217,9 +217,9 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
             all seeds is finite.
     """
     options = task._make_options(task.start)
-    for driven in task.tasks:  # what cannot be driven at all; kernels are compiled once
-        if error := _run_entry(driven, task.name, options, task.seeds[:1]).error:
-            raise ValueError(f"{task.name} in {driven.name}: {error}")
+    for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once
+        if error := _run_entry(control_task, task.name, options, task.seeds[:1]).error:
+            raise ValueError(f"{task.name} in {control_task.name}: {error}")
     study = create_study(task, search.storage, "tpe", search.seed)
     if not study.trials:
         study.enqueue_trial(task.start)
