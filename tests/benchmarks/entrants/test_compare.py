@@ -82,7 +82,7 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
     assert number["score"] == 0.0 and number["cost_vs_nominal"] == 1.0
     words = " ".join(out.split())
     assert "costs 100 % [100, 100] of nominal where both finish, and wins 50 % of these" in words
-    assert "Not publishable: 1 contest x 4 episodes" in words
+    assert "Not publishable: 1 task x 4 episodes" in words
     found = sideslip.score(mine, YAW, scenarios="gust", episodes=4, jobs=1)
     assert (found.score.value, found.cost.value, found.won.value) == (0.0, 1.0, 0.5)
     assert (found.n, found.error) == (4, "") and f"{mine} on {REFERENCE_FILTER}" in repr(found)
