@@ -44,7 +44,7 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v1",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
-        "--n-eval-envs", "4", "--eval-freq", "250000",
+        "--n-eval-envs", "4", "--eval-freq", "250000", "--out", "here",
     ]  # fmt: skip
     costs = card.evaluation["cost"]
     assert card.evaluation["salt"] and len(costs) == 3
