@@ -123,9 +123,8 @@ def make_agent(
     agent: Any = name
     if isinstance(name, str):
         if name.endswith(ZIP):
-            zips = import_module(
-                ".training.export", __name__
-            )  # by name: it needs the extra `train`
+            # by name: it needs the extra `train`
+            zips = import_module(".training.export", __name__)
             return PolicyController(env, zips.policy_from_zip(name, env, trust=trust, **options))
         if name not in AGENTS and is_policy(name):
             return PolicyController(env, policy=name, **options)

@@ -66,10 +66,9 @@ class Port(AbstractContextManager["Port"]):
             self._socket.bind((host, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            in_use = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-            reason = (
-                "is in use" if in_use else f"is none: {getattr(error, 'strerror', None) or error}"
-            )
+            in_use = getattr(error, "errno", None) == errno.EADDRINUSE
+            text = getattr(error, "strerror", None) or error
+            reason = "is in use" if in_use else f"is none: {text}"
             raise OSError(f"UDP port {port} of {host} {reason}") from None
         self.address: Address = self._socket.getsockname()
         self._sent: dict[int, int] = {}
