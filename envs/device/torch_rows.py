@@ -140,10 +140,11 @@ class _AttachedParameters:
         selected[rows] = True
         held = [(mask & ~selected, base, old, x) for mask, base, old, x in self._held]
         self._held = [entry for entry in held if entry[0].any()]
-        texts = {id(config.scenario): repr(config.scenario) for config in configs}
-        groups: dict[str, list[int]] = {}
+        texts, groups = dict[int, str](), dict[str, list[int]]()  # most rows share one scenario
         for row in rows.tolist() if parameters else ():
-            groups.setdefault(texts[id(configs[row].scenario)], []).append(row)
+            scenario = configs[row].scenario
+            text = texts.get(id(scenario)) or texts.setdefault(id(scenario), repr(scenario))
+            groups.setdefault(text, []).append(row)
         for members in groups.values():
             mask = torch.zeros_like(selected)
             mask[members] = True
