@@ -1,14 +1,14 @@
 """The tables of results in README.md and docs/results/benchmark.md, and README's sentences.
 
-`python -m sideslip.benchmarks.readme` drives README's entries in every task with steering, and
-writes the rows to docs/first.json and both tables. The columns of transfer are those of
+`python -m sideslip.benchmarks.readme` drives the entries in every task with steering, and writes
+their rows to docs/first.json and both tables. The columns of transfer are those of
 docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes.
 """
 
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +39,7 @@ README, PAGE = Path("README.md"), Path("docs/results/benchmark.md")
 ROWS, TRANSFER = Path("docs/first.json"), Path("docs/procedures.json")
 METRICS = ("cost_vs_nominal", "failure_rate", "score")
 SPEEDS = dict(zip(TITLES, ("18-28 km/h", "60-90 km/h", "70-110 km/h"), strict=True))
-ENTRIES: Mapping[str, Sequence[tuple[str, str]]] = {
+ENTRIES: dict[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", JOINT), ("distill-coms-steering", JOINT)],
     "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", JOINT)],
@@ -50,7 +50,11 @@ ENTRIES: Mapping[str, Sequence[tuple[str, str]]] = {
     "`two-dof` on `exact-kf` (tie-vision), motors alone": [("two-dof", REFERENCE_FILTER)],
     "no control": [("none", "")],
 }
-"""The lines of the tables, and who stands for each: of a policy the one of the task's car."""
+"""The lines of README's table, and who stands for each: of a policy the one of the task's car."""
+PAGE_ENTRIES = ENTRIES | {
+    "policy on late samples alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
+}
+"""The lines of the page's tables."""
 _BEST, _TUNED = "`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`"
 _FAST = "road", LIMIT  # tiers of the passenger car
 _PROCEDURES = {"distill-car-steering": "policy on joint"}
@@ -60,7 +64,7 @@ _TRANSFER = {
 }
 """Columns of transfer: scenario, metric, factor and format."""
 _RIVAL = (REFERENCE_CONTROLLER, "ratio")  # against whom costs are paired there
-EPISODES, _DOUBLED_EPISODES = 32, 16  # a task
+EPISODES, _DOUBLED_EPISODES = 64, 32  # a task
 _DOUBLED = ", ranges doubled"
 
 
@@ -72,7 +76,7 @@ def _measure_entries(
 ) -> list[ResultRow]:
     """Drive the entries and nominal in every scored task with steering; return their rows."""
     policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
-    pairs = [(NOMINAL, ""), *(pair for pairs in ENTRIES.values() for pair in pairs)]
+    pairs = [(NOMINAL, ""), *(pair for pairs in PAGE_ENTRIES.values() for pair in pairs)]
     salt, rows = salt or make_salt(), list[ResultRow]()
     for changes, episodes in (({}, EPISODES), ({"world": _double_ranges()}, _DOUBLED_EPISODES)):
         cases = [
@@ -178,16 +182,19 @@ def _make_task_table(rows: Sequence[ResultRow]) -> str:
     """Make the table by task: a line a task, a column an entry, with 95 % intervals."""
     cells = _Cells(rows)
     lines = [
-        [task.scenario, *(cells.format(task.name, pairs, True) for pairs in ENTRIES.values())]
+        [task.scenario, *(cells.format(task.name, pairs, True) for pairs in PAGE_ENTRIES.values())]
         for task in _list_tasks()
     ]
-    return format_table(lines, list(ENTRIES))
+    return format_table(lines, list(PAGE_ENTRIES))
 
 
 def _make_doubled_table(rows: Sequence[ResultRow]) -> str:
     """Make the table of the world whose ranges are doubled: a line an entry, a column a tier."""
     cells, heads = _Cells(rows), [f"tier {tier}{_DOUBLED}" for tier in TITLES]
-    lines = [[name, *(cells.format(x, ENTRIES[name], True) for x in heads)] for name in ENTRIES]
+    lines = [
+        [name, *(cells.format(x, pairs, True) for x in heads)]
+        for name, pairs in PAGE_ENTRIES.items()
+    ]
     return format_table(lines, heads)
 
 

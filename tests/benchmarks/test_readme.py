@@ -70,7 +70,7 @@ def test_a_task_has_a_line_with_intervals() -> None:
     cost = ResultRow("control", task.name, "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12)
     rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
     (line,) = (x for x in readme._make_task_table(rows).splitlines() if "50 [" in x)
-    assert line.startswith(f"| {task.scenario} |") and line.endswith("| 50 [40, 60] (7) |")
+    assert line.startswith(f"| {task.scenario} |") and "| 50 [40, 60] (7) |" in line
 
 
 def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
