@@ -226,6 +226,8 @@ def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
         The configurations.
     """
     base: Any = env.unwrapped
+    if hasattr(base, "row_configs"):
+        return list(base.row_configs)
     return [base.config] if hasattr(base, "config") else base.get_attr("config")
 
 
@@ -237,6 +239,18 @@ def _iterate_wrappers(env: Any) -> Iterator[Any]:
         yield from _iterate_wrappers(inner["venv"] if "venv" in inner else env.env)  # noqa: SIM401
     for child in (*inner.get("envs", ()), *filter(None, [inner.get("vector_env")])):
         yield from _iterate_wrappers(child)
+
+
+def has_foreign_wrapper(env: Any) -> bool:
+    """Check whether a wrapper may change observations or actions.
+
+    Args:
+        env: Env with its wrappers.
+
+    Returns:
+        True if one is not known, or declared, to be transparent.
+    """
+    return not all(map(_is_transparent, _iterate_wrappers(env)))
 
 
 def _is_transparent(wrapper: Any) -> bool:

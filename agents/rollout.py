@@ -1,9 +1,11 @@
 """The episode loop, and an episode as a table of every signal with its unit."""
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +18,8 @@ from ..envs.numerics import require_extra
 from ..envs.numerics.primitives import Scalar
 from ..envs.record import Array, Log, concatenate
 from ..envs.validation import short_repr
-from .env_info import CarEnv, CarVectorEnv
+from ..envs.vehicle.parameters import Vehicle
+from .env_info import CarEnv, CarVectorEnv, has_foreign_wrapper
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +69,7 @@ def iterate_steps(
             "builds one from a name"
         )
     obs, info = env.reset(seed=seeds, options=options)
+    _check_full_scale(env, agent)
     running = np.ones(getattr(env, "num_envs", 1), np.bool_)
     action, state, start = np.zeros(env.action_space.shape or (1,), np.float32), None, running
     yield EpisodeStep(obs, info, action, 0.0, False, False, running)
@@ -76,6 +80,18 @@ def iterate_steps(
         yield EpisodeStep(obs, info, action, reward, terminated, truncated, running)
         start = np.atleast_1d(np.logical_or(terminated, truncated))
         running = running & ~start
+
+
+def _check_full_scale(env: CarEnv | CarVectorEnv, agent: Any) -> None:
+    """Raise ValueError for an agent whose actions have another full scale than the car."""
+    designed, car = getattr(agent, "full_scale", None), getattr(env.unwrapped, "vehicle", None)
+    if not (isinstance(designed, float) and isinstance(car, Vehicle)):
+        return
+    if not math.isclose(designed, car.yaw_moment_limit, rel_tol=1e-9):
+        raise ValueError(
+            f"the agent's full scale is {designed:g} N m, the car's {car.yaw_moment_limit:g}: "
+            "make the agent for an env that has this vehicle from the start"
+        )
 
 
 def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tuple[Array, Array]:
@@ -157,8 +173,9 @@ class Rollout:
 
     @property
     def cost(self) -> float:
-        """The episode's cost J: minus the return."""
-        return float(-self.columns["reward"].sum())
+        """The episode's cost J: minus the env's own return."""
+        costs = self.columns.get("cost", -self.columns["reward"])  # a wrapper may change rewards
+        return float(costs.sum())
 
     @property
     def failed(self) -> bool:
@@ -262,17 +279,20 @@ def rollout(
         info = step.info | {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
         info["y_l"] = motion.y + base.vehicle.preview * (motion.psi - motion.theta)
         info |= {"X": motion.X, "Y": motion.Y}  # y_l: tie-vision (4)
+        info = {x: value for x, value in info.items() if isinstance(value, Real | np.number)}
         info.pop("is_success", None)
         rows.append([*map(float, (*info.values(), step.reward, *step.action, *step.obs))])
         records.append(base.record)
     names, width = [*info, "reward"], len(step.action)
     names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
-    names += [f"obs_{entry.name}" for entry in layout]
+    has_layout = not has_foreign_wrapper(env)  # else entries have no name and no unit
+    entries = {f"obs_{entry.name}": entry.unit for entry in layout} if has_layout else {}
+    names += list(entries) or [f"obs_{i}" for i in range(step.obs.size)]
     table = np.array(rows).T
     # wrappers may put a prefix before beta's estimates in `info`
     estimates = {name: "rad" for name in names if name.endswith(("beta_hat", "beta_std"))}
     units = {name: _INFO_UNITS.get(name, "-") for name in names} | estimates
-    units |= {f"obs_{entry.name}": entry.unit for entry in layout}
+    units |= entries
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
     t = record.ticks * record.dt  # the truth between rows is interpolated

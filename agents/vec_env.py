@@ -102,9 +102,10 @@ class _VecEnvRow:
         mask = np.arange(self._env.num_envs) == self._i
         seeds: Any = [seed if is_row else None for is_row in mask]
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
-        obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
+        obs, infos = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
         base: Any = self._env.unwrapped
-        return obs[self._i], make_info(base.engine.arrays.reports[self._i].tolist())
+        (info,) = _split_infos(infos, [self._i])
+        return obs[self._i], make_info(base.engine.arrays.reports[self._i].tolist()) | info
 
     def is_wrapped(self, wrapper_class: type) -> bool:
         """Return whether a layer has this class, or is the vector twin of it."""

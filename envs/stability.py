@@ -86,8 +86,9 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     adds 0.00025 s2 ((N_z(t) - N_z(t - 10 ms))/(10 ms N_max))^2.
 
     ## Episode end
-    `terminated`: the car spun (sideslip above 0.5 rad), left the road's width or the driver's lane,
-    or a number is not finite. `truncated`: the scenario's duration is over (there is no TimeLimit).
+    `terminated`: the car spun (sideslip above 0.5 rad, not backing up), left the road's width or
+    the driver's lane, or a number is not finite. `truncated`: the scenario's duration is over
+    (there is no TimeLimit).
 
     ## Info
     `t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost, failure, is_success`

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..envs.record import FAST, PACKET, Array
-from ..envs.recordings.dialect import LATENCIES, SENSORS, SLOW_QUANTITIES
+from ..envs.recordings.dialect import LATENCIES, SENSORS, SLOW_QUANTITIES, TRUTH
 from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
 from ..envs.recordings.tables import find_offset, parse_column_name
 from ..envs.sensors.link import SlowSensor
@@ -80,6 +80,13 @@ class Stream:
             raise ValueError(f"{', '.join(twice)} comes twice among {', '.join(channels)}")
         if latencies := [name for name in LATENCIES.values() if name in quantities]:
             raise ValueError(f"{latencies[0]}: no channel, for a sample that is pushed has come")
+        if strange := [name for name in quantities if name in ("time", *TRUTH)]:
+            raise ValueError(f"{strange[0]} is no sensor's channel")
+        if kinds := [x for x in channels if x.casefold().endswith(("_held", "_interpolated"))]:
+            raise ValueError(f"{kinds[0]}: what is pushed is a sample, neither held nor made")
+        gps, *more = SENSORS["gps"]
+        if gps not in quantities and (extra := [name for name in more if name in quantities]):
+            raise ValueError(f"{extra[0]} is used beside {gps} alone")
         lacking = [name for name in SENSORS["camera"] if name not in quantities]
         if 0 < len(lacking) < len(SENSORS["camera"]):
             raise ValueError(f"a camera's sample has both values; no channel of {lacking[0]}")
@@ -95,6 +102,8 @@ class Stream:
             if quantity == "steer":
                 factor, shift = factor * wires.gain, wires.offset
             latency = wires.latency.get(_find_wire(quantity), 0.0)
+            if not latency < memory:
+                raise ValueError(f"{name} is {latency:g} s late: memory {memory:g} s is too short")
             self._channels[name] = place, factor, shift, latency
         self.dt, self.counts = dt, {"outside": 0}
         self._places = {name: place for place, name in enumerate(quantities)}

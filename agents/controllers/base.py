@@ -202,7 +202,7 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
         TypeError: It is no number.
         ValueError: The number is out of range.
     """
-    if not isinstance(value, Real):
+    if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} is a number, got {value!r}")
     if not 0.0 <= value < math.inf or (value == 0.0 and not allow_zero):
         rule = "number of zero or more" if allow_zero else "positive number"

@@ -109,7 +109,7 @@ def read_normalisation(
         raise ValueError(f"the normaliser is of another observation than the network's {n_inputs}")
     prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
     scale = 1.0 / np.sqrt(stats.var + normaliser.epsilon)
-    return stats.mean, np.where(stats.var > 2.0 * prior, scale, 0.0), normaliser.clip_obs
+    return stats.mean, np.where(stats.var > 1.01 * prior, scale, 0.0), normaliser.clip_obs
 
 
 class RewardScale:

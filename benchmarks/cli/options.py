@@ -144,6 +144,8 @@ def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+        if name in options:
+            raise ValueError(f"option {name} is there twice")
         options[name] = value
         with suppress(json.JSONDecodeError):
             options[name] = json.loads(value)

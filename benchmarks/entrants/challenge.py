@@ -162,6 +162,8 @@ class ComparisonRequest:
             check_choice("env", self.env_id, _IDS)
         if len(self.seeds or range(self.episodes)) < 2:
             raise ValueError("an interval needs two episodes or more")
+        if len(set(self.seeds or ())) < len(self.seeds or ()):
+            raise ValueError("a seed stands twice: its drives would count as independent")
         if self.fresh and not self.files:
             raise ValueError("fresh seeds follow the files of the entries, and there is none")
         if self.salt:

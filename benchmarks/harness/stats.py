@@ -149,7 +149,7 @@ def mean_share(values: Array) -> Estimate:
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
     odds = interval(values, lambda x, axis: ratio_of_means(x, 1.0 - x, axis))
-    return Estimate(*(x / (1.0 + x) for x in odds))
+    return Estimate(*(x / (1.0 + x) for x in np.maximum(odds, 0.0)))
 
 
 def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
@@ -13,7 +15,7 @@ from ..harness.drives import SETTLED
 from ..harness.results import Suite
 from .identify import IdentificationResult, identify, make_suite
 from .quality import TRUTH, make_remarks, make_warnings
-from .suite import corners, replay
+from .suite import Settings, corners, replay
 from .validate import make_validation_table
 
 _FITTED, _NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
@@ -120,10 +122,18 @@ def replay_file(
     remarks += make_remarks(logs)
     settings = {"noise": wires.noise} | settings
     settings["emulated"] = not any(part.slow for part in logs)
+    present = {name for part in logs for name in part.slow}
+    for name in ("course_rate", "delay", "bias_deg") if present else ():
+        if settings.get(name, getattr(Settings, name)) != getattr(Settings, name):
+            raise ValueError(f"{name} is of an emulated course; the log has slow sensors itself")
+    if absent := sorted({"camera", "gps"} & wires.latency.keys() - present):
+        remarks.append(f"The latency of {absent[0]} is not used: the log has no such sensor.")
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
-    suite, *others = [replay(part, design, **settings) for part in parts]
+    suites = [replay(part, design, **settings) for part in parts]
+    times = [part.time[-1] - part.time[0] for part in parts]
+    suite = suites.pop(longest := int(np.argmax(times)))  # whose verdict is the file's
     settings["stiffness_factor"] = factor
-    others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
+    others = suites + [corners(part, car, **settings) for part in parts if "beta" in part.truth]
     for other in others:
         suite.rows += other.rows
         suite.tables += other.tables
@@ -132,6 +142,9 @@ def replay_file(
     urgent, remarks = _split_urgent(remarks)
     suite.text = "\n\n".join([suite.text, *remarks])
     suite.warnings = urgent + make_warnings(logs, design)
+    if suites:
+        text = f"the verdict is of the longest of {len(parts)} parts, "
+        suite.warnings.append(f"{text}{times[longest]:.0f} of {sum(times):.0f} s")
     if unknown:
         suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
     if any(text.startswith(TRUTH) for text in suite.warnings):

@@ -1,5 +1,6 @@
 """Configuration of an environment, checked, and of an episode, packed for the kernels."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -196,6 +197,13 @@ def _apply_stamp_range(sensor: SlowSensor, low: float, high: float) -> SlowSenso
     return dataclasses.replace(sensor, delays=delays, jitter=sensor.jitter + (high - low))
 
 
+def _replace_parameters(car: Vehicle, changes: Mapping[str, float], tier: str) -> Vehicle:
+    """Replace parameters by a scenario's; a scored one's yield to what a car states itself."""
+    fields = (x for x in dataclasses.fields(car) if tier and x.default is not dataclasses.MISSING)
+    stated = {x.name for x in fields if x.default != getattr(car, x.name)}
+    return car.replace(**{name: value for name, value in changes.items() if name not in stated})
+
+
 def _check_later_start(scenario: Scenario) -> None:
     """Raise ValueError for a scenario whose manoeuvre cannot begin later."""
     starts = scenario.range("initial_beta") + scenario.range("initial_gamma")
@@ -246,6 +254,7 @@ class EnvConfig:
     lead_in: float = 0.0  # s
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "slow_changes", copy.deepcopy(self.slow_changes))
         check_choice("sensors", self.sensors, SENSOR_SETS)
         if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
             names = [entry.name for entry in dataclasses.fields(self)]
@@ -312,8 +321,8 @@ class EnvConfig:
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
         """Pack all that a reset does not draw; motion (len(Motion),) is NaN where it is default."""
-        vehicle = vehicle.replace(**scenario.vehicle)
-        nominal = self.nominal.replace(**scenario.nominal)
+        vehicle = _replace_parameters(vehicle, scenario.vehicle, scenario.tier)
+        nominal = _replace_parameters(self.nominal, scenario.nominal, scenario.tier)
         world, n = self.world, int(self.control_period)
         if self.strict:
             for part in (scenario, vehicle, nominal, world):

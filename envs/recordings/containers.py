@@ -33,6 +33,9 @@ _BAG = re.compile(rb"\x89MCAP|SQLite format 3")
 _LONGEST_STEP_BACK = 0.25  # s, by which frames of a bus may come out of order
 _LONGEST_LATENCY = 5.0  # s; beyond it a bag's log has another clock than its headers
 DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
+_NO_VALUE = re.compile(
+    r"\b(sna|n/?a|err(or)?|fault|init)\b|(un|not ?)avail|invalid|not.?valid", re.I
+)
 _ARITHMETIC = re.compile(
     r"(?:[\d\s.+\-*/^(),]|\bX1?\b|(?<=\d)e|\b(?:sin|cos|tan|exp|log|sqrt|abs)\b)*", re.I
 )
@@ -239,7 +242,7 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
             units[label] = find_unit(signal.unit or "")
         if wanted:
             messages[message.frame_id, message.is_extended_frame] = message, wanted
-    remarks, seen_ids, n_short, cut = [], set[int](), 0, ""
+    remarks, seen_ids, n_short, n_absent, cut = [], set[int](), 0, 0, ""
     buses: dict[tuple[int, bool], set[object]] = {}
     try:
         frames = getattr(can, reader)(path)
@@ -253,6 +256,7 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
             message, wanted = messages[key]
             buses.setdefault(key, set()).add(frame.channel)
             try:
+                raw = message.decode(bytes(frame.data), decode_choices=False, scaling=False)
                 decoded = message.decode(bytes(frame.data), decode_choices=False)
             except DecodeError:
                 decoded = {}
@@ -260,7 +264,10 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
                 n_short += 1
                 continue
             for name, label in wanted.items():
-                if name in decoded:  # a multiplexed one is not in every frame
+                choices = message.get_signal_by_name(name).choices or {}
+                if name in decoded and _NO_VALUE.search(str(choices.get(raw[name], ""))):
+                    n_absent += 1
+                elif name in decoded:  # a multiplexed one is not in every frame
                     channels[label].stamps.append(frame.timestamp)
                     channels[label].values.append(float(decoded[name]))
     except Exception as error:  # of python-can anything, where a file is damaged
@@ -269,6 +276,8 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
         cut = str(error) or type(error).__name__
     if cut:
         remarks.append(f"WARNING: the trace is cut or damaged, and read up to there: {cut}.")
+    if n_absent:
+        remarks.append(f"{n_absent} values that {dbc} calls not available are left out.")
     if n_short:
         remarks.append(f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.")
     for (number, _), names_of_buses in buses.items():

@@ -169,6 +169,7 @@ KINDS = ("fresh", "held", "interpolated")
 LONGEST_GAP = 1.0  # s between values of a fast quantity that are joined by a line
 _COMPLETE = 0.75  # of the rows, above which a quantity is one of every row
 _SHUFFLED = 0.05  # of the rows, which step back in time
+_WRAP = 0.25  # s, by which a quantity's clock steps back where it began anew
 _MIN_INTERVALS = 5  # between samples, from which their period is found
 
 
@@ -205,6 +206,15 @@ def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: boo
     is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
     if not (is_merged or (is_shuffled and not is_strict)):
         return []
+    for name in set(needed) - {"time"} if is_merged else ():
+        rows = np.flatnonzero(np.isfinite(values[name]))
+        steps = np.diff(time[rows])
+        if 0 < np.count_nonzero(steps < -_WRAP) <= 0.001 * len(steps):
+            row = int(rows[np.argmin(steps) + 1])
+            raise ValueError(
+                f"time steps back by {-steps.min():.6g} s at row {row + 1}, within {name}: the "
+                "clock wrapped or began anew; read the parts one by one"
+            )
     order = np.argsort(time, kind="stable")
     values.update({name: column[order] for name, column in values.items()})
     return [f"Time steps back in {n_back} of {len(time)} rows: they were sorted by it."]

@@ -25,6 +25,7 @@ _SAMPLED = {  # column of the record: quantity of the log
 }
 _INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command", "curvature")
 _GAPS = {*TRUTH, *SLOW_QUANTITIES}  # need not be known in every row
+_SLOW_ROWS = 0.011  # s, rows so far apart that half of one counts
 _GAP = 1.5  # steps of time
 _STILL = 1e-3  # of a step of time
 _DRIFT = 1e-4  # of the log's length
@@ -38,7 +39,8 @@ def _make_log(
 
     Its first tick is that of the first row, by the time from `origin` (s) on; None: from 0, or from
     a first row below it, for no tick is negative. A logged input (steering, torque, command) acts
-    from its row to the next, so it stands one row later in the record.
+    from its row to the next, so it stands one row later in the record; rows slower than 100 Hz take
+    the mean of both rows' steering.
     """
     dt = find_step(values["time"]) if dt is None else dt
     start = float(values["time"][0])
@@ -136,6 +138,10 @@ def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
             fast[0, getattr(FAST, name)] = values[name][0]
             fast[1:, getattr(FAST, name)] = values[name][:-1]
             present.add(name)
+    time = values["time"]
+    if len(time) > 1 and time[-1] - time[0] > _SLOW_ROWS * (len(time) - 1):
+        steer = values["steer"]  # sampled, not held: its mean over a row is that of both ends
+        fast[1:, FAST.steer] = 0.5 * (steer[:-1] + steer[1:])
     return fast, tuple(name for name in Fast._fields if name in present)
 
 

@@ -25,7 +25,7 @@ with require_extra("wires", "decoding NMEA needs pynmeagps"):
     from pynmeagps.nmeatypes_get import NMEA_PAYLOADS_GET
 
 DECODED = ("GLL", "GSA", "VTG", "RMC", "GNS", "GGA", "GSV", "ZDA")  # later ones overrule
-_NO_FIX = "NEMS"  # modes of GNS: none, dead reckoning, typed in, simulated
+_NO_FIX = "NEMS"  # modes: none, dead reckoning, typed in, simulated
 _VENDOR, _OTHER = "of vendors", "other"
 _RANGES = {
     "lat": (0.0, 90.0), "lon": (0.0, 180.0), "cog": (0.0, 360.0), "cogt": (0.0, 360.0),
@@ -67,9 +67,11 @@ def _read_sentence(text: bytes) -> _Sentence | None:
                 sentence.bad.append(name)
             else:
                 sentence.values[name] = value
+    modes = set(sentence.values.get("posMode", "N" if kind == "GNS" else ""))
     if kind == "GNS":
-        modes = set(sentence.values.get("posMode", "N"))
         sentence.values["quality"] = int(bool(modes - set(_NO_FIX)))
+    elif modes and modes <= set(_NO_FIX):
+        sentence.values["status"] = "V"
     if kind == "ZDA" and {"year", "month", "day"} <= sentence.values.keys():
         try:
             day = [sentence.values[name] for name in ("year", "month", "day")]

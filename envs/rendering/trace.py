@@ -47,16 +47,20 @@ class EpisodeTrace:
         self._labels: dict[str, None] = {}
 
     def add(self, report: Array, state: Array) -> None:
-        """Add a step; one that is not after the last begins a new episode.
+        """Add a step; one before the last begins a new episode, one at its time replaces it.
 
         Args:
             report: Report of the step, shape (len(StepReport),).
             state: Packed state of the car.
         """
-        if self._rows and report[REPORT.t] <= self.newest[TRACE_POINT.t]:
+        if self._rows and report[REPORT.t] < self.newest[TRACE_POINT.t]:
             self._rows, self._estimates, self._labels = [], [], {}
-        self._rows.append(np.concatenate([report[_REPORT_COLUMNS], state[_STATE_COLUMNS]]))
-        self._estimates.append({})
+        row = np.concatenate([report[_REPORT_COLUMNS], state[_STATE_COLUMNS]])
+        if self._rows and row[TRACE_POINT.t] == self.newest[TRACE_POINT.t]:
+            self._rows[-1] = row  # it did not move: another row of the env was reset
+        else:
+            self._rows.append(row)
+            self._estimates.append({})
 
     def add_estimate(self, label: str, value: float, deviation: float) -> None:
         """Add an estimate of the sideslip angle to the newest step.

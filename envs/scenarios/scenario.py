@@ -61,6 +61,8 @@ def _check_field(entry: dataclasses.Field[object], value: Any) -> None:
         if not (fits and min(value) >= 0.0):
             number = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
             raise ValueError(f"{name} is {number} times in s, zero or more, got {got}")
+        if len(counts) == 1 and value[0] >= value[1]:
+            raise ValueError(f"{name} is (from, to), from before to, got {got}")
     elif kind == Mapping[str, float]:
         _check_mapping(name, value)
     elif "plausible" in entry.metadata:
@@ -82,6 +84,8 @@ def _check_mapping(name: str, values: object) -> None:
     if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
         raise ValueError(f"{name} is a mapping of names to numbers, got {short_repr(values)}")
     known = list(Noise._fields) if name == "noise" else _PARAMETERS
+    if name == "vehicle" and "friction" in values:
+        raise ValueError("vehicle has no friction here: the scenario's `friction` is the road's")
     if unknown := sorted(key for key in values if key not in known):
         if name != "noise":
             raise TypeError(describe_unknown(f"parameter of {name}", unknown, known))
@@ -192,8 +196,9 @@ class Scenario:
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
-            if isinstance(value, list):
-                object.__setattr__(self, entry.name, tuple(value))
+            if isinstance(value, list | Mapping):  # a copy: who passed it may change it
+                kind = tuple if isinstance(value, list) else dict
+                object.__setattr__(self, entry.name, kind(value))
         try:
             for entry in dataclasses.fields(self):
                 _check_field(entry, getattr(self, entry.name))
@@ -243,7 +248,7 @@ class Scenario:
             (period is None or period >= MIN_GPS_PERIOD,
              f"gps_period is {MIN_GPS_PERIOD} s or more, got {period!r}"),
             *((self.range(name)[0] >= 0.0, f"{name} is zero or more, got {getattr(self, name)!r}")
-              for name in ("gps_latency", "camera_jitter")),
+              for name in ("gps_latency", "camera_jitter", "wind_length")),
             (0.0 <= self.camera_loss < 1.0,
              f"camera_loss is a probability below 1, got {self.camera_loss!r}"),
             (not self.camera_jitter or self.camera_delays is not None,

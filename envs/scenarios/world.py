@@ -93,6 +93,8 @@ class World:
                 raise ValueError(f"{text}, got {short_repr(value)}")
             if "plausible" in entry.metadata and entry.metadata["plausible"][0] > 0 >= ends[0]:
                 raise ValueError(f"world: {entry.name} must be positive, got {value!r}")
+        if self.moment_rate < 0.0:
+            raise ValueError(f"world: moment_rate is zero or more, got {self.moment_rate!r}")
 
     @property
     def is_ideal(self) -> bool:

@@ -39,7 +39,8 @@ def smooth(
 
     Args:
         estimator: One with gains "covariance" that listens at every tick, whatever its rule for
-            late samples, or the name of one, to be built for the log's sensors.
+            late samples, or the name of one, to be built for the log's sensors and columns; for
+            another car than the COMS `vehicle` is among the options.
         log: Recorded drive.
         lag_seconds: Lag (s), whole ticks; a tick of block i (blocks of this length) has what was
             captured before block i + 2. `math.inf` takes the whole log.
@@ -54,6 +55,7 @@ def smooth(
     """
     if isinstance(estimator, str):
         defaults: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
+        defaults["present"] = log.record.present
         estimator = make_estimator(estimator, **(defaults | options))
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")

@@ -289,6 +289,9 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         if name in WANDER:
             key = f"{name}_time"
             times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
+            if times[name] > 0.0 and f"q_{name}" in reader:
+                text = f"q_{name} is not used beside {key}, {times[name]:g} s, and {name}_sd"
+                raise ValueError(f"{reader.name}: {text}")
     return {"fast": fast, "bias_sds": biases, "bias_times": times}
 
 

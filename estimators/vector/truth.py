@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from ..wrappers.truth import STIFFNESSES, TruthEntries
+from ..wrappers.truth import STIFFNESSES, TruthEntries, check_single
 from ..wrappers.truth import TruthObservation as Single
 from .records import Mask, Observations, VectorObservation
 
@@ -35,6 +35,7 @@ class TruthObservation(VectorObservation):
     ) -> None:
         recorded = {"parameters": list(parameters), "states": list(states)}
         super().__init__(env, Single, recorded)
+        check_single(env, type(self))
         if not hasattr(env, "layout"):
             raise TypeError(
                 f"{type(env).__name__} has no layout; wrap it in "

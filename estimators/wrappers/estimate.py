@@ -351,9 +351,10 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, object]:
-        """Return a snapshot of the env and the estimator for `set_state`."""
+        """Return a snapshot of the env, step limits inside and the estimator for `set_state`."""
         inner = self.env.get_wrapper_attr("get_state")()
-        return {"env": inner, "estimator": self.estimator.get_state()}
+        steps = [limit._elapsed_steps for limit in self._find_step_limits()]
+        return {"env": inner, "steps": steps, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
@@ -362,7 +363,17 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
             snapshot: Result of `get_state`.
         """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
+        for limit, steps in zip(self._find_step_limits(), snapshot["steps"], strict=True):
+            limit._elapsed_steps = steps
         self._update_estimator().set_state(snapshot["estimator"])
+
+    def _find_step_limits(self) -> list[gym.wrappers.TimeLimit[Any, Any]]:
+        """Return the step limits between the env and here; an estimator inside has its own."""
+        layer, limits = self.env, []
+        while isinstance(layer, gym.Wrapper) and not isinstance(layer, EstimateObservation):
+            limits += [layer] if isinstance(layer, gym.wrappers.TimeLimit) else []
+            layer = layer.env
+        return limits
 
     def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""

@@ -171,6 +171,21 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
+def check_single(env: Any, kind: type) -> None:
+    """Raise ValueError where a wrapper of a kind is inside: readings would be calibrated twice.
+
+    Args:
+        env: Env or vector env, with its wrappers.
+        kind: Class of the wrapper.
+    """
+    while env is not env.unwrapped:
+        if isinstance(env, kind):
+            raise ValueError(
+                f"one {kind.__name__} takes all parameters and states; two are stacked"
+            )
+        env = env.env
+
+
 class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
@@ -187,6 +202,9 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         env: Environment with a `layout`.
         parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
         states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+
+    Raises:
+        ValueError: A name is unknown or stands twice, or another one is inside.
     """
 
     def __init__(
@@ -197,6 +215,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     ) -> None:
         RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         gym.Wrapper.__init__(self, env)
+        check_single(env, type(self))
         self._entries = TruthEntries(parameters, states, env.get_wrapper_attr("layout"))
         self.layout = self._entries.layout
         self.observation_space = make_space(self.layout)

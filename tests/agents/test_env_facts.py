@@ -14,7 +14,7 @@ from gymnasium.wrappers import vector
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.env_info import get_env_facts, get_layout
+from sideslip.agents.env_info import get_env_facts, get_layout, list_plant_kinds
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
 from sideslip.estimators.vector.truth import TruthObservation as BatchTruth
@@ -245,3 +245,9 @@ def test_what_is_no_env_of_ours_is_refused_in_one_line() -> None:
             with pytest.raises(TypeError, match=r"gym\.make\('sideslip/YawVision-v0'\)") as caught:
                 make_agent(name, env)  # type: ignore[arg-type]
             assert "\n" not in str(caught.value)
+
+
+def test_rows_of_a_native_env_show_each_plant() -> None:
+    rows = [{"base": "slalom", "tyres": tyres} for tyres in ("linear", "fiala")]
+    env = gym.make_vec("sideslip/YawFusion-v0", num_envs=2, scenario=rows)
+    assert {kind.tyres for kind in list_plant_kinds(env)} == {"linear", "fiala"}

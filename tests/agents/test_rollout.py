@@ -11,6 +11,7 @@ import pytest
 import sideslip
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import evaluate_episodes, iterate_steps
+from sideslip.estimators import EstimateObservation
 
 
 @pytest.mark.smoke
@@ -101,3 +102,24 @@ def test_a_rollout_of_many_cars_or_of_another_env_is_refused_in_one_line() -> No
             TypeError, match=r"^rollout runs one env .*evaluate_episodes runs a vector env$"
         ):
             sideslip.rollout(env)  # type: ignore[arg-type]
+
+
+def test_a_wrapper_that_changes_numbers_takes_their_names_and_leaves_the_cost() -> None:
+    def make() -> Any:
+        return gym.make("sideslip/YawFusion-v0", scenario="coms-slalom")
+
+    plain = sideslip.rollout(make(), None, seed=1)
+    scaled = sideslip.rollout(gym.wrappers.RescaleObservation(make(), -1, 1), None, seed=1)
+    assert "obs_0" in scaled.units and "obs_beta_ref_mean" not in scaled.columns
+    for wrap in (
+        lambda env: gym.wrappers.TransformReward(env, lambda reward: max(reward, -0.001)),
+        gym.wrappers.RecordEpisodeStatistics,
+    ):
+        assert sideslip.rollout(wrap(make()), None, seed=1).cost == plain.cost
+
+
+def test_an_agent_of_another_full_scale_is_refused() -> None:
+    env = EstimateObservation(gym.make("sideslip/YawFusion-v0"), "exact-kf")
+    agent = make_agent("lqr", env)
+    with pytest.raises(ValueError, match=r"full scale is .* N m, the car's 3500"):
+        sideslip.rollout(env, agent, options={"vehicle": "passenger-car"})

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, StabilityEnv
+from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv
 from sideslip.envs.record import FAST
 
 from .helpers import FULL, LINEAR, bits, play
@@ -177,3 +178,21 @@ def test_backing_up_is_no_spin() -> None:
         _, _, terminated, truncated, info = env.step(np.zeros(1, np.float32))
         over = terminated or truncated
     assert info["failure"] == 0 and info["is_success"]
+
+
+def test_what_was_passed_in_may_change_afterwards() -> None:
+    camera, car = {"period": 0.05}, {"mass": 400.0}
+    scenario = Scenario(name="mine", vehicle=car)
+    env: Any = gym.make("sideslip/YawVision-v0", scenario=scenario, camera=camera).unwrapped
+    camera["period"], car["mass"] = 0.1, 800.0
+    env.reset(seed=1, options={"friction": 0.8})
+    assert env.slow_sensors["camera"].period == 0.05 and env.vehicle.mass == 400.0
+
+
+def test_a_scored_scenario_keeps_what_a_car_states_itself() -> None:
+    car = {"base": "passenger-car", "motor_power": 80000.0, "transfer_height": 0.25}
+    for vehicle, power, height in ((car, 80000.0, 0.25), ("coms", 2000.0, 0.45)):
+        env: Any = gym.make("sideslip/YawFusion-v1", scenario="coms-slalom", vehicle=vehicle)
+        env.reset(seed=0)
+        for told in (env.unwrapped.vehicle, env.unwrapped.nominal):
+            assert (told.motor_power, told.transfer_height) == (power, height)

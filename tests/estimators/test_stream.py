@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,17 @@ def test_refused_samples(sample: Sample, message: str) -> None:
             "a camera's sample has both values; no channel of camera_y_l",
         ),
         (("speed_x_kmh", "steer_deg", "yaw_rate_radps"), {"memory": 0.0}, "got 0.01, 0.0"),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "gps_speed_mps"),
+            {},
+            "gps_speed is used beside course alone",
+        ),
+        (("speed_x_kmh", "steer_deg", "yaw_rate_radps", "time_s"), {}, "time is no sensor's"),
+        (
+            ("speed_x_kmh", "steer_deg", "yaw_rate_radps", "course_rad_held"),
+            {},
+            "course_rad_held: what is pushed is a sample",
+        ),
     ],
 )
 def test_refused_streams(channels: tuple[str, ...], options: Any, message: str) -> None:
@@ -184,3 +196,12 @@ def test_old_fixes_that_come_at_once_do_not_set_the_clock_back() -> None:
     for k in range(20):
         stream.push("course_rad", 2.0 + 0.1 * k, 0.0)
     assert stream.counts == {"outside": 20} and stream.estimate() == before
+
+
+def test_a_sample_that_comes_later_than_the_memory_is_refused_at_once(tmp_path: Path) -> None:
+    car = tmp_path / "car.toml"
+    channels = ("speed_x_mps", "steer_rad", "yaw_rate_radps", "course_rad")
+    car.write_text('base = "passenger-car"\nlatency = {gps = 1.2}\n')
+    with pytest.raises(ValueError, match=r"course_rad is 1[.]2 s late: memory 1 s is too short"):
+        Stream(car, channels)
+    Stream(car, channels, memory=2.0)

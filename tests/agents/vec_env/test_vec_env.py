@@ -160,6 +160,13 @@ def test_one_row_is_reset_alone() -> None:
     assert bits(ours.step(drawn(ours, 1))[0]) == bits(theirs.step(drawn(ours, 1))[0])
 
 
+def test_a_row_that_is_reset_alone_tells_its_estimate() -> None:
+    env = make_vec_env("sideslip/YawFusion-v0", 2, seed=3, estimator="exact-kf", scaled=False)
+    env.reset()
+    ((_, info),) = env.env_method("reset", seed=5, indices=[1])
+    assert "beta_hat" in info and env.reset_infos[0].keys() <= info.keys()
+
+
 def test_what_is_set_is_told_and_the_environment_is_not_overwritten() -> None:
     env = native(VISION, 3)
     env.set_attr("lesson", 2, indices=[0, 2])

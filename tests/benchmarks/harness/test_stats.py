@@ -50,6 +50,12 @@ def test_a_mean_share_stays_between_none_and_all() -> None:
     assert mean_share(np.ones(5)) == (1.0, 1.0, 1.0)
 
 
+def test_a_single_one_of_many_has_bounds_in_order() -> None:
+    for values in ([1.0, 0.0, 0.0, 0.0], [0.1] + [0.0] * 9):
+        share = mean_share(np.array(values))
+        assert 0.0 <= share.low <= share.value <= share.high <= 1.0
+
+
 def test_pairing_removes_what_the_seeds_share() -> None:
     rng = np.random.default_rng(2)
     shared = rng.uniform(1.0, 100.0, 50)

@@ -223,3 +223,22 @@ def test_that_most_rows_were_dropped_is_the_first_line(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"estimators": [], "figures": False}
     first, *_ = replay_file(tmp_path / "late.csv", PASSENGER_CAR, **settings).warnings
     assert "rows lack a value of yaw_rate" in first
+
+
+def test_the_verdict_is_of_the_longest_part_and_says_so(tmp_path: Path) -> None:
+    rows = read_csv(saved(tmp_path))
+    hole, path = len(rows) // 4, tmp_path / "parts.csv"
+    rows.drop(index=range(hole, hole + 70)).to_csv(path, index=False)
+    settings: dict[str, Any] = {"estimators": ["exact-kf"], "figures": False}
+    suite = replay_file(path, PASSENGER_CAR, **settings)
+    rows.iloc[hole + 70 :].to_csv(tmp_path / "long.csv", index=False)
+    assert suite.verdict == replay_file(tmp_path / "long.csv", PASSENGER_CAR, **settings).verdict
+    assert "the verdict is of the longest of 2 parts" in suite.warnings[-1]
+
+
+def test_an_option_of_an_emulated_course_is_refused_beside_a_real_one(tmp_path: Path) -> None:
+    rows = read_csv(saved(tmp_path)).assign(course_rad=math.nan)
+    rows.loc[::20, "course_rad"] = 0.1
+    rows.to_csv(tmp_path / "course.csv", index=False)
+    with pytest.raises(ValueError, match="delay is of an emulated course"):
+        replay_file(tmp_path / "course.csv", PASSENGER_CAR, delay=0.5)

@@ -306,3 +306,10 @@ def test_pandas_is_loaded_late_and_its_extra_named(
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'sideslip\[report\]'"):
         read_log(path)
+
+
+def test_slow_rows_have_the_mean_steering_of_both_ends(tmp_path: Path) -> None:
+    table = drive().iloc[::5]
+    fast = read_log(saved(table, tmp_path)).record.fast
+    steer = table["steer_rad"].to_numpy()
+    np.testing.assert_array_equal(fast[1:, FAST.steer], 0.5 * (steer[1:] + steer[:-1]))

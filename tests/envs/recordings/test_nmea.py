@@ -114,6 +114,13 @@ def test_a_fix_needs_the_consent_of_both_sentences(status: str, quality: str) ->
     assert not epoch.has_fix and counts.without_fix == 1
 
 
+@pytest.mark.parametrize(("mode", "has_fix"), [("A", True), ("E", False), ("N", False)])
+def test_dead_reckoning_is_no_fix(mode: str, has_fix: bool) -> None:
+    text = rmc().decode().partition("*")[0][1:-1] + mode
+    (epoch,), _ = decoded(sentence(text) + gga())
+    assert epoch.has_fix == has_fix
+
+
 @pytest.mark.parametrize(("knots", "quality"), [("1.9", 0), ("2.0", 1), ("", 0)])
 def test_below_one_metre_a_second_a_course_has_no_quality(knots: str, quality: int) -> None:
     (epoch,), _ = decoded(rmc(spd=knots) + gga())

@@ -205,3 +205,11 @@ def test_columns_that_are_never_known_together(tmp_path: Path) -> None:
     table["steer_rad"] = table["steer_rad"].where((table.index % 10 == 0) & (table.index > 600))
     with pytest.raises(ValueError, match="are not known at the same time"):
         read_parts(saved(table, tmp_path))
+
+
+def test_a_clock_that_wraps_in_merged_topics_is_refused(tmp_path: Path) -> None:
+    merged = pd.concat(topics(with_course())).sort_values("time_s")
+    half = 0.5 * merged["time_s"].max()
+    merged["time_s"] = merged["time_s"] % half
+    with pytest.raises(ValueError, match=r"time steps back by .* within .*: the clock wrapped"):
+        read_parts(saved(merged, tmp_path))

@@ -196,3 +196,18 @@ def test_who_draws_nothing_loads_nothing() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_a_masked_reset_leaves_the_others_charts() -> None:
+    env: Any = gym.make_vec(
+        "sideslip/YawVision-v0", num_envs=2, autoreset_mode="Disabled", render_mode="rgb_array"
+    )
+    env.reset(seed=0)
+    env.render()
+    for _ in range(5):
+        env.step(np.zeros((2, 1), np.float32))
+    before = env.render()[1]
+    env.reset(options={"reset_mask": np.array([True, False])})
+    first, second = env.render()
+    np.testing.assert_array_equal(second, before)
+    assert (first != before).any()

@@ -191,3 +191,16 @@ def test_a_reset_to_another_scenario_tells_the_filter() -> None:
     assert env.estimator.sensors["camera"].delays == (0.020, 0.015, 0.010, 0.025)
     env.reset(seed=0, options={"scenario": "sine"})
     assert env.estimator.filters[0].measured == 1
+
+
+def test_a_snapshot_has_the_step_limit_inside() -> None:
+    env = EstimateObservation(gym.make("sideslip/YawVision-v1", max_episode_steps=12))
+    env.reset(seed=0)
+    still = np.zeros(1, np.float32)
+    for _ in range(4):
+        env.step(still)
+    snapshot = env.get_state()
+    for _ in range(5):
+        env.step(still)
+    env.set_state(snapshot)
+    assert [env.step(still)[3] for _ in range(8)] == [False] * 7 + [True]
