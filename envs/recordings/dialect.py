@@ -53,16 +53,14 @@ def read_text(
 ) -> tuple["pd.DataFrame", list[str], list[str]]:
     """Read a text table in any dialect.
 
+    Raises ValueError for a binary file, and where header and rows differ in length.
+
     Args:
         data: Content of the file.
         is_wanted: Whether a column's name is looked for; such names identify the header.
 
     Returns:
-        The table, whose names may repeat; the units of its columns, "" for unknown ones; and a
-        sentence that describes the dialect, unless it is plain CSV.
-
-    Raises:
-        ValueError: For a binary file, and where header and rows differ in length.
+        The table, whose names may repeat, its units ("" for unknown ones), remarks on its dialect.
     """
     import pandas as pd
 
@@ -87,12 +85,9 @@ def read_text(
         i for i, row in rows.items()
         if abs(len(row) - width) <= 1 and 2 * sum(map(bool, row)) >= len(row)
         and not any(map(_NUMBER.fullmatch, row))
-    ]  # fmt: skip
-    best, other = (
-        [i for i in lines_group if any(map(is_wanted, rows[i]))]
-        for lines_group in (header_lines, () if header_lines else rows)
-    )
-    header_line = (best or header_lines or other or list(rows))[0]
+    ] or list(rows)  # fmt: skip
+    best = (i for i in header_lines if any(map(is_wanted, rows[i])))
+    header_line = next(best, header_lines[0])
     header, body_rows = rows[header_line], {i: row for i, row in rows.items() if i > header_line}
     if any(header[width:]) or any(any(row[len(header) :]) for row in body_rows.values()):
         raise ValueError(
@@ -193,14 +188,13 @@ def find_samples(
     Returns:
         Sentences on what was done.
     """
-    remarks = _sort_rows(values, needed, is_strict)
-    remarks += _keep_samples(values, kinds)
+    remarks = _sort_rows(values, needed, is_strict) + _keep_samples(values, kinds)
     return remarks + _align_clocks(values, needed)
 
 
 def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
     time = values["time"]
-    n_back = int(np.count_nonzero(np.diff(time) < 0.0))
+    n_back = int((np.diff(time) < 0.0).sum())
     is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
     is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
     if not (is_merged or (is_shuffled and not is_strict)):
