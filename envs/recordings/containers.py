@@ -8,6 +8,7 @@ import io
 import re
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,20 +54,13 @@ class LogTable(NamedTuple):
     remarks: list[str]  # sentences on how the file was read
 
 
-class _Channel(NamedTuple):
-    """Samples of a channel: stamps (s) and values, and how late they came (s) where that is known.
+@dataclass
+class _Channel:
+    """Samples of a channel; a long trace costs 16 or 24 bytes a sample."""
 
-    Arrays of doubles, so that a long trace costs 16 or 24 bytes a sample.
-    """
-
-    stamps: "array[float]"
-    values: "array[float]"
-    late: "array[float]"
-
-    @classmethod
-    def make(cls) -> "_Channel":
-        """Make an empty one."""
-        return cls(array("d"), array("d"), array("d"))
+    stamps: "array[float]" = field(default_factory=lambda: array("d"))  # s
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+    late: "array[float]" = field(default_factory=lambda: array("d"))  # s, where that is known
 
 
 def _join_channels(
@@ -94,7 +88,8 @@ def read_table(
 ) -> LogTable:
     """Read a log's columns, a file's kind recognised by its beginning.
 
-    Raises FileNotFoundError, ValueError for a file that is no table, ImportError without an extra.
+    Raises FileNotFoundError, ImportError without an extra, and ValueError, which does not name the
+    file, for one that is no table.
 
     Args:
         source: Path of a file or of a ROS 2 bag's folder, or the table itself.
@@ -113,12 +108,12 @@ def read_table(
         raise FileNotFoundError(f"{path}: there is no such file")
     is_folder, head = path.is_dir(), b""
     if is_folder and not (path / "metadata.yaml").is_file():
-        raise ValueError(f"{path}: expected a file, found a folder")
+        raise ValueError("expected a file, found a folder")
     if not is_folder:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
         if not head.strip():
-            raise ValueError(f"{path}: the file is empty")
+            raise ValueError("the file is empty")
     try:
         if head.startswith(b"MDF "):
             return _read_mdf(path, is_wanted, mapping.get(DBC, ""))
@@ -138,7 +133,7 @@ def read_table(
     except Exception as error:  # of a library anything, where a file is damaged
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
-        raise ValueError(f"{path}: expected {_CONTAINERS}, but {reason:.300}") from None
+        raise ValueError(f"expected {_CONTAINERS}, but {reason:.300}") from None
 
 
 def _make_table(
@@ -158,18 +153,14 @@ def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
             import h5py
 
         with h5py.File(path) as file:
-            loaded = {name: np.asarray(x) for name, x in file.items() if hasattr(x, "dtype")}
-            vectors = {name: x.squeeze() for name, x in loaded.items()}
+            vectors = {n: np.asarray(x).squeeze() for n, x in file.items() if hasattr(x, "dtype")}
     else:
         from scipy.io import loadmat
 
         vectors = loadmat(path, squeeze_me=True, simplify_cells=True)
-    columns = {
-        name: values
-        for name, values in vectors.items()
-        if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiub"
-    }
-    lengths = [len(values) for values in columns.values()]
+    arrays = {name: x for name, x in vectors.items() if isinstance(x, np.ndarray)}
+    columns = {n: x for n, x in arrays.items() if x.ndim == 1 and x.dtype.kind in "fiub"}
+    lengths = list(map(len, columns.values()))
     common_length = max(set(lengths), key=lengths.count, default=0)
     return pd.DataFrame({name: x for name, x in columns.items() if len(x) == common_length})
 
@@ -242,11 +233,11 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
                 if short.count(label) > 1:
                     both = [x for x in names if x.endswith(f".{label}")]
                     raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
-            wanted[signal.name], channels[label] = label, _Channel.make()
+            wanted[signal.name], channels[label] = label, _Channel()
             units[label] = find_unit(signal.unit or "")
         if wanted:
             messages[message.frame_id, message.is_extended_frame] = message, wanted
-    remarks, seen_ids, n_short, cut = [], set[int](), 0, ""
+    seen_ids, n_short, cut = set[int](), 0, ""
     buses: dict[tuple[int, bool], set[object]] = {}
     try:
         frames = getattr(can, reader)(path)
@@ -274,13 +265,12 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
         if not any(channel.stamps for channel in channels.values()):
             raise
         cut = str(error) or type(error).__name__
-    if cut:
-        remarks.append(f"WARNING: the trace is cut or damaged, and read up to there: {cut}.")
-    if n_short:
-        remarks.append(f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.")
-    for (number, _), names_of_buses in buses.items():
-        if len(names_of_buses) > 1:
-            text = join_names(sorted(map(str, names_of_buses)))
+    damage = f"the trace is cut or damaged, and read up to there: {cut}"
+    shortage = f"{n_short} frames are shorter than {dbc} says, and left out"
+    remarks = [f"WARNING: {text}." for text, is_so in ((damage, cut), (shortage, n_short)) if is_so]
+    for (number, _), bus_names in buses.items():
+        if len(bus_names) > 1:
+            text = join_names(sorted(map(str, bus_names)))
             raise ValueError(f"0x{number:x} is on several buses: {text}; write a trace of one")
     sent = [message for message in database.messages if message.frame_id in seen_ids]
     if seen_ids and not sent:
@@ -321,11 +311,11 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
         from rosbags.rosbag2 import Reader
 
     mapping = {name: label for name, label in mapping.items() if name != DBC}
-    channels = {label: _Channel.make() for label in mapping.values()}
+    channels = {label: _Channel() for label in mapping.values()}
     fields: dict[str, list[str]] = {}
     for label in channels:
-        topic, _, field = label.partition(":")
-        fields.setdefault(topic, []).append(field)
+        topic, _, name = label.partition(":")
+        fields.setdefault(topic, []).append(name)
     decoders: dict[int, Callable[[bytes], Any]] = {}
     with Reader(path) as reader:
         topics = sorted({connection.topic for connection in reader.connections})
@@ -337,15 +327,15 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
                 decoders[connection.id] = _make_decoder(connection)
             message = decoders[connection.id](data)
             captured = _read_stamp(message) or logged
-            for field in fields[connection.topic]:
-                channel = channels[f"{connection.topic}:{field}"]
-                channel.values.append(_read_field(message, connection.topic, field))
+            for name in fields[connection.topic]:
+                channel = channels[f"{connection.topic}:{name}"]
+                channel.values.append(_read_field(message, connection.topic, name))
                 channel.stamps.append(1e-9 * captured)
                 channel.late.append(1e-9 * (logged - captured))
     columns = {label: (x.stamps, x.values) for label, x in channels.items()}
     longest = max((max(map(abs, x.late)) for x in channels.values() if x.late), default=0.0)
     for name, label in mapping.items():
-        stamps, _, late = channels[label]
+        stamps, late = channels[label].stamps, channels[label].late
         for sensor, (first, *_) in SENSORS.items() if longest <= _LONGEST_LATENCY else ():
             if name.startswith(f"{first}_") and any(late):
                 columns.setdefault(f"{LATENCIES[sensor]}_s", (stamps, late))

@@ -1,7 +1,6 @@
 """The dialect of a text table, the samples among a table's values, and metres on the earth.
 
-A dialect is encoding, separator, decimal mark, header and units. A sensor's samples are found among
-held or interpolated values. Metres are those of the tangent plane of WGS 84.
+A dialect is encoding, separator, decimal mark, header and units. Metres are of WGS 84's tangents.
 """
 
 import csv
@@ -96,8 +95,8 @@ def read_text(
         )
     units, skipped = [""] * len(header), []
     for i, row in body_rows.items():
-        known = sum(map(bool, map(find_unit, row))), sum(map(bool, row))
-        is_units = 0 < known[1] <= 2 * known[0] and not any(map(_NUMBER.fullmatch, row))
+        n_units, n_filled = sum(map(bool, map(find_unit, row))), sum(map(bool, row))
+        is_units = 0 < n_filled <= 2 * n_units and not any(map(_NUMBER.fullmatch, row))
         if len(row) > 1 and not is_units:
             break
         units = [*map(find_unit, row), *units[len(row) :]] if is_units else units
@@ -144,11 +143,10 @@ def _find_encoding(data: bytes) -> str:
 
 
 def _split_line(line: str, separator: str) -> list[str]:
+    entries = line.split() if separator == " " else line.split(separator)
     if '"' in line:
-        line_fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    else:
-        line_fields = line.split() if separator == " " else line.split(separator)
-    return [field.strip() for field in line_fields]
+        entries = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return list(map(str.strip, entries))
 
 
 Mask = npt.NDArray[np.bool_]
@@ -241,11 +239,10 @@ def find_sampling(values: Array) -> tuple[str, float]:
     Returns:
         "held", "interpolated" or "", and the period of the samples (rows), 0 for "".
     """
-    for kind, places in (("held", np.flatnonzero(np.diff(values))), ("interpolated", None)):
-        places = _find_knots(values) if places is None else places
-        if period := _find_period(np.diff(places)):
-            return kind, period
-    return "", 0.0
+    if period := _find_period(np.diff(np.flatnonzero(np.diff(values)))):
+        return "held", period
+    period = _find_period(np.diff(_find_knots(values)))
+    return "interpolated" if period else "", period
 
 
 def _find_knots(values: Array) -> npt.NDArray[np.int64]:
@@ -306,8 +303,8 @@ def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str
             moved_rows = np.flatnonzero(known[name] & (places < len(rows)))
             values[name] = np.full(len(rows), np.nan)
             values[name][places[moved_rows]] = column[moved_rows]
-    needed_columns = [joined[n] for n in joined.keys() - TRUTH]
-    complete_rows = np.flatnonzero(np.isfinite([*needed_columns, rows]).all(0))
+    columns = [joined[n] for n in joined.keys() - TRUTH]
+    complete_rows = np.flatnonzero(np.isfinite([*columns, rows]).all(0))
     if not len(complete_rows):
         raise ValueError(f"{base}, {', '.join(joined)} are not known at the same time")
     used = slice(complete_rows[0], complete_rows[-1] + 1)

@@ -128,8 +128,7 @@ def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
             present.add(name)
     for name in _INPUTS:
         if name in values:
-            fast[0, getattr(FAST, name)] = values[name][0]
-            fast[1:, getattr(FAST, name)] = values[name][:-1]
+            fast[:, getattr(FAST, name)] = np.append(values[name][:1], values[name][:-1])
             present.add(name)
     return fast, tuple(name for name in Fast._fields if name in present)
 
@@ -150,9 +149,7 @@ def make_packets(
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     absent = np.full(len(values["time"]), np.nan)
     for sensor, names in SENSORS.items():
-        if not np.isfinite(values.get(names[0], np.nan)).any():
-            continue
-        known = np.flatnonzero(np.isfinite(values[names[0]]))
+        known = np.flatnonzero(np.isfinite(values.get(names[0], absent)))
         if sensor == "camera":  # a filter takes both values or none
             known = known[np.isfinite(values.get(names[1], absent)[known])]
         if not len(known):
@@ -166,16 +163,11 @@ def make_packets(
         late = np.nan_to_num(values.get(LATENCIES[sensor], absent)[known]) / dt
         late = np.maximum(np.ceil(late - _STILL), 0.0)  # no estimator has it before it came
         packets.append(make_packet_rows(sensor, ticks, ticks + late, columns, quality))
-        rows = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
-        clocks[sensor] = SlowSensor(
-            period=rows * dt,
-            delays=(float(late.min()) * dt,),
-            phase=(first + int(known[0])) % rows * dt,
-            jitter=float(np.ptp(late)) * dt,
-        )
-    all_packets = np.concatenate(packets)
-    order = np.lexsort((all_packets[:, PACKET.sensor], all_packets[:, PACKET.arrived]))
-    return all_packets[order], clocks
+        n = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
+        phase, delays = (first + int(known[0])) % n * dt, (float(late.min()) * dt,)
+        clocks[sensor] = SlowSensor(n * dt, delays, phase, jitter=float(np.ptp(late)) * dt)
+    rows = np.concatenate(packets)
+    return rows[np.lexsort((rows[:, PACKET.sensor], rows[:, PACKET.arrived]))], clocks
 
 
 def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
@@ -224,16 +216,16 @@ def read_parts(
     Returns:
         Whole drives, and sentences on what was done.
     """
-    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
     label = title = name_log(source)
     if isinstance(source, str | Path):  # the file's with its folder's
         title = f"{Path(source).resolve().parent.name}/{Path(source).stem}"
-    gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
-    known = ~np.any(list(gaps.values()), axis=0)
-    elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
-    is_used = known & (elapsed >= start) & (elapsed < (math.inf if end is None else end))
-    count = int(np.count_nonzero(~known))
     try:
+        values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
+        gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
+        known = ~np.any(list(gaps.values()), axis=0)
+        elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
+        is_used = known & (elapsed >= start) & (elapsed < (math.inf if end is None else end))
+        count = int(np.count_nonzero(~known))
         if count > len(known) / 2:
             names = ", ".join(name for name, gap in gaps.items() if gap.any())
             lack = f"{count} of {len(known)} rows lack a value of {names}"

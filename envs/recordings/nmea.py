@@ -1,8 +1,7 @@
 """NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
 
-Fields have the forms and conversions of pynmeagps (needs the extra `wires`). Its parser of whole
-sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a tunnel),
-while here that field alone is left out. Degrees from north and knots do not leave this file.
+Fields have the forms of pynmeagps (extra `wires`), whose parser of sentences would lose one for a
+bad field ("0NaN" in a tunnel). Degrees from north and knots do not leave this file.
 """
 
 import math

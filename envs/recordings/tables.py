@@ -25,10 +25,8 @@ _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
 _ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
 _ACCELERATION = {"mps2": 1.0, "g": GRAVITY}
-_LENGTH = {"m": 1.0}
-_TORQUE = {"nm": 1.0}
-_NUMBER = {"count": 1.0}
-_CURVATURE = {"radpm": 1.0}
+_LENGTH, _TORQUE = {"m": 1.0}, {"nm": 1.0}
+_NUMBER, _CURVATURE = {"count": 1.0}, {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -58,16 +56,13 @@ def _make_column_name(quantity: str) -> str:
 
 
 def parse_column_name(name: str) -> tuple[str, float, float]:
-    """Parse a column's name.
+    """Parse a column's name; ValueError for one that is none of ours.
 
     Args:
         name: Name in lower case, unit included.
 
     Returns:
         Quantity, factor to SI units, and what is added then (pi / 2 rad for a course from north).
-
-    Raises:
-        ValueError: The name is none of ours.
     """
     if name in _NAMES:
         return _NAMES[name]
@@ -133,24 +128,19 @@ def read_columns(
         source, lambda name: name.casefold() in wanted or bool(_match_column(name, "")), mapping
     )
     remarks = [*table.remarks]
-    try:
-        columns = _find_columns(table, mapped, remarks)
-        if missing := [_make_column_name(name) for name in needed if name not in columns]:
-            raise ValueError(
-                f"no column {' nor '.join(missing)}; the log has {join_names(table.names)}; "
-                f"--map {missing[0]}=COLUMN names one"
-            )
-        if len(table.frame) < 2:
-            rows = "no rows" if table.frame.empty else "one row"
-            raise ValueError(f"the log has {rows}; a drive needs two or more")
-        values = {}
-        for quantity, (place, name) in columns.items():
-            column = _convert_column(table, place, name, remarks)
-            if quantity in needed or not np.isnan(column).all():
-                values[quantity] = column
-        _check_complete(values, ["time"])
-    except ValueError as error:
-        raise ValueError(f"{name_log(source)}: {error}") from None
+    columns = _find_columns(table, mapped, remarks)
+    if missing := [_make_column_name(name) for name in needed if name not in columns]:
+        has = f"the log has {join_names(table.names)}; --map {missing[0]}=COLUMN names one"
+        raise ValueError(f"no column {' nor '.join(missing)}; {has}")
+    if len(table.frame) < 2:
+        rows = "no rows" if table.frame.empty else "one row"
+        raise ValueError(f"the log has {rows}; a drive needs two or more")
+    values = {}
+    for quantity, (place, name) in columns.items():
+        column = _convert_column(table, place, name, remarks)
+        if quantity in needed or not np.isnan(column).all():
+            values[quantity] = column
+    _check_complete(values, ["time"])
     kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
     return values, {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}, remarks
 
@@ -176,12 +166,9 @@ def read_quantities(
         Quantities by name, shape (n,) each, and sentences on how they were read.
     """
     values, kinds, remarks = read_columns(source, mapping, needed)
-    try:
-        remarks += find_samples(values, needed, kinds, gaps is not None)
-        if gaps is not None:
-            _check_complete(values, [name for name in values if name not in gaps])
-    except ValueError as error:
-        raise ValueError(f"{name_log(source)}: {error}") from None
+    remarks += find_samples(values, needed, kinds, gaps is not None)
+    if gaps is not None:
+        _check_complete(values, [name for name in values if name not in gaps])
     return values, remarks
 
 
@@ -231,7 +218,7 @@ def _find_columns(
         match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = parse_column_name(name)[0] if name else ""
+            quantity = _NAMES[name][0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -242,19 +229,15 @@ def _find_columns(
         name_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
         if unit not in ("", "count", name_unit):
             if level:
-                raise ValueError(
-                    f"{label} has the unit {unit} in the file; --map {quantity}_{unit}={label} or "
-                    f"--map {name}={label} says which it is"
-                )
+                rule = f"--map {quantity}_{unit}={label} or --map {name}={label} says which it is"
+                raise ValueError(f"{label} has the unit {unit} in the file; {rule}")
             remarks.append(f"{label} is read as {name}, though its unit in the file is {unit}.")
         for other, alias in others:
             if alias != name:
                 raise ValueError(f"{quantity} is given twice, as {name} and {alias}")
             if not table.frame.iloc[:, place].equals(table.frame.iloc[:, other]):
-                raise ValueError(
-                    f"{label} is given twice, in columns {place + 1} and {other + 1}, with other "
-                    "values; rename or delete one"
-                )
+                where = f"in columns {place + 1} and {other + 1}, with other values"
+                raise ValueError(f"{label} is given twice, {where}; rename or delete one")
             remarks.append(f"{label} is given twice, with the same values.")
         columns[quantity] = place, name
     return columns
@@ -294,6 +277,6 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
         text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
         if is_none[row]:
             expected = "a number" + " with a decimal point alone" * ("," in text)
-        place_text = f"column {label!r}, row {row + 1}"
-        raise ValueError(f"{place_text}: expected {expected}, got {short_repr(text)}")
+        got = f"expected {expected}, got {short_repr(text)}"
+        raise ValueError(f"column {label!r}, row {row + 1}: {got}")
     return values
