@@ -1,8 +1,7 @@
 """The picture of a car: the road, a close-up and strip charts over time.
 
-The close-up has its nose to the right and shows velocity and sideslip angle, tyre forces in their
-friction circles, motor torques and wind. The charts show truth, references and estimates with their
-standard deviation.
+The close-up has its nose to the right: velocity, tyre forces in their friction circles, torques and
+wind. The charts show truth, references and estimates with their standard deviation.
 """
 
 import math
@@ -108,16 +107,14 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
     canvas.draw_text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
     canvas.set_clip(box)
     for line in strip.lines:
-        if line.deviation is not None:
-            is_known = np.isfinite(line.values) & np.isfinite(line.deviation)
-            t, middle, std = line.t[is_known], line.values[is_known], line.deviation[is_known]
-            if len(t) > 1:
-                edges = to_pixels(t, middle + std), to_pixels(t, middle - std)[::-1]
-                shade = mix_colours(line.colour, "#FFFFFF", 0.25)
-                canvas.draw_polygon(np.concatenate(edges), shade)
+        std = np.full_like(line.t, np.nan) if line.deviation is None else line.deviation
+        is_known = np.isfinite(line.values + std)
+        edges = [to_pixels(line.t, line.values + sign * std)[is_known] for sign in (1.0, -1.0)]
+        if len(edges[0]) > 1:
+            shade = mix_colours(line.colour, "#FFFFFF", 0.25)
+            canvas.draw_polygon(np.concatenate([edges[0], edges[1][::-1]]), shade)
     for line in strip.lines:
-        is_known = np.isfinite(line.values)
-        points = to_pixels(line.t[is_known], line.values[is_known])
+        points = to_pixels(line.t, line.values)[np.isfinite(line.values)]
         if len(points) > 1:
             canvas.draw_line(points, line.colour, line.width, _DASH * line.dashed)
         if len(points) and not line.dashed:
@@ -127,9 +124,8 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
 
 def _find_nice_limit(limit: float) -> float:
     """Find the next of 1, 2, 3, 5, 10 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(limit))
-    candidates = (factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0))
-    return next(candidate for candidate in candidates if candidate >= limit - 1e-9)
+    limits = 10.0 ** math.floor(math.log10(limit)) * np.array([1.0, 2.0, 3.0, 5.0, 10.0])
+    return float(limits[limits >= limit - 1e-9][0])
 
 
 _GREEN = PALETTE[2]
@@ -225,7 +221,7 @@ def _draw_directions(
     canvas.draw_line(make_ray(reference, 138.0), INK, 1.0, (4.0, 3.0))
     for angle, colour in estimates.values():
         canvas.draw_line(make_ray(angle, 132.0), colour, 2.0)
-    canvas.draw_arrow(*make_ray(beta, 122.0), INK, 3.0)
+    canvas.draw_arrow(centre, make_ray(beta, 122.0)[1], INK, 3.0)
     canvas.draw_disc(centre, 4.0, INK)
     canvas.draw_disc(centre, 1.8, "#FFFFFF")
 
