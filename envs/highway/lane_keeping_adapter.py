@@ -145,8 +145,9 @@ class KeepingEnv(PlantEnv):
         **options: Any,
     ) -> None:
         self.plant: _KeepingPlant = _KeepingPlant(render_mode)
-        fixed = {"steering": True, "reference": "zero-slip", "control_period": control_period}
-        super().__init__(sensors, KEEPING, make_keeping_vehicle(), **fixed | options)
+        options = {"steering": True, "reference": "zero-slip", **options}
+        car = make_keeping_vehicle()
+        super().__init__(sensors, KEEPING, car, control_period=control_period, **options)
 
     def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
         if options:

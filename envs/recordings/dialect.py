@@ -171,11 +171,10 @@ def find_samples(
     """Reduce a table to its samples, in the rows of the fastest needed quantity, in place.
 
     Rows that are shuffled, or of which none has all needed quantities, are sorted by time. A slow
-    sensor's column that repeats or interpolates its samples keeps these alone: a held one was
-    captured in the first row of its run, linear interpolation shows them as the knots. Either is
-    believed only where they have one period. A fast quantity that comes at regular gaps is
-    interpolated, up to `LONGEST_GAP`; rows at the ends where it is unknown are left out. A slow
-    sample between the rows moves to the next: no estimator may have it before it was captured.
+    sensor's column that repeats or interpolates its samples keeps these alone, where they have one
+    period: the first of each run of held ones, or the knots of the lines. A fast quantity that
+    comes at regular gaps is interpolated, up to `LONGEST_GAP`, but not at the ends. A slow sample
+    between the rows moves to the next: no estimator may have it before it was captured.
 
     Args:
         values: Quantities by name, (n,) each, angles in rad; NaN where unknown.

@@ -93,18 +93,16 @@ class Canvas:
         for point in scaled if thick > 4 else ():
             pygame.draw.circle(self._large, colour, point, thick / 2)
 
-    def draw_disc(
-        self, centre: Points, radius: float, colour: str, width: float | None = None
-    ) -> None:
+    def draw_disc(self, centre: Points, radius: float, colour: str, width: float = 0.0) -> None:
         """Draw a circle.
 
         Args:
             centre: Its centre (px), shape (2,).
             radius: Its radius (px), to the middle of the line.
             colour: Its colour.
-            width: Width of the line (px); None fills the circle.
+            width: Width of the line (px); 0 fills the circle.
         """
-        thick = 0 if width is None else max(round(_OVERSAMPLING * width), 1)
+        thick = max(round(_OVERSAMPLING * width), 1) if width else 0
         place, outer = _scale_points(np.atleast_2d(centre))[0], _OVERSAMPLING * radius + thick / 2
         pygame.draw.circle(self._large, colour, place, outer, thick)
 

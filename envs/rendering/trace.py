@@ -44,7 +44,6 @@ class EpisodeTrace:
     def __init__(self) -> None:
         self.rows: list[Array] = []  # the truth, shape (len(TracePoint),) each
         self._estimates: list[dict[str, tuple[float, float]]] = []  # of each row, by label
-        self._labels: dict[str, None] = {}
 
     def add(self, report: Array, state: Array) -> None:
         """Add a step; one that is not after the last begins a new episode.
@@ -54,7 +53,7 @@ class EpisodeTrace:
             state: Packed state of the car.
         """
         if self.rows and report[REPORT.t] <= self.rows[-1][TRACE_POINT.t]:
-            self.rows, self._estimates, self._labels = [], [], {}
+            self.rows, self._estimates = [], []
         self.rows.append(np.concatenate([report[_REPORT_COLUMNS], state[_STATE_COLUMNS]]))
         self._estimates.append({})
 
@@ -66,7 +65,6 @@ class EpisodeTrace:
             value: Sideslip angle (rad).
             deviation: Standard deviation (rad).
         """
-        self._labels[label] = None
         self._estimates[-1][label] = value, deviation
 
     def select_since(self, t: float, max_points: int = 400) -> tuple[Array, dict[str, Array]]:
@@ -83,9 +81,10 @@ class EpisodeTrace:
         first = int(np.searchsorted(times, t))
         step = max((len(times) - first) // max_points, 1)
         chosen = range(len(times) - 1, first - 1, -step)[::-1]
+        labels = dict.fromkeys(label for by_label in self._estimates for label in by_label)
         estimates = {
             label: np.array([self._estimates[k].get(label, _UNKNOWN) for k in chosen])
-            for label in self._labels
+            for label in labels
         }
         return np.array([self.rows[k] for k in chosen]), estimates
 

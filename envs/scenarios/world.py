@@ -99,9 +99,7 @@ class World:
         return self == IDEAL
 
     def scale(self, group: str, factor: float) -> "World":
-        """Scale the ranges of a group about the ideal: 0 takes its errors away, 2 doubles them.
-
-        Lengths, periods and times of an error stay: its amplitude alone is scaled.
+        """Scale a group's amplitudes about the ideal: 0 takes its errors away, 2 doubles them.
 
         Args:
             group: Name in `GROUPS`.
@@ -145,15 +143,13 @@ WorldSource = str | Mapping[str, Any] | World
 def make_world(source: WorldSource) -> World:
     """Make a world from its name, a mapping of fields or a world itself.
 
+    Raises TypeError for an unknown field, and ValueError for an unknown name or a bad value.
+
     Args:
         source: Name in `WORLDS`; mapping of fields, over another world under `base`; or a `World`.
 
     Returns:
         The world.
-
-    Raises:
-        TypeError: For an unknown field or another kind of source.
-        ValueError: For an unknown name or a value out of place.
     """
     if isinstance(source, World):
         return source

@@ -1,7 +1,6 @@
 """Pictures of the road: markings, bends, roll and pitch, shadow, wear, blur and noise.
 
-Each pixel has the road's brightness, averaged over the pixel's footprint on the road's plane. Needs
-the extra `vision`.
+Each pixel has the road's brightness averaged over its footprint. Needs the extra `vision`.
 """
 
 from dataclasses import dataclass, fields

@@ -207,9 +207,6 @@ class LaneFinder:
         near: Distance ahead of the car where the search begins (m).
         far: Distance ahead where it ends (m).
         view: Limits beyond which the lane counts as lost; None for no limits.
-
-    Attributes:
-        rows_ahead: Distance ahead of each row that is searched (m), shape (rows,).
     """
 
     def __init__(
@@ -227,7 +224,7 @@ class LaneFinder:
         self._scale = scale = camera.size[0] / WORKING_WIDTH
         self._mount = _CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
-        self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
+        self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))  # m
         self._y = np.arange(_SEARCHED, -_SEARCHED, -_CELL)
         pixels = camera.project_points(self.rows_ahead[:, None], self._y)
         self._visible = np.isfinite(pixels[..., 0])

@@ -44,17 +44,13 @@ class Film:
 
     Args:
         path: Path of the file.
-
-    Attributes:
-        frame_count: Number of frames by the file's header.
-        rate: Frames per second.
     """
 
     def __init__(self, path: "str | os.PathLike[str]") -> None:
         _check_file(path)
         self._reader = cv2.VideoCapture(str(path))
-        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0
+        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)  # of the header
+        self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0  # frames a second
         if (first := self._read_frame()) is None:
             raise ValueError(f"{path}: this is no film that can be read")
         self._buffer = [first]
