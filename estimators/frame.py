@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..envs.record import Log
-    from ..envs.recordings.tables import LogSource
+    from ..envs.recordings.containers import LogSource
 
 _HEALTH_TIME = 0.05  # s, after which the filter is asked whether it is healthy
 

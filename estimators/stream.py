@@ -13,7 +13,7 @@ import numpy as np
 from ..envs.record import FAST, PACKET, Array
 from ..envs.recordings.dialect import LATENCIES, SENSORS, SLOW_QUANTITIES, TRUTH
 from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
-from ..envs.recordings.tables import find_offset, parse_column_name
+from ..envs.recordings.tables import parse_column_name
 from ..envs.sensors.link import SlowSensor
 from ..envs.vehicle.parameters import VehicleSource, make_vehicle
 from .core.record import FilterRecords
@@ -73,7 +73,7 @@ class Stream:
         memory: float = 1.0,
     ) -> None:
         parsed = {name: parse_column_name(name.casefold()) for name in channels}
-        quantities = [quantity for quantity, _ in parsed.values()]
+        quantities = [quantity for quantity, _, _ in parsed.values()]
         if missing := [name for name in NEEDED[1:] if name not in quantities]:
             raise ValueError(f"no channel of {', '.join(missing)} among {', '.join(channels)}")
         if twice := [name for name in dict.fromkeys(quantities) if quantities.count(name) > 1]:
@@ -97,8 +97,7 @@ class Stream:
             raise ValueError("a stream takes accelerations of the centre of gravity: no at.accel")
         self._at = wires.at
         self._channels: dict[str, tuple[int, float, float, float]] = {}
-        for place, (name, (quantity, factor)) in enumerate(parsed.items()):
-            shift = find_offset(name.casefold())
+        for place, (name, (quantity, factor, shift)) in enumerate(parsed.items()):
             if quantity == "steer":
                 factor, shift = factor * wires.gain, wires.offset
             latency = wires.latency.get(_find_wire(quantity), 0.0)

@@ -29,7 +29,7 @@ from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resoluti
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-    from ...envs.recordings.tables import LogSource
+    from ...envs.recordings.containers import LogSource
 
 FILTER = "joint"
 _SCREEN_ROWS = 12  # findings on the screen; all are in the report

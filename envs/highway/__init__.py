@@ -1,7 +1,6 @@
 """Our car in highway-env's road networks, among its vehicles; and its lane keeping as our record.
 
 `traffic` has the networks and the vehicles, `env` the environment `sideslip/Highway-v0`,
-`lane_keeping_adapter` the adapter around highway-env's `lane-keeping-v0`. highway-env's y axis
-points to the right and its angles turn that way: every number is mirrored once, where it crosses
-into or out of this room.
+`lane_keeping_adapter` the adapter of `lane-keeping-v0`. highway-env's y axis points to the right:
+every number is mirrored once, where it crosses into or out of this room.
 """

@@ -86,27 +86,21 @@ class HighwayEnv(StabilityEnv):
         super().__init__(sensors, adapted, vehicle, reference=reference, **options)
         if self.config.lead_in:
             raise ValueError("lead_in: the vehicle ahead does not wait, so an episode has none")
-        if road == "curved" and self.control_period > _MAX_PERIOD:
-            raise ValueError(
-                f"control_period is {self.control_period} ticks; road {road!r} bends, and the lane "
-                f"is found once a step: {_MAX_PERIOD} ticks at most"
-            )
+        if road == "curved" and (n := self.control_period) > _MAX_PERIOD:
+            rule = f"the lane is found once a step: {_MAX_PERIOD} ticks at most"
+            raise ValueError(f"control_period is {n} ticks; road {road!r} bends, and {rule}")
         self._traffic: Traffic | None = None
 
     def _adapt_scenario(self, scenario: Scenario) -> Scenario:
         """Set bank and grade from the beginning; ValueError for a road of its own or no driver."""
-        defaults = Scenario(name="")
+        defaults, name = Scenario(name=""), f"scenario {scenario.name!r}"
         for field in _OWN_ROAD_FIELDS:
             if (value := getattr(scenario, field)) != getattr(defaults, field):
-                raise ValueError(
-                    f"scenario {scenario.name!r}: {field} {value!r} is of our own roads; here the "
-                    "road is highway-env's, whose bends are driven at any angle"
-                )
+                rule = "here the road is highway-env's, whose bends are driven at any angle"
+                raise ValueError(f"{name}: {field} {value!r} is of our own roads; {rule}")
         if self.hazard is not None and scenario.steering != "driver":
-            raise ValueError(
-                f"scenario {scenario.name!r}: steering {scenario.steering!r} swerves around "
-                "nothing; a hazard takes 'driver', or hazard=None"
-            )
+            rule = "swerves around nothing; a hazard takes 'driver', or hazard=None"
+            raise ValueError(f"{name}: steering {scenario.steering!r} {rule}")
         return scenario.replace(curve_start=-1000.0, curve_ramp=1.0)
 
     def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
@@ -115,9 +109,8 @@ class HighwayEnv(StabilityEnv):
             options["scenario"] = self._adapt_scenario(make_scenario(options["scenario"]))
         state = options.get("state", {})
         if isinstance(state, Mapping):
-            if fixed_names := [name for name in _FIXED_STATE if name in state]:
-                reason = f"{fixed_names[0]} is where the road begins; y may be"
-                raise ValueError(f"reset option state: {reason}")
+            if bad := [name for name in _FIXED_STATE if name in state]:
+                raise ValueError(f"reset option state: {bad[0]} is where the road begins; y may be")
             if "y" in state:
                 options["state"] = {**state, "Y": state["y"]}
         return options
@@ -125,8 +118,7 @@ class HighwayEnv(StabilityEnv):
     def _start_episode(self) -> None:
         """Make the road, its vehicles, and the driver's path around the one that brakes."""
         p, z = self._row.p, self._row.z
-        friction = 0.5 * float(p[P.car.mu] + p[P.car.mu_r])
-        speed = float(p[P.speed_profile.speed])
+        speed, friction = float(p[P.speed_profile.speed]), 0.5 * float(p[P.car.mu] + p[P.car.mu_r])
         start = TrafficStart(self._episode.vehicle, self.motion, speed, friction)
         key = int(z[Z.clock.key_low]) | int(z[Z.clock.key_high]) << 32
         self._traffic = Traffic(self.road, start, self.hazard, self.traffic, key)

@@ -62,7 +62,6 @@ class _KeepingPlant:
         self.env = LaneKeepingEnv({"simulation_frequency": rate, "policy_frequency": rate})
         self.env.render_mode = render_mode
         self.specific_force = (0.0, 0.0)
-        self.s = 0.0
 
     def start(self, seed: int) -> None:
         """Begin an episode with a seed of highway-env's environment."""
@@ -74,8 +73,7 @@ class _KeepingPlant:
         """Project the car onto highway-env's lane; the next tick is one of its own `step`."""
         self._is_full_step = True
         x, y, heading = self.env.vehicle.state[:3, 0].tolist()
-        position = locate_on_lane(self.env.lane, x, -y, -heading)
-        self.y, self.theta, self.curvature = position.y, position.theta, position.curvature
+        _, self.y, self.theta, self.curvature = locate_on_lane(self.env.lane, x, -y, -heading)
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
         """Step the car over a tick of h seconds, and integrate its place on the lane.
@@ -147,9 +145,9 @@ class KeepingEnv(PlantEnv):
         **options: Any,
     ) -> None:
         self.plant: _KeepingPlant = _KeepingPlant(render_mode)
-        fixed: dict[str, Any] = {"steering": True, "reference": "zero-slip"}
-        fixed |= {"control_period": control_period, **options}
-        super().__init__(sensors, KEEPING, make_keeping_vehicle(), **fixed)
+        options = {"steering": True, "reference": "zero-slip", **options}
+        car = make_keeping_vehicle()
+        super().__init__(sensors, KEEPING, car, control_period=control_period, **options)
 
     def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
         if options:

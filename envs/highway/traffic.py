@@ -40,13 +40,29 @@ _FAST = 60.0  # m/s, no limit
 _DIFFERENCE = 0.05  # m, of differences along a lane
 
 
-class _RoadLayout(NamedTuple):
-    """A network and the lanes that our car follows in it."""
+class _RoadLayout:
+    """A network of two lanes whose first straight lies behind our car, and its way through it."""
 
-    network: RoadNetwork
-    route: list[AbstractLane]  # our lanes, one after the other
-    side: int  # of the free lane
-    ramp: tuple[str, str, int] | None = None  # where others merge from
+    def __init__(self, side: int) -> None:
+        self.side = side  # of the free lane
+        self.network = RoadNetwork()
+        self.ramp: tuple[str, str, int] | None = None  # where others merge from
+        self.route: list[AbstractLane] = []  # our lanes, one after the other
+        self.add_straight("start", "a", _BEHIND, 0.0)
+        self.route.clear()
+
+    def list_lanes(self) -> list[tuple[float, tuple[int, int]]]:
+        """List both lanes from left to right: (offset in m to the right of ours, its lines)."""
+        left = -WIDTH if self.side > 0 else 0.0
+        return [(left, (_LINE, _DASHES)), (left + WIDTH, (_NONE, _LINE))]
+
+    def add_straight(self, a: str, b: str, start: float, end: float, y: float = 0.0) -> None:
+        """Add both lanes of a straight stretch from x = start to end, ours at y."""
+        for offset, lines in self.list_lanes():
+            ends = [start, y + offset], [end, y + offset]
+            lane = StraightLane(*ends, WIDTH, lines, speed_limit=_FAST)
+            self.network.add_lane(a, b, lane)
+            self.route += [lane] * (offset == 0.0)
 
 
 class LanePosition(NamedTuple):
@@ -60,72 +76,53 @@ class LanePosition(NamedTuple):
 
 def _make_straight(side: int) -> _RoadLayout:
     """Make two lanes straight ahead."""
-    network = RoadNetwork()
-    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
-    route = _add_straight(network, "a", "b", side, 0.0, _BEYOND)
-    return _RoadLayout(network, route, side)
+    road = _RoadLayout(side)
+    road.add_straight("a", "b", 0.0, _BEYOND)
+    return road
 
 
 def _make_curved(side: int) -> _RoadLayout:
     """Make two lanes through a bend to the left and one to the right, with circular arcs."""
-    network, route = RoadNetwork(), []
-    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
-    route += _add_straight(network, "a", "b", side, 0.0, ENTRY)
+    road = _RoadLayout(side)
+    road.add_straight("a", "b", 0.0, ENTRY)
     position, heading = np.array([ENTRY, 0.0]), 0.0
     for first, last, turn in (("b", "c", 1.0), ("c", "d", -1.0)):
         centre = position + turn * RADIUS * np.array([math.sin(heading), -math.cos(heading)])
         phase = heading + turn * 0.5 * math.pi
-        for offset, lines in _list_lanes(side):
-            radius = RADIUS + turn * offset
-            ends = phase, phase - turn * ANGLE
+        for offset, lines in road.list_lanes():
+            radius, ends = RADIUS + turn * offset, (phase, phase - turn * ANGLE)
             lane = CircularLane(centre, radius, *ends, turn < 0.0, WIDTH, lines, speed_limit=_FAST)
-            network.add_lane(first, last, lane)
-            route += [lane] * (offset == 0.0)
-        position, heading = route[-1].position(route[-1].length, 0.0), heading - turn * ANGLE
-    route += _add_straight(network, "d", "e", side, position[0], position[0] + _BEYOND, position[1])
-    return _RoadLayout(network, route, side)
+            road.network.add_lane(first, last, lane)
+            road.route += [lane] * (offset == 0.0)
+        arc = road.route[-1]
+        position, heading = arc.position(arc.length, 0.0), heading - turn * ANGLE
+    road.add_straight("d", "e", position[0], position[0] + _BEYOND, position[1])
+    return road
 
 
 def _make_merging(side: int) -> _RoadLayout:
     """Make two lanes straight ahead that others join from a ramp on the right, as on `merge-v0`."""
-    network, route = RoadNetwork(), []
-    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
-    for first, last, start, end in (("a", "b", 0.0, 200.0), ("b", "c", 200.0, 350.0)):
-        route += _add_straight(network, first, last, side, start, end)
-    route += _add_straight(network, "c", "d", side, 350.0, _BEYOND)
-    edge, sway, lines = max(offset for offset, _ in _list_lanes(side)) + WIDTH, 3.25, (_LINE, _LINE)
+    road = _RoadLayout(side)
+    road.add_straight("a", "b", 0.0, 200.0)
+    road.add_straight("b", "c", 200.0, 350.0)
+    road.add_straight("c", "d", 350.0, _BEYOND)
+    edge, sway = max(offset for offset, _ in road.list_lanes()) + WIDTH, 3.25
     far = edge + 2.0 * sway
-    style = {"line_types": lines, "forbidden": True, "speed_limit": _FAST}
-    ramp = StraightLane([_BEHIND, far], [120.0, far], **style)
+    style = {"line_types": (_LINE, _LINE), "forbidden": True, "speed_limit": _FAST}
     ends = [120.0, far - sway], [200.0, far - sway]
+    ramp = StraightLane([_BEHIND, far], [120.0, far], **style)
     bend = SineLane(*ends, sway, math.pi / 80.0, 0.5 * math.pi, **style)
-    style["line_types"] = _NONE, _LINE
-    last = StraightLane([200.0, edge], [350.0, edge], **style)
-    for first, end_node, lane in (("j", "k", ramp), ("k", "b", bend), ("b", "c", last)):
-        network.add_lane(first, end_node, lane)
-    return _RoadLayout(network, route, side, ("j", "k", 0))
+    final = StraightLane([200.0, edge], [350.0, edge], **style | {"line_types": (_NONE, _LINE)})
+    for first, last, lane in (("j", "k", ramp), ("k", "b", bend), ("b", "c", final)):
+        road.network.add_lane(first, last, lane)
+    road.ramp = ("j", "k", 0)
+    return road
 
 
 ROADS: dict[str, Callable[[int], _RoadLayout]] = {
     "straight": _make_straight, "curved": _make_curved, "merging": _make_merging,
 }  # fmt: skip
 """The function that makes each road, for the side of the free lane."""
-
-
-def _list_lanes(side: int) -> list[tuple[float, tuple[int, int]]]:
-    """List both lanes from left to right: (offset in m to the right of ours, its lines)."""
-    left = -WIDTH if side > 0 else 0.0
-    return [(left, (_LINE, _DASHES)), (left + WIDTH, (_NONE, _LINE))]
-
-
-def _add_straight(
-    network: RoadNetwork, first: str, last: str, side: int, start: float, end: float, y: float = 0.0
-) -> list[AbstractLane]:
-    """Add both lanes of a straight stretch from x = start to end, ours at y; return ours."""
-    for offset, lines in _list_lanes(side):
-        ends = [start, y + offset], [end, y + offset]
-        network.add_lane(first, last, StraightLane(*ends, WIDTH, lines, speed_limit=_FAST))
-    return [network.graph[first][last][int(side > 0)]]
 
 
 def locate_on_lane(lane: AbstractLane, X: float, Y: float, psi: float) -> LanePosition:
@@ -156,9 +153,9 @@ def locate_on_lane(lane: AbstractLane, X: float, Y: float, psi: float) -> LanePo
             offset = point - lane.position(longitudinal, 0.0)
             longitudinal += float(direction @ offset) / _compute_scale(lane, longitudinal)
             right = float(direction[0] * offset[1] - direction[1] * offset[0])
-        before, after = longitudinal - _DIFFERENCE, longitudinal + _DIFFERENCE
-        heading_change = lane.heading_at(after) - lane.heading_at(before)
-        bend = -heading_change / (2.0 * _DIFFERENCE * _compute_scale(lane, longitudinal))
+        turn = lane.heading_at(longitudinal + _DIFFERENCE)
+        turn -= lane.heading_at(longitudinal - _DIFFERENCE)
+        bend = -turn / (2.0 * _DIFFERENCE * _compute_scale(lane, longitudinal))
     lane_direction = -lane.heading_at(longitudinal)
     theta = lane_direction + 2.0 * math.pi * round((psi - lane_direction) / (2.0 * math.pi))
     return LanePosition(float(longitudinal), -float(right), float(theta), float(bend))
@@ -194,8 +191,8 @@ class Hazard:
         for name, value in vars(self).items():
             ends = list(value) if isinstance(value, list | tuple) else [value, value]
             if len(ends) != 2 or not all(map(is_finite, ends)) or not 0.0 <= ends[0] <= ends[1]:
-                rule = "is a number or (low, high) from 0 on"
-                raise ValueError(f"hazard: {name} {rule}, got {value}")
+                rule = f"{name} is a number or (low, high) from 0 on"
+                raise ValueError(f"hazard: {rule}, got {value}")
             object.__setattr__(self, name, tuple(map(float, ends)))
 
 
@@ -323,10 +320,9 @@ class Traffic:
             else:
                 index, offset = slots[i % len(slots)]
                 far = offset + math.copysign(45.0 * (i // len(slots)), offset)
-                lateral = 0.0 if index == ego else WIDTH * (index - ego)
-                position = np.array([far + random.uniform(-8.0, 8.0), lateral])
-            vehicle = IDMVehicle(self.road, position, speed=speed, target_speed=speed)
-            self.road.vehicles.append(vehicle)
+                position = np.array([far + random.uniform(-8.0, 8.0), WIDTH * (index - ego)])
+            other = IDMVehicle(self.road, position, speed=speed, target_speed=speed)
+            self.road.vehicles.append(other)
         if course.ramp is not None:
             end = course.network.graph["b"]["c"][-1]
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))

@@ -1,7 +1,6 @@
 """Environments around a plant that is not ours: our sensors, scenarios, references and cost.
 
-`PlantEnv` takes any `_Plant`, `OutsideEnv` one of CommonRoad's models, after checks
-that the model can follow scenario and reset options.
+`PlantEnv` takes any `_Plant`, `OutsideEnv` one of CommonRoad's models.
 """
 
 import dataclasses
@@ -11,16 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ..engine import step as engine
 from ..engine.layout import P, StepVariant, Z
 from ..engine.outputs import finish_step
-from ..engine.step import (
-    StepEnd,
-    check_action_range,
-    clip_action,
-    make_step_params,
-    make_step_variant,
-    write_final_state,
-)
 from ..engine.tick import StepParams, StepState, TickInputs, compute_inputs, measure_tick
 from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
 from ..numerics.jit import as_python
@@ -51,10 +43,8 @@ def _check_scenario(scenario: Scenario, model: str) -> None:
     for field in _OWN_PLANT_FIELDS:
         value = getattr(scenario, field)
         if value and value != defaults[field]:
-            raise ValueError(
-                f"{name}: {field} {value!r} is of our own plant and road; an outside plant is "
-                "what it is, on a straight and level road"
-            )
+            rule = "an outside plant is what it is, on a straight and level road"
+            raise ValueError(f"{name}: {field} {value!r} is of our own plant and road; {rule}")
     if model != "multi-body":
         if scenario.wind_height:
             wind = f"wind_height {scenario.wind_height!r} rolls the body"
@@ -65,10 +55,8 @@ def _check_scenario(scenario: Scenario, model: str) -> None:
     change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
     min_speed = scenario.range("speed")[0] + min(change, 0.0)
     if min_speed < _MIN_SPEED:
-        raise ValueError(
-            f"{name}: its speed comes down to {min_speed:.3g} m/s; the multi-body model needs "
-            f"{_MIN_SPEED} m/s or more"
-        )
+        rule = f"the multi-body model needs {_MIN_SPEED} m/s or more"
+        raise ValueError(f"{name}: its speed comes down to {min_speed:.3g} m/s; {rule}")
 
 
 def _check_options(options: Mapping[str, Any], model: str) -> None:
@@ -76,9 +64,8 @@ def _check_options(options: Mapping[str, Any], model: str) -> None:
     if "vehicle" in options:
         raise ValueError("reset option vehicle: an outside plant is its own vehicle")
     if "friction" in options and model == "single-track":
-        raise ValueError(
-            "reset option friction: the single-track model's tyres are linear and know none"
-        )
+        reason = "the single-track model's tyres are linear and know none"
+        raise ValueError(f"reset option friction: {reason}")
     state = check_mapping("reset option state", options.get("state", {}))
     for name in ("s", "y", "theta"):
         if name in state:
@@ -87,19 +74,15 @@ def _check_options(options: Mapping[str, Any], model: str) -> None:
         if state.get("phi") or state.get("phi_dot"):
             raise ValueError(f"reset option state: the {model} model has no roll")
     elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= _MIN_SPEED):
-        raise ValueError(
-            f"reset option state: v_x is {short_repr(v_x)} m/s; "
-            f"the multi-body model needs {_MIN_SPEED} or more"
-        )
+        rule = f"the multi-body model needs {_MIN_SPEED} or more"
+        raise ValueError(f"reset option state: v_x is {short_repr(v_x)} m/s; {rule}")
 
 
-_make_step_params = as_python(make_step_params)
-_make_step_variant = as_python(make_step_variant)
-_write_final_state = as_python(write_final_state)
-_compute_inputs = as_python(compute_inputs)
-_measure_tick = as_python(measure_tick)
-_compute_tick_cost = as_python(compute_tick_cost)
-_select_failure = as_python(select_failure)
+_make_step_params = as_python(engine.make_step_params)
+_make_step_variant = as_python(engine.make_step_variant)
+_write_final_state = as_python(engine.write_final_state)
+_compute_inputs, _measure_tick = as_python(compute_inputs), as_python(measure_tick)
+_compute_tick_cost, _select_failure = as_python(compute_tick_cost), as_python(select_failure)
 
 
 class _Plant(Protocol):
@@ -122,16 +105,15 @@ class PlantEnv(StabilityEnv):
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Drive one control period of the plant: `step_vehicle` with another motion."""
-        shares = clip_action(command)
+        shares = engine.clip_action(command)
         if shares[0] != shares[0]:
             return super()._advance(command)  # refuses or fails before it moves anything
-        if check_action_range(command):
+        if engine.check_action_range(command):
             warn_once(self, command)
-        row, n = self._row, self.control_period
-        variant = _make_step_variant(row.p, row.switches)
-        precompute_window(row, n, variant)
-        done = self._integrate_step(_make_step_params(row.p), variant, shares)
-        finish_step(row, n, done)
+        variant = _make_step_variant(self._row.p, self._row.switches)
+        precompute_window(self._row, self.control_period, variant)
+        done = self._integrate_step(_make_step_params(self._row.p), variant, shares)
+        finish_step(self._row, self.control_period, done)
         return done
 
     def _integrate_step(
@@ -140,10 +122,11 @@ class PlantEnv(StabilityEnv):
         """Integrate as `step.integrate_step`, with the plant's motion; return the ticks done."""
         row, plant, task = self._row, self.plant, params.task
         z, window = row.z, row.window
-        motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
-        nominal_motion = read(z, Z.nominal_motion)
-        driver, errors = float(z[Z.driver]), read(z, Z.errors)
-        state = StepState(motion, drive, None, driver, params.car, refs, nominal_motion, errors)
+        nominal_motion, driver = read(z, Z.nominal_motion), float(z[Z.driver])
+        state = StepState(
+            read(z, Z.motion), read(z, Z.drive), None, driver, params.car, read(z, Z.refs),
+            nominal_motion, read(z, Z.errors),
+        )  # fmt: skip
         tick, cost, done, is_over, failure = float(z[Z.clock.tick]), 0.0, 0, False, 0.0
         N_z, added = shares[0] * task.yaw_scale, shares[1] * task.authority
         while not is_over:
@@ -157,9 +140,8 @@ class PlantEnv(StabilityEnv):
             motion, force = state.motion, (0.0, 0.0)
             if plant.is_finite:
                 motion, force = plant.motion, plant.specific_force
-            driver, measured = _measure_tick(
-                params, motion, force, applied, state.refs, tick_inputs, variant
-            )
+            signals = motion, force, applied, state.refs, tick_inputs
+            driver, measured = _measure_tick(params, *signals, variant)
             measured = measured._replace(lost=not plant.is_finite)
             state = StepState(
                 motion, inputs.drive, None, driver, state.car, measured.refs, nominal_motion,
@@ -172,7 +154,7 @@ class PlantEnv(StabilityEnv):
             failure = _select_failure(measured.lost, tick_cost.spun, tick_cost.off)
             is_over = failure != RUNNING or tick >= task.duration or done == self.control_period
         write(z, state.motion, Z.motion)
-        end = StepEnd(failure, tick_cost.beta, measured.refs, tick, cost)
+        end = engine.StepEnd(failure, tick_cost.beta, measured.refs, tick, cost)
         _write_final_state(row, state, measured, end, task.duration)
         return done
 

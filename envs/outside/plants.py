@@ -1,13 +1,11 @@
 """Outside plants: CommonRoad's vehicle models as another truth than ours.
 
-M. Althoff and G. Wuersching, "CommonRoad: Vehicle Models", 2020: a linear single-track model, a
-single-track model that drifts (Magic Formula, wheel speeds) and a multi-body model, all of the
-same BMW 320i. They need the extra `outside`, loaded when a plant is made.
+M. Althoff and G. Wuersching, "CommonRoad: Vehicle Models", 2020: a single-track model, one that
+drifts and a multi-body model, all of a BMW 320i (extra `outside`, loaded when a plant is made).
 
 What the models lack is added here: the yaw moment as motor torques on the rear wheels of the
-multi-body model, and as N_z / I_z on the yaw acceleration of the others, which have no left and
-right wheels. Steering angles are prescribed, not sent through the models' rate limit. The
-multi-body model's axes are those of its z-down source read as y left: its labels are mirrored
+multi-body model, and as N_z / I_z on the yaw acceleration of the others. Steering angles are
+prescribed, not sent through the models' rate limit. The multi-body model's labels are mirrored
 (the wheel called left rear is on the right) and its roll has the other sign than ours.
 """
 
@@ -71,27 +69,14 @@ def make_outside_vehicle() -> Vehicle:
     body = 0.5 * (p.T_f**2 * p.K_sf + p.T_r**2 * p.K_sr) - p.K_tsf - p.K_tsr  # N m/rad
     tyres = 0.5 * (p.T_f**2 + p.T_r**2) * p.K_zt
     return Vehicle(
-        name="bmw-320i",
-        mass=p.m,
-        yaw_inertia=p.I_z,
-        front_arm=p.a,
-        rear_arm=p.b,
-        front_stiffness=-p.tire.p_ky1 * per_arm * p.b,
-        rear_stiffness=-p.tire.p_ky1 * per_arm * p.a,
-        front_track=p.T_f,
-        rear_track=p.T_r,
-        wheel_radius=p.R_w,
-        gravity_height=p.h_cg,
-        motor_torque=_MOTOR_TORQUE,
-        preview=12.0,
-        width=p.w,
-        friction=p.tire.p_dy1,
-        sprung_mass=p.m_s,
-        roll_arm=arm,
-        roll_inertia=p.I_Phi_s + p.m_s * arm**2,
+        name="bmw-320i", mass=p.m, yaw_inertia=p.I_z, front_arm=p.a, rear_arm=p.b,
+        front_stiffness=-p.tire.p_ky1 * per_arm * p.b, rear_stiffness=-p.tire.p_ky1 * per_arm * p.a,
+        front_track=p.T_f, rear_track=p.T_r, wheel_radius=p.R_w, gravity_height=p.h_cg,
+        motor_torque=_MOTOR_TORQUE, preview=12.0, width=p.w, friction=p.tire.p_dy1,
+        sprung_mass=p.m_s, roll_arm=arm, roll_inertia=p.I_Phi_s + p.m_s * arm**2,
         roll_stiffness=1.0 / (1.0 / body + 1.0 / tyres),
         roll_damping=0.5 * (p.T_f**2 * p.K_sdf + p.T_r**2 * p.K_sdr),
-    )
+    )  # fmt: skip
 
 
 class OutsidePlant(ABC):
@@ -215,10 +200,9 @@ class SingleTrack(OutsidePlant):
     def _compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
         """Compute the specific force of the state x from the path's tangent and normal."""
         rate, slip = self._compute_derivative(self.x, inputs), self.x[6]
-        tangential, normal = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
+        tangential, normal = float(rate[3]), float(self.x[3] * (rate[6] + self.x[5]))
         sine, cosine = math.sin(slip), math.cos(slip)
-        a_x, a_y = tangential * cosine - normal * sine, tangential * sine + normal * cosine
-        return float(a_x), float(a_y)
+        return tangential * cosine - normal * sine, tangential * sine + normal * cosine
 
 
 class Drift(SingleTrack):
@@ -265,9 +249,8 @@ class MultiBody(OutsidePlant):
     def _compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
         """Compute the specific force that the rolled body of the state x feels."""
         rate, x = self._compute_derivative(self.x, inputs), self.x
-        a_x = rate[3] - x[5] * x[10]
-        a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
-        return float(a_x), float(a_y)
+        a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])
+        return float(rate[3] - x[5] * x[10]), float(a_y)
 
 
 OUTSIDE_PLANTS: dict[str, type[OutsidePlant]] = {

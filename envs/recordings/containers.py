@@ -7,7 +7,8 @@ Nothing is interpolated or held here.
 import io
 import re
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,12 +17,15 @@ from numpy.typing import ArrayLike
 
 from ..numerics import require_extra
 from ..validation import join_names, short_repr
-from .dialect import find_unit, to_metres
+from .dialect import LATENCIES, SENSORS, find_unit, read_text, to_metres
 
 if TYPE_CHECKING:
     import pandas as pd
     from cantools.database.can import Database
     from rosbags.interfaces import Connection
+
+    LogSource = str | Path | pd.DataFrame
+    """File of a recorded drive, or its table in memory."""
 
 _TRACES = {  # reader of python-can, by what its files begin with
     "BLFReader": rb"LOGG",
@@ -40,6 +44,8 @@ _ARITHMETIC = re.compile(
     r"(?:[\d\s.+\-*/^(),]|\bX1?\b|(?<=\d)e|\b(?:sin|cos|tan|exp|log|sqrt|abs)\b)*", re.I
 )
 _DBC_NEEDED = "a CAN trace needs its description: --map dbc=FILE"
+_CONTAINERS = "CSV, Parquet, MATLAB, MDF, a CAN trace, a bag or VBO"
+_HEAD_BYTES = 1 << 16  # in which a file shows what it is
 
 
 class LogTable(NamedTuple):
@@ -51,20 +57,13 @@ class LogTable(NamedTuple):
     remarks: list[str]  # sentences on how the file was read
 
 
-class _Channel(NamedTuple):
-    """Samples of a channel: stamps (s) and values, and how late they came (s) where that is known.
+@dataclass
+class _Channel:
+    """Samples of a channel; a long trace costs 16 or 24 bytes a sample."""
 
-    Arrays of doubles, so that a long trace costs 16 or 24 bytes a sample.
-    """
-
-    stamps: "array[float]"
-    values: "array[float]"
-    late: "array[float]"
-
-    @classmethod
-    def make(cls) -> "_Channel":
-        """Make an empty one."""
-        return cls(array("d"), array("d"), array("d"))
+    stamps: "array[float]" = field(default_factory=lambda: array("d"))  # s
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+    late: "array[float]" = field(default_factory=lambda: array("d"))  # s, where that is known
 
 
 def _join_channels(
@@ -87,78 +86,90 @@ def _join_channels(
     return LogTable(frame.rename_axis("time_s").reset_index(), known, names, [])
 
 
-def is_bag(path: Path, head: bytes) -> bool:
-    """Check whether a path is a ROS 2 bag, or the folder of one.
+def read_table(
+    source: "LogSource", is_wanted: Callable[[str], bool], mapping: Mapping[str, str]
+) -> LogTable:
+    """Read a log's columns, a file's kind recognised by its beginning.
+
+    Raises FileNotFoundError, ImportError without an extra, and ValueError, which does not name the
+    file, for one that is no table.
 
     Args:
-        path: File or folder.
-        head: Beginning of the file.
+        source: Path of a file or of a ROS 2 bag's folder, or the table itself.
+        is_wanted: Whether a column's name is looked for.
+        mapping: Our column names to the file's; under `DBC` the description of CAN frames.
 
     Returns:
-        True if it is.
+        The table.
     """
-    return (path / "metadata.yaml").is_file() or bool(_BAG.match(head))
+    if not isinstance(source, str | Path):
+        return _make_table(source)
+    with require_extra("report", "reading a log needs pandas"):
+        import pandas as pd
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    is_folder, head = path.is_dir(), b""
+    if is_folder and not (path / "metadata.yaml").is_file():
+        raise ValueError("expected a file, found a folder")
+    if not is_folder:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+        if not head.strip():
+            raise ValueError("the file is empty")
+    try:
+        if head.startswith(b"MDF "):
+            return _read_mdf(path, is_wanted, mapping.get(DBC, ""))
+        if reader := next((name for name, text in _TRACES.items() if re.match(text, head)), ""):
+            return _read_can(path, reader, is_wanted, mapping.get(DBC, ""))
+        if is_folder or _BAG.match(head):
+            return _read_bag(path, mapping)
+        if head.startswith(b"PAR1"):
+            return _make_table(pd.read_parquet(path))
+        if head.startswith(b"MATLAB"):
+            return _make_table(_read_matlab(path, head))
+        if head.startswith(b"File created") and b"[column names]" in head:
+            return _make_table(_read_vbo(path.read_bytes()))
+        return _make_table(*read_text(path.read_bytes(), is_wanted))
+    except (MemoryError, ImportError, FileNotFoundError):
+        raise
+    except Exception as error:  # of a library anything, where a file is damaged
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
+        raise ValueError(f"expected {_CONTAINERS}, but {reason:.300}") from None
 
 
-def find_trace_reader(head: bytes) -> str:
-    """Find the reader of a CAN trace.
-
-    Args:
-        head: Beginning of the file.
-
-    Returns:
-        Name of python-can's reader, "" for another file.
-    """
-    return next((name for name, text in _TRACES.items() if re.match(text, head)), "")
+def _make_table(
+    frame: "pd.DataFrame", units: Sequence[str] = (), remarks: Sequence[str] = ()
+) -> LogTable:
+    """Make a table of all columns, whose names lose spaces at their ends."""
+    names = [str(name).strip() for name in frame.columns]
+    return LogTable(frame.set_axis(names, axis=1), [*units] or [""] * len(names), names, [*remarks])
 
 
-def read_matlab(path: Path, data: bytes) -> "pd.DataFrame":
-    """Read the numeric vectors of the commonest length from a MATLAB file of any version.
-
-    Args:
-        path: File.
-        data: Its beginning.
-
-    Returns:
-        A column a vector.
-    """
+def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
+    """Read the numeric vectors of the commonest length from a MATLAB file of any version."""
     import pandas as pd
 
-    if data.startswith(b"MATLAB 7.3"):
+    if head.startswith(b"MATLAB 7.3"):
         with require_extra("mat", "reading MATLAB 7.3 needs h5py"):
             import h5py
 
         with h5py.File(path) as file:
-            loaded = {name: np.asarray(x) for name, x in file.items() if hasattr(x, "dtype")}
-            vectors = {name: x.squeeze() for name, x in loaded.items()}
+            vectors = {n: np.asarray(x).squeeze() for n, x in file.items() if hasattr(x, "dtype")}
     else:
         from scipy.io import loadmat
 
         vectors = loadmat(path, squeeze_me=True, simplify_cells=True)
-    columns = {
-        name: values
-        for name, values in vectors.items()
-        if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiub"
-    }
-    lengths = [len(values) for values in columns.values()]
+    arrays = {name: x for name, x in vectors.items() if isinstance(x, np.ndarray)}
+    columns = {n: x for n, x in arrays.items() if x.ndim == 1 and x.dtype.kind in "fiub"}
+    lengths = list(map(len, columns.values()))
     common_length = max(set(lengths), key=lengths.count, default=0)
     return pd.DataFrame({name: x for name, x in columns.items() if len(x) == common_length})
 
 
-def read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
-    """Read the wanted channels of an MDF file; of one with CAN frames those of its description.
-
-    Args:
-        path: File.
-        is_wanted: Whether a channel's name is looked for.
-        dbc: Description of the frames, "" for none.
-
-    Returns:
-        The table.
-
-    Raises:
-        ValueError: Two wanted channels have one name, or frames lack their description.
-    """
+def _read_mdf(path: Path, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
+    """Read the wanted channels of an MDF file; of one with CAN frames those of its description."""
     with require_extra("mdf", "reading MDF needs asammdf"):
         from asammdf import MDF
 
@@ -198,24 +209,11 @@ def _check_formula(name: str, conversion: object) -> None:
         _check_formula(name, nested)
 
 
-def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
+def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str) -> LogTable:
     """Read the wanted signals of a CAN trace (BLF, ASC, candump, TRC), a stamp a frame.
 
-    A signal is called as in its description, or MESSAGE.SIGNAL, which is needed where two messages
-    share its name. Frames are read one by one: memory holds the wanted samples alone.
-
-    Args:
-        path: File.
-        reader: Name of python-can's reader.
-        is_wanted: Whether a signal's name is looked for.
-        dbc: Description of the frames (DBC, ARXML, KCD, SYM), "" for none.
-
-    Returns:
-        The table.
-
-    Raises:
-        ValueError: No description, one of another car, a name of two signals, and a trace without
-            a frame of any wanted signal.
+    A signal is called as in its description (DBC, ARXML, KCD, SYM), or MESSAGE.SIGNAL, which is
+    needed where two messages share its name. Memory holds the wanted samples alone.
     """
     with require_extra("can", "reading a CAN trace needs python-can and cantools"):
         import can
@@ -238,11 +236,11 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
                 if short.count(label) > 1:
                     both = [x for x in names if x.endswith(f".{label}")]
                     raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
-            wanted[signal.name], channels[label] = label, _Channel.make()
+            wanted[signal.name], channels[label] = label, _Channel()
             units[label] = find_unit(signal.unit or "")
         if wanted:
             messages[message.frame_id, message.is_extended_frame] = message, wanted
-    remarks, seen_ids, n_short, n_absent, cut = [], set[int](), 0, 0, ""
+    seen_ids, n_short, n_absent, cut = set[int](), 0, 0, ""
     buses: dict[tuple[int, bool], set[object]] = {}
     try:
         frames = getattr(can, reader)(path)
@@ -274,15 +272,14 @@ def read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: str
         if not any(channel.stamps for channel in channels.values()):
             raise
         cut = str(error) or type(error).__name__
-    if cut:
-        remarks.append(f"WARNING: the trace is cut or damaged, and read up to there: {cut}.")
+    damage = f"the trace is cut or damaged, and read up to there: {cut}"
+    shortage = f"{n_short} frames are shorter than {dbc} says, and left out"
+    remarks = [f"WARNING: {text}." for text, is_so in ((damage, cut), (shortage, n_short)) if is_so]
     if n_absent:
         remarks.append(f"{n_absent} values that {dbc} calls not available are left out.")
-    if n_short:
-        remarks.append(f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.")
-    for (number, _), names_of_buses in buses.items():
-        if len(names_of_buses) > 1:
-            text = join_names(sorted(map(str, names_of_buses)))
+    for (number, _), bus_names in buses.items():
+        if len(bus_names) > 1:
+            text = join_names(sorted(map(str, bus_names)))
             raise ValueError(f"0x{number:x} is on several buses: {text}; write a trace of one")
     sent = [message for message in database.messages if message.frame_id in seen_ids]
     if seen_ids and not sent:
@@ -310,34 +307,24 @@ def _load_database(dbc: str) -> "Database":
     return database
 
 
-def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], str]) -> LogTable:
+def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
     """Read the mapped fields of a ROS 2 bag, a folder or a file, or of MCAP with ROS 2 messages.
 
     A field is /TOPIC:FIELD.PART, as /imu:angular_velocity.z. A sample is captured at its header's
     stamp and arrives at the log's time, where there is a header; else both are the log's. rosbags
     hands out bytes alone: its own decoder runs text that it makes of the file's definitions.
-
-    Args:
-        path: File, or folder of a ROS 2 bag.
-        mapping: Our column names to fields.
-        sensor_of: Function from our column name to the slow sensor that has it, "" for none.
-
-    Returns:
-        The table; a column gps_latency_s or camera_latency_s says how late that sensor's came.
-
-    Raises:
-        ValueError: A topic or a field is not there, or messages are of an unknown kind.
+    A column gps_latency_s or camera_latency_s says how late that sensor's samples came.
     """
     with require_extra("bags", "reading a bag needs rosbags and mcap-ros2-support"):
         import mcap_ros2.decoder  # noqa: F401
         from rosbags.rosbag2 import Reader
 
     mapping = {name: label for name, label in mapping.items() if name != DBC}
-    channels = {label: _Channel.make() for label in mapping.values()}
+    channels = {label: _Channel() for label in mapping.values()}
     fields: dict[str, list[str]] = {}
     for label in channels:
-        topic, _, field = label.partition(":")
-        fields.setdefault(topic, []).append(field)
+        topic, _, name = label.partition(":")
+        fields.setdefault(topic, []).append(name)
     decoders: dict[int, Callable[[bytes], Any]] = {}
     with Reader(path) as reader:
         topics = sorted({connection.topic for connection in reader.connections})
@@ -349,17 +336,18 @@ def read_bag(path: Path, mapping: Mapping[str, str], sensor_of: Callable[[str], 
                 decoders[connection.id] = _make_decoder(connection)
             message = decoders[connection.id](data)
             captured = _read_stamp(message) or logged
-            for field in fields[connection.topic]:
-                channel = channels[f"{connection.topic}:{field}"]
-                channel.values.append(_read_field(message, connection.topic, field))
+            for name in fields[connection.topic]:
+                channel = channels[f"{connection.topic}:{name}"]
+                channel.values.append(_read_field(message, connection.topic, name))
                 channel.stamps.append(1e-9 * captured)
                 channel.late.append(1e-9 * (logged - captured))
     columns = {label: (x.stamps, x.values) for label, x in channels.items()}
     longest = max((max(map(abs, x.late)) for x in channels.values() if x.late), default=0.0)
     for name, label in mapping.items():
-        stamps, _, late = channels[label]
-        if (sensor := sensor_of(name)) and any(late) and longest <= _LONGEST_LATENCY:
-            columns.setdefault(f"{sensor}_latency_s", (stamps, late))
+        stamps, late = channels[label].stamps, channels[label].late
+        for sensor, (first, *_) in SENSORS.items() if longest <= _LONGEST_LATENCY else ():
+            if name.startswith(f"{first}_") and any(late):
+                columns.setdefault(f"{LATENCIES[sensor]}_s", (stamps, late))
     table = _join_channels(columns, {}, [f"{topic}:..." for topic in topics])
     if longest <= _LONGEST_LATENCY:
         return table
@@ -410,18 +398,8 @@ def _read_field(message: object, topic: str, field: str) -> float:
 _VBO_NAMES = {"time": "time_s", "velocity": "speed_x_kmh", "heading": "course_degnorth"}
 
 
-def read_vbo(data: bytes) -> "pd.DataFrame":
-    """Read a VBOX file: its time of day in s, its speed, heading and place by our names.
-
-    Args:
-        data: Content of the file.
-
-    Returns:
-        The table; other columns have the file's names.
-
-    Raises:
-        ValueError: A section is missing.
-    """
+def _read_vbo(data: bytes) -> "pd.DataFrame":
+    """Read a VBOX file: its time of day in s, its speed, heading and place by our names."""
     import pandas as pd
 
     sections = re.split(r"^\[([^\]\n]+)\]\s*$", data.decode("cp1252"), flags=re.M)

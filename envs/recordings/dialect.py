@@ -1,7 +1,6 @@
 """The dialect of a text table, the samples among a table's values, and metres on the earth.
 
-A dialect is encoding, separator, decimal mark, header and units. A sensor's samples are found among
-held or interpolated values. Metres are those of the tangent plane of WGS 84.
+A dialect is encoding, separator, decimal mark, header and units. Metres are of WGS 84's tangents.
 """
 
 import csv
@@ -53,16 +52,14 @@ def read_text(
 ) -> tuple["pd.DataFrame", list[str], list[str]]:
     """Read a text table in any dialect.
 
+    Raises ValueError for a binary file, and where header and rows differ in length.
+
     Args:
         data: Content of the file.
         is_wanted: Whether a column's name is looked for; such names identify the header.
 
     Returns:
-        The table, whose names may repeat; the units of its columns, "" for unknown ones; and a
-        sentence that describes the dialect, unless it is plain CSV.
-
-    Raises:
-        ValueError: For a binary file, and where header and rows differ in length.
+        The table, whose names may repeat, its units ("" for unknown ones), remarks on its dialect.
     """
     import pandas as pd
 
@@ -87,12 +84,9 @@ def read_text(
         i for i, row in rows.items()
         if abs(len(row) - width) <= 1 and 2 * sum(map(bool, row)) >= len(row)
         and not any(map(_NUMBER.fullmatch, row))
-    ]  # fmt: skip
-    best, other = (
-        [i for i in lines_group if any(map(is_wanted, rows[i]))]
-        for lines_group in (header_lines, () if header_lines else rows)
-    )
-    header_line = (best or header_lines or other or list(rows))[0]
+    ] or list(rows)  # fmt: skip
+    best = (i for i in header_lines if any(map(is_wanted, rows[i])))
+    header_line = next(best, header_lines[0])
     header, body_rows = rows[header_line], {i: row for i, row in rows.items() if i > header_line}
     if any(header[width:]) or any(any(row[len(header) :]) for row in body_rows.values()):
         raise ValueError(
@@ -101,8 +95,8 @@ def read_text(
         )
     units, skipped = [""] * len(header), []
     for i, row in body_rows.items():
-        known = sum(map(bool, map(find_unit, row))), sum(map(bool, row))
-        is_units = 0 < known[1] <= 2 * known[0] and not any(map(_NUMBER.fullmatch, row))
+        n_units, n_filled = sum(map(bool, map(find_unit, row))), sum(map(bool, row))
+        is_units = 0 < n_filled <= 2 * n_units and not any(map(_NUMBER.fullmatch, row))
         if len(row) > 1 and not is_units:
             break
         units = [*map(find_unit, row), *units[len(row) :]] if is_units else units
@@ -149,11 +143,10 @@ def _find_encoding(data: bytes) -> str:
 
 
 def _split_line(line: str, separator: str) -> list[str]:
+    entries = line.split() if separator == " " else line.split(separator)
     if '"' in line:
-        line_fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    else:
-        line_fields = line.split() if separator == " " else line.split(separator)
-    return [field.strip() for field in line_fields]
+        entries = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return list(map(str.strip, entries))
 
 
 Mask = npt.NDArray[np.bool_]
@@ -179,11 +172,10 @@ def find_samples(
     """Reduce a table to its samples, in the rows of the fastest needed quantity, in place.
 
     Rows that are shuffled, or of which none has all needed quantities, are sorted by time. A slow
-    sensor's column that repeats or interpolates its samples keeps these alone: a held one was
-    captured in the first row of its run, linear interpolation shows them as the knots. Either is
-    believed only where they have one period. A fast quantity that comes at regular gaps is
-    interpolated, up to `LONGEST_GAP`; rows at the ends where it is unknown are left out. A slow
-    sample between the rows moves to the next: no estimator may have it before it was captured.
+    sensor's column that repeats or interpolates its samples keeps these alone, where they have one
+    period: the first of each run of held ones, or the knots of the lines. A fast quantity that
+    comes at regular gaps is interpolated, up to `LONGEST_GAP`, but not at the ends. A slow sample
+    between the rows moves to the next: no estimator may have it before it was captured.
 
     Args:
         values: Quantities by name, (n,) each, angles in rad; NaN where unknown.
@@ -194,14 +186,13 @@ def find_samples(
     Returns:
         Sentences on what was done.
     """
-    remarks = _sort_rows(values, needed, is_strict)
-    remarks += _keep_samples(values, kinds)
+    remarks = _sort_rows(values, needed, is_strict) + _keep_samples(values, kinds)
     return remarks + _align_clocks(values, needed)
 
 
 def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
     time = values["time"]
-    n_back = int(np.count_nonzero(np.diff(time) < 0.0))
+    n_back = int((np.diff(time) < 0.0).sum())
     is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
     is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
     if not (is_merged or (is_shuffled and not is_strict)):
@@ -257,11 +248,10 @@ def find_sampling(values: Array) -> tuple[str, float]:
     Returns:
         "held", "interpolated" or "", and the period of the samples (rows), 0 for "".
     """
-    for kind, places in (("held", np.flatnonzero(np.diff(values))), ("interpolated", None)):
-        places = _find_knots(values) if places is None else places
-        if period := _find_period(np.diff(places)):
-            return kind, period
-    return "", 0.0
+    if period := _find_period(np.diff(np.flatnonzero(np.diff(values)))):
+        return "held", period
+    period = _find_period(np.diff(_find_knots(values)))
+    return "interpolated" if period else "", period
 
 
 def _find_knots(values: Array) -> npt.NDArray[np.int64]:
@@ -322,8 +312,8 @@ def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str
             moved_rows = np.flatnonzero(known[name] & (places < len(rows)))
             values[name] = np.full(len(rows), np.nan)
             values[name][places[moved_rows]] = column[moved_rows]
-    needed_columns = [joined[n] for n in joined.keys() - TRUTH]
-    complete_rows = np.flatnonzero(np.isfinite([*needed_columns, rows]).all(0))
+    columns = [joined[n] for n in joined.keys() - TRUTH]
+    complete_rows = np.flatnonzero(np.isfinite([*columns, rows]).all(0))
     if not len(complete_rows):
         raise ValueError(f"{base}, {', '.join(joined)} are not known at the same time")
     used = slice(complete_rows[0], complete_rows[-1] + 1)

@@ -16,7 +16,7 @@ from .dialect import LATENCIES, LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
 from .tables import name_log, read_quantities
 
 if TYPE_CHECKING:
-    from .tables import LogSource
+    from .containers import LogSource
 
 NEEDED = ("time", "speed_x", "yaw_rate", "steer")  # without which a log cannot be read
 _SAMPLED = {  # column of the record: quantity of the log
@@ -82,29 +82,25 @@ def make_packet_rows(
 
 
 def find_step(time: Array) -> float:
-    """Find the step of an even clock.
+    """Find the step of an even clock; ValueError, with the row, for an uneven one.
 
     Args:
         time: Time of each row (s), shape (n,).
 
     Returns:
         dt (s).
-
-    Raises:
-        ValueError: If the clock is uneven, with the row.
     """
     steps = np.diff(time)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    min_step = _STILL * typical
     for is_wrong, what in (
-        (steps < -min_step, "runs backward"),
-        (np.abs(steps) <= min_step, "stands still"),
+        (steps < -_STILL * typical, "runs backward"),
+        (np.abs(steps) <= _STILL * typical, "stands still"),
         (steps > _GAP * typical, f"jumps (a step is {typical:.6g} s)"),
     ):
         if is_wrong.any():
             row = int(np.argmax(is_wrong)) + 1
-            times = f"{time[row]:.12g} s after {time[row - 1]:.12g} s"
-            raise ValueError(f"time {what} at row {row + 1}: {times}")
+            after = f"{time[row]:.12g} s after {time[row - 1]:.12g} s"
+            raise ValueError(f"time {what} at row {row + 1}: {after}")
     dt = round(float(time[-1] - time[0]) / len(steps), 12)
     deviation = np.abs(time - time[0] - dt * np.arange(len(time)))
     if deviation.max() > dt + _DRIFT * (time[-1] - time[0]):
@@ -125,18 +121,16 @@ def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     Returns:
         Fast rows, shape (n, FAST_WIDTH), and the names.
     """
-    fast = np.zeros((len(values["time"]), FAST_WIDTH))
+    fast, present = np.zeros((len(values["time"]), FAST_WIDTH)), set()
     if not {"wheel_left", "wheel_right"} <= values.keys():
-        values = values | {"wheel_left": values["speed_x"], "wheel_right": values["speed_x"]}
-    present = set()
+        values = values | dict.fromkeys(("wheel_left", "wheel_right"), values["speed_x"])
     for name, quantity in _SAMPLED.items():
         if quantity in values:
             fast[:, getattr(FAST, name)] = values[quantity]
             present.add(name)
     for name in _INPUTS:
         if name in values:
-            fast[0, getattr(FAST, name)] = values[name][0]
-            fast[1:, getattr(FAST, name)] = values[name][:-1]
+            fast[:, getattr(FAST, name)] = np.append(values[name][:1], values[name][:-1])
             present.add(name)
     time = values["time"]
     if len(time) > 1 and time[-1] - time[0] > _SLOW_ROWS * (len(time) - 1):
@@ -161,9 +155,7 @@ def make_packets(
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     absent = np.full(len(values["time"]), np.nan)
     for sensor, names in SENSORS.items():
-        if not np.isfinite(values.get(names[0], np.nan)).any():
-            continue
-        known = np.flatnonzero(np.isfinite(values[names[0]]))
+        known = np.flatnonzero(np.isfinite(values.get(names[0], absent)))
         if sensor == "camera":  # a filter takes both values or none
             known = known[np.isfinite(values.get(names[1], absent)[known])]
         if not len(known):
@@ -177,28 +169,20 @@ def make_packets(
         late = np.nan_to_num(values.get(LATENCIES[sensor], absent)[known]) / dt
         late = np.maximum(np.ceil(late - _STILL), 0.0)  # no estimator has it before it came
         packets.append(make_packet_rows(sensor, ticks, ticks + late, columns, quality))
-        rows = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
-        clocks[sensor] = SlowSensor(
-            period=rows * dt,
-            delays=(float(late.min()) * dt,),
-            phase=(first + int(known[0])) % rows * dt,
-            jitter=float(np.ptp(late)) * dt,
-        )
-    all_packets = np.concatenate(packets)
-    order = np.lexsort((all_packets[:, PACKET.sensor], all_packets[:, PACKET.arrived]))
-    return all_packets[order], clocks
+        n = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
+        phase, delays = (first + int(known[0])) % n * dt, (float(late.min()) * dt,)
+        clocks[sensor] = SlowSensor(n * dt, delays, phase, jitter=float(np.ptp(late)) * dt)
+    rows = np.concatenate(packets)
+    return rows[np.lexsort((rows[:, PACKET.sensor], rows[:, PACKET.arrived]))], clocks
 
 
 def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
     """Compute the sideslip angle (rad) where the log knows it; 0 at a standstill."""
-    v_x, v_y = values["speed_x"], values.get("speed_y")
-    if "sideslip" in values:
-        beta = values["sideslip"]
-    elif v_y is not None:
-        beta = np.arctan2(v_y, v_x)
-    else:
+    if not TRUTH & values.keys():
         return {}
-    is_standing = np.hypot(v_x, 0.0 if v_y is None else np.nan_to_num(v_y)) <= _STANDING
+    v_x, v_y = values["speed_x"], values.get("speed_y", np.zeros(1))
+    beta = values["sideslip"] if "sideslip" in values else np.arctan2(v_y, v_x)
+    is_standing = np.hypot(v_x, np.nan_to_num(v_y)) <= _STANDING
     return {"beta": np.where(is_standing, 0.0, beta)}
 
 
@@ -226,43 +210,34 @@ def read_parts(
     time is not after that of those before, are dropped; a file of which most rows lack a value at
     irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
     clock; longer ones, and a clock that is set back by more, divide the log, and parts under
-    `_MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
-    sample lacks the sensor.
+    `_MIN_PART` s are left out. All parts have the dt of the longest. Raises ValueError where no
+    part is left, and the errors of `tables.read_columns`.
 
     Args:
-        source: Table, or its file (see `tables.CONTAINERS`). Columns are named as in
-            `tables.COLUMNS`; unknown ones are ignored.
-        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
-            `tables.parse_mapping` makes it.
+        source: Table or its file, whose known columns are named as in `tables.COLUMNS`.
+        mapping: Our column names to the log's, as `tables.parse_mapping` makes it.
         start: Time after the first row from which it is read (s).
         end: Time after the first row up to which it is read (s); None: to its end.
 
     Returns:
         Whole drives, and sentences on what was done.
-
-    Raises:
-        ValueError: For a file that is no table, a missing column, a value that is no number, and
-            where no part is left. Rows in messages count from 1 below the header.
     """
-    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
     label = title = name_log(source)
     if isinstance(source, str | Path):  # the file's with its folder's
         title = f"{Path(source).resolve().parent.name}/{Path(source).stem}"
-    gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
-    known = ~np.any(list(gaps.values()), axis=0)
-    elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
-    is_used = known & (elapsed >= start) & (elapsed < (math.inf if end is None else end))
-    count = int(np.count_nonzero(~known))
-    drop_reason = "rows lack a value and were dropped"
     try:
+        values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
+        gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
+        known = ~np.any(list(gaps.values()), axis=0)
+        elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
+        is_used = known & (elapsed >= start) & (elapsed < (math.inf if end is None else end))
+        count = int(np.count_nonzero(~known))
         if count > len(known) / 2:
             names = ", ".join(name for name, gap in gaps.items() if gap.any())
-            drop_reason = f"of {len(known)} rows lack a value of {names}"
+            lack = f"{count} of {len(known)} rows lack a value of {names}"
             if np.count_nonzero(known[1:] & known[:-1]) < np.count_nonzero(known) / 2:
-                regular = f"regular gaps up to {LONGEST_GAP:g} s could be filled"
-                raise ValueError(f"{count} {drop_reason}; {regular}")
-            remarks = [f"{WARNING_PREFIX}{count} {drop_reason} and were dropped.", *remarks]
-            count = 0
+                raise ValueError(f"{lack}; regular gaps up to {LONGEST_GAP:g} s could be filled")
+            remarks, count = [f"{WARNING_PREFIX}{lack} and were dropped.", *remarks], 0
         if np.count_nonzero(is_used) < 2:
             raise ValueError("fewer than two rows are complete, or are in the time asked for")
         pieces, done = _split_pieces({name: column[is_used] for name, column in values.items()})
@@ -274,7 +249,8 @@ def read_parts(
         logs = [_make_log(piece, title, dt, origin) for piece in pieces]
     except ValueError as error:
         raise ValueError(f"{label}: {error}") from None
-    remarks += [f"{count} {text}." for count, text in [*done, (count, drop_reason)] if count]
+    done.append((count, "rows lack a value and were dropped"))
+    remarks += [f"{count} {text}." for count, text in done if count]
     sensors = set[str]().union(*(log.slow for log in logs))
     for i, log in enumerate(logs if len(logs) > 1 else ()):
         logs[i] = dataclasses.replace(log, name=f"{log.name}, part {i + 1}")
@@ -294,23 +270,21 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     for rows in np.split(np.arange(len(time)), ends):
         newest = np.maximum.accumulate(time[rows])
         is_later = np.append(True, time[rows][1:] > newest[:-1] + 1e-3 * typical)
-        rows, dropped = rows[is_later], dropped + int(np.count_nonzero(~is_later))
+        rows, dropped = rows[is_later], dropped + int((~is_later).sum())
         if (len(ends) and time[rows[-1]] - time[rows[0]] < _MIN_PART) or len(rows) < 2:
             short += 1
             continue
-        holes += int(np.count_nonzero(np.diff(time[rows]) > 1.5 * typical))
-        piece = {name: column[rows] for name, column in values.items()}
-        pieces.append(_resample_evenly(piece, typical))
+        holes += int((np.diff(time[rows]) > 1.5 * typical).sum())
+        pieces.append(_resample_evenly({n: column[rows] for n, column in values.items()}, typical))
     if dropped > len(time) / 2:
-        rows_text = f"{dropped} of {len(time)} rows: have its stamps lost digits?"
-        raise ValueError(f"time stands still or steps back in {rows_text}")
+        text = f"stands still or steps back in {dropped} of {len(time)} rows"
+        raise ValueError(f"time {text}: have its stamps lost digits?")
     if not pieces:
-        hole = f"a hole of {MAX_HOLE:g} s"
-        raise ValueError(f"no part of the log lasts {_MIN_PART:g} s without {hole}")
-    n_backward = int(np.count_nonzero(is_backward))
+        text = f"lasts {_MIN_PART:g} s without a hole of {MAX_HOLE:g} s"
+        raise ValueError(f"no part of the log {text}")
     return pieces, [
         (dropped, "rows whose time steps back or stands still were dropped"),
-        (n_backward, "times the clock was set back: the log is divided there"),
+        (int(is_backward.sum()), "times the clock was set back: the log is divided there"),
         (holes, f"holes up to {MAX_HOLE:g} s were filled by interpolation"),
         (len(pieces) if len(pieces) > 1 else 0, "parts, between which rows are missing"),
         (short, f"parts under {_MIN_PART:g} s were left out"),

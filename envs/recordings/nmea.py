@@ -1,8 +1,7 @@
 """NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
 
-Fields have the forms and conversions of pynmeagps (needs the extra `wires`). Its parser of whole
-sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a tunnel),
-while here that field alone is left out. Degrees from north and knots do not leave this file.
+Fields have the forms of pynmeagps (extra `wires`), whose parser of sentences would lose one for a
+bad field ("0NaN" in a tunnel). Degrees from north and knots do not leave this file.
 """
 
 import math
@@ -33,6 +32,7 @@ _RANGES = {
     "numSV": (0, 999), "quality": (0, 9), "year": (1980, 9999), "month": (1, 12), "day": (1, 31),
 }  # fmt: skip
 _ANY = (-1e12, 1e12)
+_DAY = ("year", "month", "day")
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d(?:\.\d*)?)", re.ASCII)
 
 
@@ -61,20 +61,18 @@ def _read_sentence(text: bytes) -> _Sentence | None:
     initial_values = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
     sentence = _Sentence(talker, kind, initial_values, [])
     for (name, form), entry in zip(_list_forms(kind), fields, strict=False):
-        if entry:
-            value = _parse_value(name, form, entry)
-            if value is None:
-                sentence.bad.append(name)
-            else:
-                sentence.values[name] = value
+        if entry and (value := _parse_value(name, form, entry)) is None:
+            sentence.bad.append(name)
+        elif entry:
+            sentence.values[name] = value
     modes = set(sentence.values.get("posMode", "N" if kind == "GNS" else ""))
     if kind == "GNS":
         sentence.values["quality"] = int(bool(modes - set(_NO_FIX)))
     elif modes and modes <= set(_NO_FIX):
         sentence.values["status"] = "V"
-    if kind == "ZDA" and {"year", "month", "day"} <= sentence.values.keys():
+    day = [sentence.values[name] for name in _DAY if name in sentence.values]
+    if kind == "ZDA" and len(day) == len(_DAY):
         try:
-            day = [sentence.values[name] for name in ("year", "month", "day")]
             sentence.values["date"] = date(*day)
         except ValueError:
             sentence.bad.append("day")
@@ -91,13 +89,12 @@ def _apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> 
 @cache
 def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
     """List (name, form) of each field of a kind, groups written out."""
-    forms: list[tuple[str, str]] = []
+    forms: tuple[tuple[str, str], ...] = ()
     for name, form in NMEA_PAYLOADS_GET[kind].items():
-        if isinstance(form, tuple):  # (count or "None", fields): GSV has up to 4 satellites
-            forms += tuple(form[1].items()) * (form[0] if isinstance(form[0], int) else 4)
-        else:
-            forms.append((name, form))
-    return tuple(forms)
+        # a group is (count or "None", fields): GSV has up to 4 satellites
+        count, group = form if isinstance(form, tuple) else (1, {name: form})
+        forms += tuple(group.items()) * (count if isinstance(count, int) else 4)
+    return forms
 
 
 def _parse_value(name: str, form: str, text: str) -> Any:
@@ -254,12 +251,11 @@ class Decoder:
         try:
             sentence = _read_sentence(text)
         except ValueError:  # a known sentence may lack its checksum and its last two, newer fields
-            address, *fields = text.split(b",")
-            kind = address[2:].decode("ascii", "replace")
+            kind, n_fields = text.split(b",")[0][2:].decode("ascii", "replace"), text.count(b",")
             is_known = b"*" not in text and kind in DECODED
-            unchecked = is_known and len(fields) >= len(_list_forms(kind)) - 2
-            self.counts.unchecked += unchecked
-            self.counts.truncated += not unchecked
+            is_unchecked = is_known and n_fields >= len(_list_forms(kind)) - 2
+            self.counts.unchecked += is_unchecked
+            self.counts.truncated += not is_unchecked
             return []
         if sentence is None:
             self.counts.bad_checksum += 1
@@ -271,25 +267,24 @@ class Decoder:
     def _add_sentence(self, sentence: _Sentence) -> list[Epoch]:
         """Add a sentence to its epoch; a sentence without a time joins the epoch at hand."""
         talker, kind, values, _ = sentence
-        done: list[Epoch] = []
         time, existing = values.get("time"), self._parts.get(kind)
         if kind not in DECODED or (kind == "GLL" and time is None):
-            return done
+            return []
         if kind == "GSV":
             self._view[talker] = values.get("numSV", 0)
-            return done
-        values = values | {"talker": talker}
+            return []
+        values, done = values | {"talker": talker}, list[Epoch]()
         if kind in _TIMED:
             if existing and time is not None and time == self._time:
                 self.counts.repeated += 1
                 self._others |= {talker} - {existing["talker"]}
-                return done
+                return []
             if existing or (None not in (time, self._time) and time != self._time):
                 done = self._close()
         elif existing and self._sent:
             if talker not in self._others:
                 self._next[kind] = values
-            return done
+            return []
         if time is not None and "date" in values:
             self._date = values["date"].toordinal() - _EPOCH, time
         if kind == "ZDA":
@@ -299,9 +294,7 @@ class Decoder:
         kinds = self._parts.keys()
         has_hdop = "GSA" in kinds or any("HDOP" in part for part in self._parts.values())
         is_complete = kinds & {"RMC", "VTG"} and kinds & {"GGA", "GNS"} and has_hdop
-        if is_complete and not self._sent:
-            done.append(self._make_epoch())
-        return done
+        return [*done, self._make_epoch()] if is_complete and not self._sent else done
 
     def _close(self) -> list[Epoch]:
         """End the epoch at hand; return it unless it was handed out or has no position."""
@@ -317,24 +310,21 @@ class Decoder:
         known = {k: v for kind in DECODED for k, v in self._parts.get(kind, {}).items()}
         flags = [known["status"] == "A"] if "status" in known else []
         flags += [known["quality"] not in _NOT_MEASURED] if "quality" in known else []
-        latitude = _apply_sign(known, "lat", "NS", "S")
-        longitude = _apply_sign(known, "lon", "EW", "W")
-        has_fix = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
+        place = _apply_sign(known, "lat", "NS", "S"), _apply_sign(known, "lon", "EW", "W")
+        has_fix = bool(flags) and all(flags) and math.isfinite(sum(place))
         knots = known.get("spd", known.get("sogn", known.get("sogk", math.nan) / 1.852))
         speed = _KNOT * knots if has_fix else math.nan
         north = known.get("cog", known.get("cogt", math.nan)) if has_fix else math.nan
-        hdop = known.get("HDOP", 0.0)
         self._fix = t if has_fix else self._fix
         self.counts.epochs += 1
         self.counts.without_fix += not has_fix
         self.counts.without_time += math.isnan(t)
         return Epoch(
             t,
-            latitude if has_fix else math.nan,
-            longitude if has_fix else math.nan,
+            *(place if has_fix else (math.nan, math.nan)),
             math.radians(math.remainder(90.0 - north, 360.0)),
             speed,
-            hdop if hdop > 0.0 else math.nan,
+            known["HDOP"] if known.get("HDOP", 0.0) > 0.0 else math.nan,
             known.get("numSV", 0),
             sum(self._view.values()),
             int(speed >= COURSE_SPEED and math.isfinite(north)),
@@ -342,16 +332,15 @@ class Decoder:
         )
 
     def _convert_time(self, time: float) -> float:
-        day, newest_time = self._date
-        # midnight, without a date
-        day += (time < newest_time - DAY / 2) - (time > newest_time + DAY / 2)
+        day, newest = self._date
+        day += (time < newest - DAY / 2) - (time > newest + DAY / 2)  # midnight, without a date
         self._date = day, time
         self._leaps += self._in_leap and time < DAY
         self._in_leap = time >= DAY
         t = day * DAY + time + self._leaps
-        self.counts.backward += t < self._last
-        self.counts.forward += t >= self._last + HOUR and (self._last >= _FIRST or t < _FIRST)
-        self._last = t
+        last, self._last = self._last, t
+        self.counts.backward += t < last
+        self.counts.forward += t >= last + HOUR and (last >= _FIRST or t < _FIRST)
         return t
 
 

@@ -58,6 +58,8 @@ class ByteSource:
 def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
     """Make the source that a text names; nothing is opened before it is iterated.
 
+    Raises ValueError for a text of another form and a folder, FileNotFoundError without the file.
+
     Args:
         text: A file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
         tries: Number of times that a lost line is opened again before a byte comes.
@@ -65,10 +67,6 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
 
     Returns:
         The source.
-
-    Raises:
-        ValueError: For a text of another form, and for a folder.
-        FileNotFoundError: For a file that does not exist.
     """
     kind, _, rest = text.partition(":")
     head, _, number = rest.rpartition(":")
@@ -107,15 +105,13 @@ def is_nmea(path: str | Path) -> bool:
 def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
     """Read all epochs of a file, their dates mended (extra `wires`); FileNotFoundError without it.
 
+    Raises ValueError for a folder, and a file without a valid sentence or an epoch with a fix.
+
     Args:
         path: Path of the file.
 
     Returns:
         The epochs, and counts of what the file holds.
-
-    Raises:
-        ValueError: For a folder and a file that is empty, has no valid sentence, or no epoch with a
-            fix and a time.
     """
     from .nmea import Decoder, correct_dates
 

@@ -4,107 +4,29 @@ Files are told apart by content. Columns have our names or mapped ones.
 """
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..io import read_document
-from ..numerics import require_extra
 from ..record import Array
 from ..validation import join_names, short_repr
 from ..vehicle.parameters import GRAVITY
-from .containers import (
-    DBC,
-    LogTable,
-    find_trace_reader,
-    is_bag,
-    read_bag,
-    read_can,
-    read_matlab,
-    read_mdf,
-    read_vbo,
-)
-from .dialect import KINDS, LATENCIES, SENSORS, find_samples, find_unit, read_text
+from .containers import DBC, LogTable, read_table
+from .dialect import KINDS, LATENCIES, find_samples, find_unit
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    LogSource = str | Path | pd.DataFrame
-    """File of a recorded drive, or its table in memory."""
-
-
-CONTAINERS = "CSV, Parquet, MATLAB, MDF, a CAN trace, a bag or VBO"
-_HEAD_BYTES = 1 << 16  # in which a file shows what it is
-
-
-def _read_table(
-    path: Path, is_wanted: Callable[[str], bool], mapping: Mapping[str, str]
-) -> LogTable:
-    """Read a file's columns, its kind recognised by its beginning.
-
-    Raises FileNotFoundError, ValueError for a file that is no table, ImportError without an extra.
-    """
-    with require_extra("report", "reading a log needs pandas"):
-        import pandas as pd
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if path.is_dir() and not is_bag(path, b""):
-        raise ValueError(f"{path}: expected a file, found a folder")
-    head = b"" if path.is_dir() else _read_head(path)
-    units: list[str] = []
-    remarks: list[str] = []
-    dbc = mapping.get(DBC, "")
-    try:
-        if head.startswith(b"MDF "):
-            return read_mdf(path, is_wanted, dbc)
-        if reader := find_trace_reader(head):
-            return read_can(path, reader, is_wanted, dbc)
-        if is_bag(path, head):
-            return read_bag(path, mapping, _find_sensor)
-        if head.startswith(b"PAR1"):
-            frame = pd.read_parquet(path)
-        elif head.startswith(b"MATLAB"):
-            frame = read_matlab(path, head)
-        elif head.startswith(b"File created") and b"[column names]" in head:
-            frame = read_vbo(path.read_bytes())
-        else:
-            frame, units, remarks = read_text(path.read_bytes(), is_wanted)
-    except (MemoryError, ImportError, FileNotFoundError):
-        raise
-    except Exception as error:  # of a library anything, where a file is damaged
-        reason = " ".join(str(error).split()) or type(error).__name__
-        reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
-        message = f"{path}: expected {CONTAINERS}, but {reason:.300}"
-        raise ValueError(message) from None
-    names = [str(name).strip() for name in frame.columns]
-    return LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
-
-
-def _read_head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    if not head.strip():
-        raise ValueError(f"{path}: the file is empty")
-    return head
-
-
-def _find_sensor(name: str) -> str:
-    """Find the slow sensor whose samples a column shows, "" for none."""
-    quantity = parse_column_name(name)[0]
-    return next((sensor for sensor, names in SENSORS.items() if quantity == names[0]), "")
-
+    from .containers import LogSource
 
 _LARGEST = 1e15  # in SI units
 _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
 _ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
 _ACCELERATION = {"mps2": 1.0, "g": GRAVITY}
-_LENGTH = {"m": 1.0}
-_TORQUE = {"nm": 1.0}
-_NUMBER = {"count": 1.0}
-_CURVATURE = {"radpm": 1.0}
+_LENGTH, _TORQUE = {"m": 1.0}, {"nm": 1.0}
+_NUMBER, _CURVATURE = {"count": 1.0}, {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -121,7 +43,7 @@ quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are
 left; `course_degnorth` alone counts from north, clockwise, as a compass does. The names of course
 and camera_psi may end on a kind of samples: `course_deg_held`."""
 _NAMES = {
-    f"{quantity}_{unit}{kind}": (quantity, factor)
+    f"{quantity}_{unit}{kind}": (quantity, factor, np.pi / 2.0 if unit == "degnorth" else 0.0)
     for quantity, units in COLUMNS.items()
     for unit, factor in units.items()
     for kind in ("", *(f"_{kind}" * (quantity in ("course", "camera_psi")) for kind in KINDS))
@@ -133,51 +55,34 @@ def _make_column_name(quantity: str) -> str:
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
-def parse_column_name(name: str) -> tuple[str, float]:
-    """Parse a column's name.
+def parse_column_name(name: str) -> tuple[str, float, float]:
+    """Parse a column's name; ValueError for one that is none of ours.
 
     Args:
         name: Name in lower case, unit included.
 
     Returns:
-        Quantity and factor to SI units.
-
-    Raises:
-        ValueError: The name is none of ours.
+        Quantity, factor to SI units, and what is added then (pi / 2 rad for a course from north).
     """
     if name in _NAMES:
         return _NAMES[name]
-    known = [_make_column_name(q) for q in COLUMNS]
+    known = list(map(_make_column_name, COLUMNS))
     if near := next((q for q in (name, name.rpartition("_")[0]) if q in COLUMNS), None):
         known = [f"{near}_{u}" for u in COLUMNS[near]]
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
 
-def find_offset(name: str) -> float:
-    """Find what is added to a column's values in SI units.
-
-    Args:
-        name: Name in lower case, unit included.
-
-    Returns:
-        pi / 2 for a course from north (rad), 0 for all others.
-    """
-    return np.pi / 2.0 if name.startswith("course_degnorth") else 0.0
-
-
 def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
     """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
 
+    Raises FileNotFoundError for a TOML file that does not exist, and ValueError for a text of
+    another form, an unknown name and a name mapped twice.
+
     Args:
-        texts: Texts of the form NAME=COLUMN, where dbc=FILE names the description of a CAN trace,
-            and TOML files that hold the same names and columns; a file's DBC lies beside it.
+        texts: NAME=COLUMN, dbc=FILE that describes a CAN trace, and TOML files, a DBC beside them.
 
     Returns:
         Our column names to the log's.
-
-    Raises:
-        FileNotFoundError: For a TOML file that does not exist.
-        ValueError: For a text of another form, an unknown name and a name mapped twice.
     """
     mapping: dict[str, str] = {}
     for text in texts:
@@ -205,7 +110,9 @@ def read_columns(
 ) -> tuple[dict[str, Array], dict[str, str], list[str]]:
     """Read a log's known columns in SI units as they stand: rows unsorted, NaN where empty.
 
-    An empty column counts as absent. A file that `_read_table` refuses raises its errors.
+    An empty column counts as absent. Raises ValueError for a missing column, one given twice, a
+    value that is no finite number, a time that is NaN and fewer than two rows, and the errors of
+    `read_table`.
 
     Args:
         source: Path of the table, or the table itself.
@@ -213,44 +120,27 @@ def read_columns(
         needed: Quantities that must be present.
 
     Returns:
-        Quantities by name, shape (n,) each, the kinds of samples that names tell, and sentences
-        on how they were read.
-
-    Raises:
-        ValueError: For a missing column, one given twice, a value that is no finite number, a time
-            that is NaN, and fewer than two rows.
+        Quantities by name, shape (n,) each, kinds of samples that names tell, and remarks.
     """
-    columns_mapped = {name: column for name, column in mapping.items() if name != DBC}
-    wanted = {*COLUMNS, *map(str.casefold, columns_mapped.values())}
-    if isinstance(source, str | Path):
-        table = _read_table(
-            Path(source),
-            lambda name: name.casefold() in wanted or bool(_match_column(name, "")),
-            mapping,
-        )
-    else:
-        names = [str(name).strip() for name in source.columns]
-        table = LogTable(source.set_axis(names, axis=1), [""] * len(names), names, [])
+    mapped = {name: column for name, column in mapping.items() if name != DBC}
+    wanted = {*COLUMNS, *map(str.casefold, mapped.values())}
+    table = read_table(
+        source, lambda name: name.casefold() in wanted or bool(_match_column(name, "")), mapping
+    )
     remarks = [*table.remarks]
-    try:
-        columns = _find_columns(table, columns_mapped, remarks)
-        missing = [_make_column_name(name) for name in needed if name not in columns]
-        if missing:
-            raise ValueError(
-                f"no column {' nor '.join(missing)}; the log has {join_names(table.names)}; "
-                f"--map {missing[0]}=COLUMN names one"
-            )
-        if len(table.frame) < 2:
-            rows = "no rows" if table.frame.empty else "one row"
-            raise ValueError(f"the log has {rows}; a drive needs two or more")
-        values = {}
-        for quantity, (place, name) in columns.items():
-            column = _convert_column(table, place, name, remarks)
-            if quantity in needed or not np.isnan(column).all():
-                values[quantity] = column
-        _check_complete(values, ["time"])
-    except ValueError as error:
-        raise ValueError(f"{name_log(source)}: {error}") from None
+    columns = _find_columns(table, mapped, remarks)
+    if missing := [_make_column_name(name) for name in needed if name not in columns]:
+        has = f"the log has {join_names(table.names)}; --map {missing[0]}=COLUMN names one"
+        raise ValueError(f"no column {' nor '.join(missing)}; {has}")
+    if len(table.frame) < 2:
+        rows = "no rows" if table.frame.empty else "one row"
+        raise ValueError(f"the log has {rows}; a drive needs two or more")
+    values = {}
+    for quantity, (place, name) in columns.items():
+        column = _convert_column(table, place, name, remarks)
+        if quantity in needed or not np.isnan(column).all():
+            values[quantity] = column
+    _check_complete(values, ["time"])
     kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
     return values, {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}, remarks
 
@@ -263,28 +153,22 @@ def read_quantities(
 ) -> tuple[dict[str, Array], list[str]]:
     """Read a log's known quantities in SI units, and describe how they were read.
 
-    Rows in messages count from 1 below the header.
+    Rows in messages count from 1 below the header. Raises the errors of `read_columns`, and
+    ValueError for NaN in a quantity without gaps.
 
     Args:
         source: Path of the table, or the table itself.
         mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
-        gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
-            shuffled rows are sorted.
+        gaps: Quantities that may hold NaN; None: all but the time, and shuffled rows are sorted.
 
     Returns:
         Quantities by name, shape (n,) each, and sentences on how they were read.
-
-    Raises:
-        ValueError: For NaN in a quantity without gaps, and for all that `read_columns` refuses.
     """
     values, kinds, remarks = read_columns(source, mapping, needed)
-    try:
-        remarks += find_samples(values, needed, kinds, gaps is not None)
-        if gaps is not None:
-            _check_complete(values, [name for name in values if name not in gaps])
-    except ValueError as error:
-        raise ValueError(f"{name_log(source)}: {error}") from None
+    remarks += find_samples(values, needed, kinds, gaps is not None)
+    if gaps is not None:
+        _check_complete(values, [name for name in values if name not in gaps])
     return values, remarks
 
 
@@ -323,9 +207,8 @@ def _find_columns(
     names, quantities = [str(name) for name in table.frame.columns], set()
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):
-            raise ValueError(
-                f"no column {column!r} for {name}; the log has {join_names(table.names)}"
-            )
+            has = f"the log has {join_names(table.names)}"
+            raise ValueError(f"no column {column!r} for {name}; {has}")
         quantity = parse_column_name(name)[0]
         if quantity in quantities:
             raise ValueError(f"{quantity} is mapped twice")
@@ -335,7 +218,7 @@ def _find_columns(
         match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = parse_column_name(name)[0] if name else ""
+            quantity = _NAMES[name][0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -346,19 +229,15 @@ def _find_columns(
         name_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
         if unit not in ("", "count", name_unit):
             if level:
-                raise ValueError(
-                    f"{label} has the unit {unit} in the file; --map {quantity}_{unit}={label} or "
-                    f"--map {name}={label} says which it is"
-                )
+                rule = f"--map {quantity}_{unit}={label} or --map {name}={label} says which it is"
+                raise ValueError(f"{label} has the unit {unit} in the file; {rule}")
             remarks.append(f"{label} is read as {name}, though its unit in the file is {unit}.")
         for other, alias in others:
             if alias != name:
                 raise ValueError(f"{quantity} is given twice, as {name} and {alias}")
             if not table.frame.iloc[:, place].equals(table.frame.iloc[:, other]):
-                raise ValueError(
-                    f"{label} is given twice, in columns {place + 1} and {other + 1}, with other "
-                    "values; rename or delete one"
-                )
+                where = f"in columns {place + 1} and {other + 1}, with other values"
+                raise ValueError(f"{label} is given twice, {where}; rename or delete one")
             remarks.append(f"{label} is given twice, with the same values.")
         columns[quantity] = place, name
     return columns
@@ -383,14 +262,14 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    quantity, factor = parse_column_name(name)
+    quantity, factor, offset = parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:
         for unit, scale in COLUMNS["time"].items():
             if 3e8 < values[0] * scale < 4e9:
                 factor = scale
                 remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
     values *= factor
-    if offset := find_offset(name):
+    if offset:
         values += offset
     is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
     if (bad := is_none | (np.abs(values) > _LARGEST)).any():
@@ -398,6 +277,6 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
         text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
         if is_none[row]:
             expected = "a number" + " with a decimal point alone" * ("," in text)
-        place_text = f"column {label!r}, row {row + 1}"
-        raise ValueError(f"{place_text}: expected {expected}, got {short_repr(text)}")
+        got = f"expected {expected}, got {short_repr(text)}"
+        raise ValueError(f"column {label!r}, row {row + 1}: {got}")
     return values

@@ -19,11 +19,8 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 with require_extra("render", "pictures need pygame"):
     import pygame as pygame  # the other files of the room take it from here
 
-Points = npt.ArrayLike
-"""Places, shape (n, 2), or one, shape (2,)."""
-Box = tuple[float, float, float, float]
-"""Left, top, width and height in pixels."""
-
+Points = npt.ArrayLike  # places, shape (n, 2), or one, shape (2,)
+Box = tuple[float, float, float, float]  # left, top, width and height (px)
 _OVERSAMPLING = 2
 _FONTS = "dejavusans,notosans,liberationsans,arial,helveticaneue,segoeui"
 _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
@@ -60,8 +57,8 @@ class Canvas:
             colour: Its colour.
             radius: Radius of the corners (px).
         """
-        scaled = pygame.Rect(_scale_box(box))
-        pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
+        corner = round(_OVERSAMPLING * radius)
+        pygame.draw.rect(self._large, colour, _scale_box(box), border_radius=corner)
 
     def draw_polygon(self, points: Points, colour: str) -> None:
         """Draw a filled polygon.
@@ -75,11 +72,7 @@ class Canvas:
         pygame.draw.aalines(self._large, colour, True, scaled)
 
     def draw_line(
-        self,
-        points: Points,
-        colour: str,
-        width: float = 1.0,
-        dash: tuple[float, float] | None = None,
+        self, points: Points, colour: str, width: float = 1.0, dash: Sequence[float] = ()
     ) -> None:
         """Draw a line.
 
@@ -87,10 +80,10 @@ class Canvas:
             points: Points on it (px), shape (n, 2), two at least.
             colour: Its colour.
             width: Its width (px).
-            dash: Length of a dash and of a gap (px); None: without gaps.
+            dash: Length of a dash and of a gap (px); none: without gaps.
         """
         thick = max(round(_OVERSAMPLING * width), 1)
-        if dash is not None:
+        if dash:
             scaled = _scale_points(_find_dashes(np.asarray(points, float), *dash))
             for start, end in zip(scaled[::2], scaled[1::2], strict=True):
                 pygame.draw.line(self._large, colour, start, end, thick)
@@ -100,20 +93,18 @@ class Canvas:
         for point in scaled if thick > 4 else ():
             pygame.draw.circle(self._large, colour, point, thick / 2)
 
-    def draw_disc(
-        self, centre: Points, radius: float, colour: str, width: float | None = None
-    ) -> None:
+    def draw_disc(self, centre: Points, radius: float, colour: str, width: float = 0.0) -> None:
         """Draw a circle.
 
         Args:
             centre: Its centre (px), shape (2,).
             radius: Its radius (px), to the middle of the line.
             colour: Its colour.
-            width: Width of the line (px); None fills the circle.
+            width: Width of the line (px); 0 fills the circle.
         """
-        thick = 0 if width is None else max(round(_OVERSAMPLING * width), 1)
-        (place,), outer = _scale_points(np.asarray(centre)[None]), _OVERSAMPLING * radius
-        pygame.draw.circle(self._large, colour, place, outer + thick / 2, thick)
+        thick = max(round(_OVERSAMPLING * width), 1) if width else 0
+        place, outer = _scale_points(np.atleast_2d(centre))[0], _OVERSAMPLING * radius + thick / 2
+        pygame.draw.circle(self._large, colour, place, outer, thick)
 
     def draw_arrow(self, start: Points, end: Points, colour: str, width: float = 2.0) -> None:
         """Draw a line with a head at its end; the head shrinks with a short one.
@@ -128,10 +119,9 @@ class Canvas:
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
             return
-        direction = (b - a) / length
-        normal, head = np.array([-direction[1], direction[0]]), min(4.0 * width, 0.6 * length)
-        neck = b - head * direction
-        half = 0.5 * width * normal
+        x, y = (b - a) / length
+        normal, head = np.array([-y, x]), min(4.0 * width, 0.6 * length)
+        neck, half = b - head * np.array([x, y]), 0.5 * width * normal
         self.draw_polygon([a + half, neck + half, neck - half, a - half], colour)
         self.draw_polygon([b, neck + 0.45 * head * normal, neck - 0.45 * head * normal], colour)
 
@@ -179,15 +169,14 @@ def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     Returns:
         Red, green and blue, shape (height, width, 3).
     """
-    width, height = picture.get_size()
     flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
-    return flat.reshape(height, width, 3).copy()
+    return flat.reshape(picture.get_height(), picture.get_width(), 3).copy()
 
 
 def _find_dashes(vertices: Array, dash: float, gap: float) -> Array:
     """Find the ends of a line's dashes, one after the other, (n, 2)."""
     steps = np.hypot(*np.diff(vertices, axis=0).T)
-    length = np.concatenate([[0.0], np.cumsum(steps)])
+    length = np.append(0.0, np.cumsum(steps))
     starts = np.arange(0.0, length[-1], dash + gap)
     ends = np.stack([starts, np.minimum(starts + dash, length[-1])], 1).ravel()
     return np.stack([np.interp(ends, length, coordinate) for coordinate in vertices.T], 1)

@@ -1,8 +1,7 @@
 """The picture of a car: the road, a close-up and strip charts over time.
 
-The close-up has its nose to the right and shows velocity and sideslip angle, tyre forces in their
-friction circles, motor torques and wind. The charts show truth, references and estimates with their
-standard deviation.
+The close-up has its nose to the right: velocity, tyre forces in their friction circles, torques and
+wind. The charts show truth, references and estimates with their standard deviation.
 """
 
 import math
@@ -56,36 +55,30 @@ def _make_strips(
     has_yaw_reference: bool,
 ) -> list[_Strip]:
     """Make the charts of sideslip angle, yaw rate and yaw moment, with those of ghosts."""
-    t = truth[:, TRACE_POINT.t]
+    t, point = truth[:, TRACE_POINT.t], TRACE_POINT
 
-    def make_lines(column: int, factor: float) -> list[_ChartLine]:
-        lines = [_ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], c) for g, c in ghosts]
+    def make_lines(column: int, factor: float = _DEGREES, reference: int = 0) -> list[_ChartLine]:
+        lines = [_ChartLine(g[:, point.t], factor * g[:, column], c) for g, c in ghosts]
+        if reference:
+            lines.insert(0, _ChartLine(t, factor * truth[:, reference], INK, True, width=1.0))
         return [*lines, _ChartLine(t, factor * truth[:, column], INK, width=2.0)]
 
-    slip, rate = make_lines(TRACE_POINT.beta, _DEGREES), make_lines(TRACE_POINT.gamma, _DEGREES)
-    slip_reference, rate_reference = (
-        _ChartLine(t, _DEGREES * truth[:, column], INK, True, width=1.0)
-        for column in (TRACE_POINT.beta_ref, TRACE_POINT.gamma_ref)
-    )
-    slip = [slip_reference, *slip]
+    slip = make_lines(point.beta, reference=point.beta_ref)
     for name, columns in estimates.items():
-        hat, std = columns.T
-        slip.append(_ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std))
-    if has_yaw_reference:
-        rate = [rate_reference, *rate]
-    moment = make_lines(TRACE_POINT.yaw_moment, 1.0)
+        hat, std = _DEGREES * columns.T
+        slip.append(_ChartLine(t, hat, colours[name], deviation=std))
+    rate = make_lines(point.gamma, reference=point.gamma_ref if has_yaw_reference else 0)
     return [
         _Strip("sideslip angle / deg", 1.0, 1.6, slip),
         _Strip("yaw rate / (deg/s)", 10.0, 1.0, rate),
-        _Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, moment),
+        _Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, make_lines(point.yaw_moment, 1.0)),
     ]
 
 
 def _draw_strips(canvas: Canvas, box: Box, strips: list[_Strip], first: float, span: float) -> None:
     """Draw charts below one another in a box, from the time `first` on for `span` seconds."""
     left, top, width, height = box
-    high = (height - _ROW) / sum(strip.share for strip in strips)
-    y = top
+    high, y = (height - _ROW) / sum(strip.share for strip in strips), top
     for strip in strips:
         inside = left + 48.0, y + _ROW, width - 60.0, strip.share * high - _ROW - 4.0
         _draw_strip(canvas, inside, strip, first, span)
@@ -98,8 +91,8 @@ def _draw_strips(canvas: Canvas, box: Box, strips: list[_Strip], first: float, s
 
 def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: float) -> None:
     left, top, width, height = box
-    values = [line.values for line in strip.lines]
-    largest = max(float(np.max(np.abs(y), initial=0.0, where=np.isfinite(y))) for y in values)
+    values = np.abs(np.concatenate([line.values for line in strip.lines]))
+    largest = float(np.max(values, initial=0.0, where=np.isfinite(values)))
     limit = _find_nice_limit(max(strip.min_limit, 1.05 * largest))
 
     def to_pixels(t: Array, values: Array) -> Array:
@@ -114,18 +107,16 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
     canvas.draw_text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
     canvas.set_clip(box)
     for line in strip.lines:
-        if line.deviation is not None:
-            is_known = np.isfinite(line.values) & np.isfinite(line.deviation)
-            t, middle, std = line.t[is_known], line.values[is_known], line.deviation[is_known]
-            if len(t) > 1:
-                edges = to_pixels(t, middle + std), to_pixels(t, middle - std)[::-1]
-                band_colour = mix_colours(line.colour, "#FFFFFF", 0.25)
-                canvas.draw_polygon(np.concatenate(edges), band_colour)
+        std = np.full_like(line.t, np.nan) if line.deviation is None else line.deviation
+        is_known = np.isfinite(line.values + std)
+        edges = [to_pixels(line.t, line.values + sign * std)[is_known] for sign in (1.0, -1.0)]
+        if len(edges[0]) > 1:
+            shade = mix_colours(line.colour, "#FFFFFF", 0.25)
+            canvas.draw_polygon(np.concatenate([edges[0], edges[1][::-1]]), shade)
     for line in strip.lines:
-        is_known = np.isfinite(line.values)
-        points = to_pixels(line.t[is_known], line.values[is_known])
+        points = to_pixels(line.t, line.values)[np.isfinite(line.values)]
         if len(points) > 1:
-            canvas.draw_line(points, line.colour, line.width, _DASH if line.dashed else None)
+            canvas.draw_line(points, line.colour, line.width, _DASH * line.dashed)
         if len(points) and not line.dashed:
             canvas.draw_disc(points[-1], 2.6, line.colour)
     canvas.set_clip(None)
@@ -133,9 +124,8 @@ def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: flo
 
 def _find_nice_limit(limit: float) -> float:
     """Find the next of 1, 2, 3, 5, 10 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(limit))
-    candidates = (factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0))
-    return next(candidate for candidate in candidates if candidate >= limit - 1e-9)
+    limits = 10.0 ** math.floor(math.log10(limit)) * np.array([1.0, 2.0, 3.0, 5.0, 10.0])
+    return float(limits[limits >= limit - 1e-9][0])
 
 
 _GREEN = PALETTE[2]
@@ -155,8 +145,7 @@ def _draw_closeup(
     """Draw a car, its sideslip angle, reference and estimates (rad) with their colours by label."""
     body = front, rear, half = road.compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
-    x_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear)
-    y_0 = box[1] + 0.5 * box[3]
+    x_0, y_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear), box[1] + 0.5 * box[3]
     to_pixels = road.Projection((x_0, y_0), scale)
     canvas.draw_polygon(to_pixels(body.outline), "#C9CED4")
     inner = body._replace(front=front - 0.02, rear=rear + 0.02, half=half - 1.5 / scale)
@@ -169,8 +158,7 @@ def _draw_closeup(
             canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
             canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
     for wheel in scene.wheels:
-        outline = wheel.outline(scene.vehicle.wheel_radius)
-        canvas.draw_polygon(to_pixels(outline), "#A9B0B7")
+        canvas.draw_polygon(to_pixels(wheel.outline(scene.vehicle.wheel_radius)), "#A9B0B7")
     _draw_forces(canvas, scene, to_pixels, per_newton)
     _draw_motors(canvas, box, scene, to_pixels)
     _draw_directions(canvas, (x_0, y_0), beta, reference, estimates)
@@ -178,12 +166,12 @@ def _draw_closeup(
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
         canvas.draw_arrow(foot, foot - (0.0, math.copysign(34.0, scene.wind)), PALETTE[3], 4.0)
         canvas.draw_text((foot[0] + 12.0, foot[1]), f"wind {abs(scene.wind):.0f} N", PALETTE[3], 12)
+    x = box[0] + 14.0
     if any(wheel.capacity for wheel in scene.wheels):
-        words = "tyre forces in their friction circles"
-        canvas.draw_text((box[0] + 14.0, box[1] + 12.0), words, road.SOFT, 12)
+        canvas.draw_text((x, box[1] + 12.0), "tyre forces in their friction circles", road.SOFT, 12)
     degrees = round(math.degrees(beta), 1) + 0.0  # no -0.0
     words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
-    canvas.draw_text((box[0] + 14.0, box[1] + box[3] - 12.0), words, INK, 12)
+    canvas.draw_text((x, box[1] + box[3] - 12.0), words, INK, 12)
 
 
 def _draw_forces(
@@ -192,25 +180,23 @@ def _draw_forces(
     """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
         cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
-        forward = cos * wheel.F_x - sin * wheel.F_y
-        left = sin * wheel.F_x + cos * wheel.F_y
+        forward, left = cos * wheel.F_x - sin * wheel.F_y, sin * wheel.F_x + cos * wheel.F_y
         start = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
         utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
         colour = mix_colours(road.ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
         canvas.draw_arrow(start, start + per_newton * np.array([forward, -left]), colour, 3.0)
         if wheel.capacity:
-            gap = math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
-            words = f"{100.0 * utilisation:.0f} %"
-            canvas.draw_text((start[0], start[1] - gap), words, colour, 12, 0.5)
+            place = start[0], start[1] - math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
+            canvas.draw_text(place, f"{100.0 * utilisation:.0f} %", colour, 12, 0.5)
 
 
 def _draw_motors(
     canvas: Canvas, box: Box, scene: road.CarScene, to_pixels: road.Projection
 ) -> None:
     """Draw each rear motor's torque as a bar, to the right where it drives."""
+    x = box[0] + 44.0
     for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
-        _, y = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
-        x = box[0] + 44.0
+        y = to_pixels(np.array([[wheel.x, wheel.y]]))[0, 1]
         canvas.draw_box((x - 30.0, y + 4.0, 60.0, 7.0), "#E4E7EA", 3.5)
         share = min(max(torque / scene.max_torque, -1.0), 1.0)
         canvas.draw_box((x + min(30.0 * share, 0.0), y + 4.0, abs(30.0 * share), 7.0), PALETTE[0])
@@ -226,17 +212,16 @@ def _draw_directions(
     estimates: dict[str, tuple[float, str]],
 ) -> None:
     """Draw the directions of the velocity, of its reference and of the estimates."""
-    foot = np.array(centre)
 
-    def find_tip(angle: float, length: float) -> Array:
-        magnified = MAGNIFIED * angle
-        return foot + length * np.array([math.cos(magnified), -math.sin(magnified)])
+    def make_ray(angle: float, length: float) -> Array:
+        direction = np.array([math.cos(MAGNIFIED * angle), -math.sin(MAGNIFIED * angle)])
+        return np.array([centre, centre + length * direction])
 
-    canvas.draw_line(np.array([foot, find_tip(0.0, 138.0)]), "#C3C8CE", 1.0)
-    canvas.draw_line(np.array([foot, find_tip(reference, 138.0)]), INK, 1.0, (4.0, 3.0))
+    canvas.draw_line(make_ray(0.0, 138.0), "#C3C8CE", 1.0)
+    canvas.draw_line(make_ray(reference, 138.0), INK, 1.0, (4.0, 3.0))
     for angle, colour in estimates.values():
-        canvas.draw_line(np.array([foot, find_tip(angle, 132.0)]), colour, 2.0)
-    canvas.draw_arrow(foot, find_tip(beta, 122.0), INK, 3.0)
+        canvas.draw_line(make_ray(angle, 132.0), colour, 2.0)
+    canvas.draw_arrow(centre, make_ray(beta, 122.0)[1], INK, 3.0)
     canvas.draw_disc(centre, 4.0, INK)
     canvas.draw_disc(centre, 1.8, "#FFFFFF")
 
@@ -260,37 +245,37 @@ def draw_picture(
         The picture.
     """
     p, _, switches, _, config, trace, _, draw_world = shot
-    now = trace.newest
+    now = trace.rows[-1]
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
     first = max(now[TRACE_POINT.t] - span, 0.0)
     truth, estimates = trace.select_since(first)
     shades = _choose_shades(estimates)
     scene = road.make_car_scene(shot)
-    ghost_cars = []
-    for label, state in ghosts:
-        past, _ = state.trace.select_since(first)
-        ghost_cars.append(road.CarTrack(road.make_car_scene(state), past, GREY, label))
+    ghost_cars = [
+        road.CarTrack(road.make_car_scene(ghost), ghost.trace.select_since(first)[0], GREY, label)
+        for label, ghost in ghosts
+    ]
     canvas = Canvas(SIZE)
     canvas.draw_box((0.0, 0.0, *SIZE), _PAPER)
     if draw_world is None:
         driven_car = road.CarTrack(scene, truth, road.BLUE, name if ghosts else "")
         road.draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
-    newest = {label: (float(item[-1, 0]), shades[label]) for label, item in estimates.items()}
-    newest = {label: item for label, item in newest.items() if math.isfinite(item[0])}
-    beta, reference = now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref]
-    _draw_closeup(canvas, _CLOSEUP, scene, beta, reference, newest)
+    ends = {label: float(item[-1, 0]) for label, item in estimates.items()}
+    newest = {n: (end, shades[n]) for n, end in ends.items() if math.isfinite(end)}
+    slips = now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref]
+    _draw_closeup(canvas, _CLOSEUP, scene, *slips, newest)
     has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
     others = [(item.truth, item.colour) for item in ghost_cars]
-    full_scale = float(p[P.task.yaw_scale])
-    strips = _make_strips(truth, estimates, shades, others, full_scale, has_yaw_reference)
+    scale = float(p[P.task.yaw_scale])
+    strips = _make_strips(truth, estimates, shades, others, scale, has_yaw_reference)
     _draw_strips(canvas, _STRIPS, strips, first, span)
     _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
     failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
     _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
     picture = canvas.finish()
     if draw_world is not None:
-        size = int(_ROAD[2]), int(_ROAD[3])
-        picture.blit(draw_world(size, [item.scene.motion for item in ghost_cars]), _ROAD[:2])
+        motions = [item.scene.motion for item in ghost_cars]
+        picture.blit(draw_world((int(_ROAD[2]), int(_ROAD[3])), motions), _ROAD[:2])
     return picture
 
 
@@ -310,8 +295,8 @@ def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[
     entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
-        width, dash = (1.5, _DASH) if dashed else (2.5, None)
-        canvas.draw_line([(x, 272.0), (x + 20.0, 272.0)], shade, width, dash)
+        ends, width = [(x, 272.0), (x + 20.0, 272.0)], 1.5 if dashed else 2.5
+        canvas.draw_line(ends, shade, width, _DASH * dashed)
         x += 26.0 + canvas.draw_text((x + 26.0, 272.0), words, INK, 12) + 18.0
 
 

@@ -48,17 +48,13 @@ _ALIASES = {
     "truth": "true, reference, bound, ideal",
 }
 _BASE_COLOURS = {**FILTERS, **CONTROLLERS, **ORACLES, "truth": INK, "measured": GREY}
-COLOURS = _BASE_COLOURS | {
-    alias: _BASE_COLOURS[name]
-    for name, aliases in _ALIASES.items()
-    for alias in aliases.split(", ")
-}
+_BY_ALIAS = {alias: name for name, text in _ALIASES.items() for alias in text.split(", ")}
+COLOURS = _BASE_COLOURS | {alias: _BASE_COLOURS[name] for alias, name in _BY_ALIAS.items()}
 """Estimators, controllers and facts by name."""
 
 FACTS = ("truth", "true")
-_LONGEST_FIRST = sorted(
-    (name for name in COLOURS if name not in (*FACTS, "none")), key=len, reverse=True
-)
+_NAMES = [name for name in COLOURS if name not in (*FACTS, "none")]
+_LONGEST_FIRST = sorted(_NAMES, key=len, reverse=True)
 _DEFAULT_PREFIX = "lqr on "  # the controller under which filters are compared
 
 
@@ -79,9 +75,7 @@ def find_base(name: str) -> str | None:
         The name.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
-    if name in COLOURS:
-        return name
-    return next((known for known in _LONGEST_FIRST if known in name), None)
+    return name if name in COLOURS else next((n for n in _LONGEST_FIRST if n in name), None)
 
 
 def find_colour(name: str) -> str:
@@ -93,9 +87,8 @@ def find_colour(name: str) -> str:
     Returns:
         "#RRGGBB".
     """
-    if known := find_base(name):
-        return COLOURS[known]
-    return OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
+    other = OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
+    return COLOURS.get(find_base(name) or "", other)
 
 
 def mix_colours(shade: str, with_shade: str, share: float) -> str:

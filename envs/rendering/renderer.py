@@ -19,7 +19,7 @@ _MODES = ("human", "rgb_array")
 _TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a control period
 
 
-class RenderMixin:
+class _RenderMixin:
     """An environment of one or more cars that draws them, from what the engine wrote.
 
     `render_mode` is None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
@@ -68,24 +68,14 @@ class RenderMixin:
             show_picture(draw_picture(render_state), 1.0 / (interval * TICK))
 
     def make_render_state(self, row: int = 0) -> RenderState:
-        """Make what a car's picture is drawn from.
-
-        Args:
-            row: Number of the car.
-
-        Returns:
-            The state, of views that change with the car.
-
-        Raises:
-            ResetNeeded: If there was no reset.
-        """
+        """Make what the picture of a row's car is drawn from, views that change with the car."""
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(getattr(self, "num_envs", 1))]
         episode, trace = self._get_episode(row), self._traces[row]
         render_state = RenderState(*episode[:5], trace, self._has_tyre_forces, self._draw_world)
         if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
-        if trace.is_empty:
+        if not trace.rows:
             trace.add(render_state.report, render_state.state)
         return render_state
 
@@ -111,7 +101,7 @@ class RenderMixin:
             pygame.display.quit()
 
 
-class SingleRenderMixin(RenderMixin):
+class SingleRenderMixin(_RenderMixin):
     """A single environment that draws its car."""
 
     annotations: dict[str, tuple[float, float]]  # estimates of the newest step
@@ -133,10 +123,10 @@ class SingleRenderMixin(RenderMixin):
         frames = self._render_frames()
         return None if frames is None else frames[0]
 
-    close = RenderMixin._close_window
+    close = _RenderMixin._close_window
 
 
-class VectorRenderMixin(RenderMixin):
+class VectorRenderMixin(_RenderMixin):
     """A vector environment that draws its cars."""
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
@@ -151,5 +141,5 @@ class VectorRenderMixin(RenderMixin):
         for row in np.flatnonzero(rows[: len(self._traces)]):
             self._traces[row].add_estimate(label, beta[row], std[row])
 
-    render = RenderMixin._render_frames
-    close_extras = RenderMixin._close_window
+    render = _RenderMixin._render_frames
+    close_extras = _RenderMixin._close_window

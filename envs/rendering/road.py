@@ -1,7 +1,6 @@
 """The scene of a car and its road from above: lane or cones, trail, the camera's field of view.
 
-A scene is read from the packed numbers of an episode (`engine.layout`). The road's direction at the
-car is drawn to the right, its left is up. A body has the car's width and 1.62 wheelbases' length.
+The road's direction at the car is drawn to the right, its left is up.
 """
 
 import math
@@ -17,16 +16,8 @@ from ..numerics.jit import as_python
 from ..numerics.packed import read
 from ..numerics.primitives import ARRAYS
 from ..record import Array
+from ..scenarios import road as tracks
 from ..scenarios.driver import compute_wind
-from ..scenarios.road import (
-    NOMINAL_PATH,
-    Section,
-    TrackPath,
-    compute_path_offset,
-    make_path,
-    make_sections,
-    step_nominal_car,
-)
 from ..sensors.camera.analytic import compute_lane_quality
 from ..vehicle.actuators import compute_torque_limit
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
@@ -42,9 +33,9 @@ _compute_lateral_forces = as_python(compute_lateral_forces)
 _apply_tyre_change, _compute_gravity = as_python(apply_tyre_change), as_python(compute_gravity)
 _compute_torque_limit, _compute_wind = as_python(compute_torque_limit), as_python(compute_wind)
 _compute_lane_quality = as_python(compute_lane_quality)
-_step_nominal_car = as_python(step_nominal_car)
+_step_nominal_car = as_python(tracks.step_nominal_car)
 _compute_curvature = as_python(compute_curvature, ARRAYS)
-_compute_path_offset = as_python(compute_path_offset, ARRAYS)
+_compute_path_offset = as_python(tracks.compute_path_offset, ARRAYS)
 
 _KNOWN_LENGTH = 45  # m of road in a scene before the car, and behind it; fewer are drawn
 _DEFAULT_HALF_ANGLE = 0.35  # rad to either side, where the scenario's camera sees at any heading
@@ -62,13 +53,12 @@ class _Body(NamedTuple):
         """A box with elliptic corners, longer at the front: points in car axes (m), (n, 2)."""
         front, rear, half = self
         turn = np.linspace(0.0, 0.5 * np.pi, 6)
-        outline = []
-        for x, a, b in ((front, 0.45, 0.4), (rear, 0.2, 0.25)):
+        corners = []
+        for sign, x, a, b in ((1, front, 0.45, 0.4), (-1, rear, 0.2, 0.25)):
             a, b = min(a, 0.3 * (front - rear)), min(b, 0.7 * half)
-            sign = 1.0 if x > 0.0 else -1.0
             corner = x - sign * a * (1.0 - np.cos(turn)), half - b * (1.0 - np.sin(turn))
-            outline.append(np.stack(corner, 1)[:: int(sign)])
-        left = np.concatenate(outline)
+            corners.append(np.stack(corner, 1)[::sign])
+        left = np.concatenate(corners)
         return np.concatenate([left, left[::-1] * (1.0, -1.0)])
 
 
@@ -110,7 +100,7 @@ class CarScene(NamedTuple):
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
     field_of_view: _CameraOverlay | None  # None without a camera
-    lanes: tuple[Section, ...]  # between cones
+    lanes: tuple[tracks.Section, ...]  # between cones
     path: Array  # the driver's, rows (s, y) in m; (0, 2) where it is the road's centre line
     curvatures: Array  # 1/m, the road's curvature at each of the next _KNOWN_LENGTH metres
     half_width: float  # m
@@ -137,16 +127,20 @@ def make_car_scene(shot: RenderState) -> CarScene:
     lateral = _compute_lateral_forces(*tyres, variant.law, variant.small_angle)
     turn = N_z / car.d_r
     longitudinal = 0.0, 0.0, 0.5 * F_x - turn, 0.5 * F_x + turn
-    places = [(car.l_f, 0.5 * car.d_f, drive.delta_f), (car.l_f, -0.5 * car.d_f, drive.delta_f)]
-    places += [(-car.l_r, 0.5 * car.d_r, 0.0), (-car.l_r, -0.5 * car.d_r, 0.0)]
+    axles = (car.l_f, car.d_f, drive.delta_f), (-car.l_r, car.d_r, 0.0)
+    places = [(x, 0.5 * side * track, angle) for x, track, angle in axles for side in (1, -1)]
     wheels = []
     for place, F_wx, F_wy, tyre in zip(places, longitudinal, lateral, tyres, strict=True):
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if variant.law == LINEAR else math.hypot(tyre.limit, F_wx)
         forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
         wheels.append(_Wheel(*place, *forces))
-    lanes = _find_lanes(params.path, config)
+    lanes, view, overlay = _find_lanes(params.path, config), read(p, P.field_of_view), None
     s = np.arange(motion.s - _KNOWN_LENGTH, motion.s + _KNOWN_LENGTH, 0.5) if lanes else np.empty(0)
+    if "camera" in config.slow:
+        angle = float(view.heading) if math.isfinite(view.heading) else _DEFAULT_HALF_ANGLE
+        has_lane = bool(_compute_lane_quality(motion, view))
+        overlay = _CameraOverlay(float(p[P.car.l_pre]), angle, has_lane)
     return CarScene(
         motion,
         config.vehicle,
@@ -156,7 +150,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         tuple(wheels),
         0.5 * float(car.mu + car.mu_r),
         float(_compute_wind(tick, params.wind)[0]),
-        _make_camera_overlay(p, motion) if "camera" in config.slow else None,
+        overlay,
         lanes,
         np.stack([s, _compute_path_offset(params.path, s)], 1),
         _sample_curvatures(params, z, motion, variant.road),
@@ -165,32 +159,25 @@ def make_car_scene(shot: RenderState) -> CarScene:
     )
 
 
-def _make_camera_overlay(p: Array, motion: Motion) -> _CameraOverlay:
-    view = read(p, P.field_of_view)
-    angle = float(view.heading) if math.isfinite(view.heading) else _DEFAULT_HALF_ANGLE
-    return _CameraOverlay(float(p[P.car.l_pre]), angle, bool(_compute_lane_quality(motion, view)))
-
-
-def _find_lanes(path: TrackPath, config: EpisodeConfig) -> tuple[Section, ...]:
+def _find_lanes(path: tracks.TrackPath, config: EpisodeConfig) -> tuple[tracks.Section, ...]:
     """Find the lanes between the cones of the episode's track, as its seed placed them."""
     track, width = config.scenario.path, config.vehicle.width
-    standard = make_path(track, width)
+    standard = tracks.make_path(track, width)
     if config.scenario.steering != "driver" or standard.shift_1 == 0.0:
         return ()
     scale = float(path.length_1 / standard.length_1)
     start = float(path.start_1 - scale * standard.start_1)
-    return make_sections(track, width, start, scale, math.copysign(1.0, path.shift_1))
+    return tracks.make_sections(track, width, start, scale, math.copysign(1.0, path.shift_1))
 
 
 def _sample_curvatures(params: StepParams, z: Array, motion: Motion, road: int) -> Array:
     """Sample the curvature ahead; a nominal path is assumed to keep its present turning rate."""
-    nominal_curvature = 0.0
-    if road == NOMINAL_PATH:
+    distances = motion.s + np.arange(float(_KNOWN_LENGTH))
+    curvatures: Array = _compute_curvature(params.road, distances)
+    if road == tracks.NOMINAL_PATH:
         nominal_motion, driver = read(z, Z.nominal_motion), float(z[Z.driver])
         turn_rate, _ = _step_nominal_car(nominal_motion, driver, motion.v_x, params.nominal_car)
-        nominal_curvature = turn_rate / max(motion.v_x, 1.0)
-    distances = motion.s + np.arange(float(_KNOWN_LENGTH))
-    curvatures: Array = nominal_curvature + _compute_curvature(params.road, distances)
+        curvatures = turn_rate / max(motion.v_x, 1.0) + curvatures
     return curvatures
 
 
@@ -233,23 +220,20 @@ class _CentreLine:
     """The centre line of the road: as the car drove along it, and its continuation."""
 
     def __init__(self, scene: CarScene, truth: Array) -> None:
-        s, y, theta = truth[:, TRACE_POINT.s], truth[:, TRACE_POINT.y], truth[:, TRACE_POINT.theta]
-        X = truth[:, TRACE_POINT.X] + y * np.sin(theta)
-        Y = truth[:, TRACE_POINT.Y] - y * np.cos(theta)
-        backward = np.arange(-float(_KNOWN_LENGTH), 0.0)
-        forward = np.arange(1.0, _KNOWN_LENGTH + 1.0)
+        X, Y, s, y, theta = truth.T[TRACE_POINT.X :]
+        X, Y = X + y * np.sin(theta), Y - y * np.cos(theta)
+        backward, forward = np.arange(-_KNOWN_LENGTH, 0.0), np.arange(1.0, _KNOWN_LENGTH + 1.0)
         directions = theta[-1] + np.cumsum(scene.curvatures)
         middle = directions - 0.5 * scene.curvatures
-        preview_xy = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
+        next_X, next_Y = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
         self._s = np.concatenate([s[0] + backward, s, s[-1] + forward])
-        self._X = np.concatenate([X[0] + backward * np.cos(theta[0]), X, preview_xy[0]])
-        self._Y = np.concatenate([Y[0] + backward * np.sin(theta[0]), Y, preview_xy[1]])
+        self._X = np.concatenate([X[0] + backward * np.cos(theta[0]), X, next_X])
+        self._Y = np.concatenate([Y[0] + backward * np.sin(theta[0]), Y, next_Y])
         self._theta = np.concatenate([theta[0] + 0.0 * backward, theta, directions])
 
     def locate(self, s: Array, y: Array) -> Array:
         """Locate points of the road, s ahead and y to the left (m), on the ground: shape (n, 2)."""
-        theta = np.interp(s, self._s, self._theta)
-        X, Y = np.interp(s, self._s, self._X), np.interp(s, self._s, self._Y)
+        X, Y, theta = (np.interp(s, self._s, line) for line in (self._X, self._Y, self._theta))
         return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
 
 
@@ -267,9 +251,9 @@ class _RoadPicture(NamedTuple):
         """Locate points of the road, s ahead and y to the left (m), in the picture (px), (n, 2)."""
         return self.project(self.centre_line.locate(s, y))
 
-    def fill_band(self, s: Array, right: float, left: float, colour: str) -> None:
-        """Fill a strip of the road between two lateral offsets (m)."""
-        y = np.repeat([right, left], len(s))
+    def fill_band(self, s: Array, offset: float, half: float, colour: str) -> None:
+        """Fill a strip of the road about a lateral offset (m), of a half width."""
+        y = np.repeat([offset - half, offset + half], len(s))
         self.canvas.draw_polygon(self.locate(np.concatenate([s, s[::-1]]), y), colour)
 
     def draw_surface(self) -> None:
@@ -277,36 +261,32 @@ class _RoadPicture(NamedTuple):
         is_ground = self.scene.half_width > 10.0 or bool(self.scene.lanes)
         self.canvas.draw_box(self.box, ASPHALT if is_ground else GRASS)
         if not is_ground:
-            edge = self.scene.half_width + 0.6
-            self.fill_band(self.s, -edge, edge, ASPHALT)
+            self.fill_band(self.s, 0.0, self.scene.half_width + 0.6, ASPHALT)
         for lane in self.scene.lanes:
-            ends, half = np.array([lane.start, lane.start + lane.length]), 0.5 * lane.width
-            shade = mix_colours(PAINT, ASPHALT, 0.5)
-            self.fill_band(ends, lane.offset - half, lane.offset + half, shade)
+            ends, shade = [lane.start, lane.start + lane.length], mix_colours(PAINT, ASPHALT, 0.5)
+            self.fill_band(np.array(ends), lane.offset, 0.5 * lane.width, shade)
 
     def draw_camera_overlay(self, overlay: _CameraOverlay) -> None:
         """Draw the camera's field of view to the preview point, and the offset that it measures."""
         m, colour = self.scene.motion, PALETTE[5] if overlay.has_lane else ORANGE
-        angles = m.psi + np.linspace(-overlay.half_angle, overlay.half_angle, 9)
-        reach = overlay.preview / np.cos(angles - m.psi)
-        rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
-        wedge = np.concatenate([[[m.X, m.Y]], rim])
-        self.canvas.draw_polygon(self.project(wedge), mix_colours(colour, ASPHALT, 0.2))
+        angles = np.linspace(-overlay.half_angle, overlay.half_angle, 9)
+        reach = overlay.preview / np.cos(angles)
+        x, y = m.X + reach * np.cos(m.psi + angles), m.Y + reach * np.sin(m.psi + angles)
+        wedge = self.project(np.stack([np.append(m.X, x), np.append(m.Y, y)], 1))
+        self.canvas.draw_polygon(wedge, mix_colours(colour, ASPHALT, 0.2))
         if overlay.has_lane:
-            x, y = m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)
-            lane = self.locate(np.array([m.s + overlay.preview]), np.array([0.0]))
-            offset = np.concatenate([lane, self.project(np.array([[x, y]]))])
-            self.canvas.draw_line(offset, colour, 2.5)
-            self.canvas.draw_disc(lane[0], 3.0, colour)
+            lane = self.locate(np.array([m.s + overlay.preview]), np.array([0.0]))[0]
+            self.canvas.draw_line([lane, wedge[5]], colour, 2.5)  # the ray straight ahead
+            self.canvas.draw_disc(lane, 3.0, colour)
 
     def draw_markings(self) -> None:
         """Draw lane markings, or cones with the driver's path; a thin line every ten metres."""
         canvas, scene, s = self.canvas, self.scene, self.s
         for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
-            cross_line = self.locate(np.full(2, place), np.array([-30.0, 30.0]))
-            canvas.draw_line(cross_line, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
-            x, bottom = cross_line[:, 0].mean(), self.box[1] + self.box[3]
-            canvas.draw_text((x + 4.0, bottom - 10.0), f"{place:.0f} m", SOFT, 11)
+            ends = self.locate(np.full(2, place), np.array([-30.0, 30.0]))
+            canvas.draw_line(ends, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
+            foot = ends[:, 0].mean() + 4.0, self.box[1] + self.box[3] - 10.0
+            canvas.draw_text(foot, f"{place:.0f} m", SOFT, 11)
         if scene.lanes:
             path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
             canvas.draw_line(self.locate(*path.T), SOFT, 1.0, (2.0, 4.0))
@@ -317,10 +297,10 @@ class _RoadPicture(NamedTuple):
             for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
                 canvas.draw_line(self.locate(start + np.arange(4.0), np.zeros(4)), PAINT, 2.0)
         for lane in scene.lanes:
-            count = max(round(lane.length / 3.0), 2)
-            places = np.linspace(lane.start, lane.start + lane.length, count + 1)
+            count = max(round(lane.length / 3.0), 2) + 1
+            places = np.linspace(lane.start, lane.start + lane.length, count)
+            sides = lane.offset + np.array([-0.5, 0.5]) * lane.width
             for place in places[np.abs(places - s.mean()) < 30.0]:
-                sides = lane.offset + np.array([-0.5, 0.5]) * lane.width
                 for cone in self.locate(np.full(2, place), sides):
                     canvas.draw_disc(cone, 3.6, ORANGE)
                     canvas.draw_disc(cone, 1.4, PAINT)
@@ -333,10 +313,10 @@ class _RoadPicture(NamedTuple):
         box, taken = self.box, []  # taken: middle, half width and half height
         for car, (x, y) in zip(cars, poses, strict=True):
             front, rear, half = self.project.scale * np.array(compute_body(car.scene.vehicle))
-            heading = car.scene.motion.psi - self.scene.motion.theta
-            cos, sin, long, shift = np.cos(heading), np.sin(heading), front - rear, front + rear
-            size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
-            taken.append((x + 0.5 * shift * cos, y - 0.5 * shift * sin, *size))
+            heading, shift = car.scene.motion.psi - self.scene.motion.theta, 0.5 * (front + rear)
+            cos, sin = np.cos(heading), np.sin(heading)
+            size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * (front - rear), half)
+            taken.append((x + shift * cos, y - shift * sin, *size))
         for i, car in enumerate(cars):
             x, y, _, tall = taken[i]
             below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
@@ -396,11 +376,10 @@ def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str)
         shown = wheel._replace(y=np.sign(wheel.y) * half)
         canvas.draw_polygon(project(shown.outline(scene.vehicle.wheel_radius)), _TYRE)
     canvas.draw_polygon(project(body.outline), colour)
-    glass, length = mix_colours(INK, colour, 0.55), front - rear
-    for rear_share, front_share, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
-        x, y = rear + np.array([rear_share, front_share]) * length, np.array([foot, tip]) * half
-        window = np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)
-        canvas.draw_polygon(project(window), glass)
+    shares = ((0.62, 0.86), (0.74, 0.72)), ((0.14, 0.74), (0.21, 0.86))  # of length and width
+    for corners in np.array(shares) * (front - rear, half) + (rear, 0.0):
+        window = np.concatenate([corners, corners[::-1] * (1.0, -1.0)])
+        canvas.draw_polygon(project(window), mix_colours(INK, colour, 0.55))
 
 
 def compute_body(vehicle: Vehicle) -> _Body:

@@ -42,9 +42,8 @@ class EpisodeTrace:
     """The recorded steps of an episode: truth and estimates."""
 
     def __init__(self) -> None:
-        self._rows: list[Array] = []
+        self.rows: list[Array] = []  # the truth, shape (len(TracePoint),) each
         self._estimates: list[dict[str, tuple[float, float]]] = []  # of each row, by label
-        self._labels: dict[str, None] = {}
 
     def add(self, report: Array, state: Array) -> None:
         """Add a step; one before the last begins a new episode, one at its time replaces it.
@@ -53,13 +52,13 @@ class EpisodeTrace:
             report: Report of the step, shape (len(StepReport),).
             state: Packed state of the car.
         """
-        if self._rows and report[REPORT.t] < self.newest[TRACE_POINT.t]:
-            self._rows, self._estimates, self._labels = [], [], {}
+        if self.rows and report[REPORT.t] < self.rows[-1][TRACE_POINT.t]:
+            self.rows, self._estimates = [], []
         row = np.concatenate([report[_REPORT_COLUMNS], state[_STATE_COLUMNS]])
-        if self._rows and row[TRACE_POINT.t] == self.newest[TRACE_POINT.t]:
-            self._rows[-1] = row  # it did not move: another row of the env was reset
+        if self.rows and row[TRACE_POINT.t] == self.rows[-1][TRACE_POINT.t]:
+            self.rows[-1] = row  # it did not move: another row of the env was reset
         else:
-            self._rows.append(row)
+            self.rows.append(row)
             self._estimates.append({})
 
     def add_estimate(self, label: str, value: float, deviation: float) -> None:
@@ -70,18 +69,7 @@ class EpisodeTrace:
             value: Sideslip angle (rad).
             deviation: Standard deviation (rad).
         """
-        self._labels[label] = None
         self._estimates[-1][label] = value, deviation
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no step is recorded."""
-        return not self._rows
-
-    @property
-    def newest(self) -> Array:
-        """The truth of the newest step, shape (len(TracePoint),)."""
-        return self._rows[-1]
 
     def select_since(self, t: float, max_points: int = 400) -> tuple[Array, dict[str, Array]]:
         """Select the steps from a time on, thinned out.
@@ -91,18 +79,18 @@ class EpisodeTrace:
             max_points: Number of steps that remain, or up to twice as many.
 
         Returns:
-            The truth, shape (n, len(TracePoint)), and by label estimates and deviations (rad),
-            shape (n, 2), NaN where there are none.
+            The truth, (n, len(TracePoint)), and by label estimates and deviations (rad), (n, 2).
         """
-        times = [row[TRACE_POINT.t] for row in self._rows]
+        times = [row[TRACE_POINT.t] for row in self.rows]
         first = int(np.searchsorted(times, t))
         step = max((len(times) - first) // max_points, 1)
         chosen = range(len(times) - 1, first - 1, -step)[::-1]
+        labels = dict.fromkeys(label for by_label in self._estimates for label in by_label)
         estimates = {
             label: np.array([self._estimates[k].get(label, _UNKNOWN) for k in chosen])
-            for label in self._labels
+            for label in labels
         }
-        return np.array([self._rows[k] for k in chosen]), estimates
+        return np.array([self.rows[k] for k in chosen]), estimates
 
 
 RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]

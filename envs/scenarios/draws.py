@@ -125,9 +125,8 @@ def _is_stable(d: Draws, car: CarParams) -> Scalar:
     later_f = drawn.C_f * select(has_change, d.front_change, 1.0)
     later_r = drawn.C_r * select(has_change, d.rear_change, 1.0)
     speed = d.critical_speed * d.speed
-    return _is_below_critical(drawn.C_f, drawn.C_r, speed, drawn) & _is_below_critical(
-        later_f, later_r, speed, drawn
-    )
+    is_stable_later = _is_below_critical(later_f, later_r, speed, drawn)
+    return _is_below_critical(drawn.C_f, drawn.C_r, speed, drawn) & is_stable_later
 
 
 @jit

@@ -1,7 +1,7 @@
 """The driver, who steers by preview and controls the speed, and the side wind; compiled.
 
-Steering is MacAdam's optimal preview control (1981) with one preview point: the lateral
-acceleration that brings the car onto the path within the preview time T,
+Steering is MacAdam's optimal preview control (IEEE Trans. SMC 11, 1981) with one preview point:
+the lateral acceleration that brings the car onto the path within the preview time T,
 2 (y_path(t + T) - y - T y') / T^2; at gain 1 the loop has 1.41/T rad/s and damping 0.71. The angle
 is the nominal car's for it in the steady state, behind a first-order lag and a rate limit.
 """
@@ -80,9 +80,6 @@ def compute_driver_angle(
 ) -> Scalar:
     """Compute the driver's steering angle a tick later.
 
-    Source: MacAdam, "Application of an optimal preview control for simulation of closed-loop
-    automobile driving", IEEE Trans. SMC 11 (1981).
-
     Args:
         angle: Present angle at the wheels (rad).
         motion: `Motion` of the car.
@@ -140,8 +137,8 @@ def compute_acceleration_command(
 ) -> tuple[Scalar, Scalar]:
     """Compute the driver's acceleration command: PI on the speed with feedforward.
 
-    The wanted acceleration is fed forward; the integral part is held at the limit. A profile that
-    does not hold its speed gives the wanted acceleration alone.
+    The integral part is held at the limit. A profile that does not hold its speed gives the wanted
+    acceleration alone.
 
     Args:
         tick: Tick since the start of the episode.

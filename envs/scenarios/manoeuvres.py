@@ -1,14 +1,10 @@
 """The scenarios by name, and a recorded drive's steering trace as a scenario.
 
 Scored are those of three tiers, whose cars, manoeuvres and sensor faults the seed draws: the small
-car (COMS) at 18 to 28 km/h, the passenger car on the road at 60 to 90 km/h, and at the limit of its
-tyres. Sensors have biases, a late GPS, and an uneven camera that may lose the lane. The env names
-the car, a task the reference.
-
-No score contains those of the papers, listed in docs/reference/papers.md; the comment above each
-one says what its paper gives. The rest is chosen here: by default the vehicle of tie-vision's Table
-I at 25 km/h, with the default Ornstein-Uhlenbeck disturbance and noise. GPS noise is that at HDOP 1
-in the simulations; in the road tests half of it follows a varying HDOP.
+car (COMS), the passenger car on the road, and at the limit of its tyres. The env names the car, a
+task the reference. No score contains those of the papers, listed in docs/reference/papers.md; the
+comment above each says what its paper gives. The rest is chosen here: by default the vehicle of
+tie-vision's Table I at 25 km/h, with the default disturbance and noise.
 """
 
 import dataclasses
@@ -47,19 +43,15 @@ _COMS = _DRAWN_IN_TIERS | {
     "nominal": _COMS_PLANT,
 }  # fmt: skip
 _CAR = _DRAWN_IN_TIERS | {
-    "speed": (60.0 * KMH, 80.0 * KMH),
-    "vehicle": _CAR_PLANT,
-    "nominal": _CAR_PLANT,
-}
+    "speed": (60.0 * KMH, 80.0 * KMH), "vehicle": _CAR_PLANT, "nominal": _CAR_PLANT
+}  # fmt: skip
 
 _RANDOM: Fields = {
     "steering": "random", "onset": (0.0, 1.0), "frequency": (0.3, 0.4), "frequency_2": (0.4, 0.8),
     "frequency_3": (0.2, 0.3), "frequency_4": (0.4, 0.6),
 }  # fmt: skip
 _SLALOM: Fields = {"steering": "slalom", "onset": (0.5, 1.5), "frequency": (0.2, 0.6)}
-_STEP: Fields = {
-    "duration": 8.0, "steering": "step", "onset": (0.5, 1.5), "hold": (1.0, 2.0),
-}  # fmt: skip
+_STEP: Fields = {"duration": 8.0, "steering": "step", "onset": (0.5, 1.5), "hold": (1.0, 2.0)}
 _SINE_WITH_DWELL: Fields = {  # FMVSS 126: 0.7 Hz, and half a second at the second peak
     "duration": 6.0, "steering": "sine-with-dwell", "onset": (0.5, 1.0), "frequency": (0.6, 0.8),
     "hold": 0.5,
@@ -136,12 +128,12 @@ _TWO_B = _make_scenarios(
     # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds no car on the track
     any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
 )
+_AROUND_80 = {"speed": (75.0 * KMH, 85.0 * KMH)}
 _TWO_C = _make_scenarios(
     "2c",
     _CAR | _set_friction(0.6, 1.0),
-    limit_slalom=_set_amplitude(_SLALOM, 0.02, 0.06) | {"speed": (75.0 * KMH, 85.0 * KMH)},
-    limit_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.03, 0.08)
-    | {"speed": (75.0 * KMH, 85.0 * KMH)},
+    limit_slalom=_set_amplitude(_SLALOM, 0.02, 0.06) | _AROUND_80,
+    limit_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.03, 0.08) | _AROUND_80,
     limit_step=_set_amplitude(_STEP, 0.02, 0.06),
     limit_random=_make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
 )
@@ -199,9 +191,7 @@ _WET_ROAD = _CAR | {
 }  # fmt: skip
 _WET_EVASION = Scenario(name="wet-evasion", duration=6.0, steering="driver", **_WET_ROAD)
 
-TIERS: tuple[Scenario, ...] = (
-    *_ONE, *_TWO_A, *_TWO_B, *_TWO_C, *_SMALL_CAR, *_ROAD, *_LIMIT, _RECOVERY
-)  # fmt: skip
+TIERS = (*_ONE, *_TWO_A, *_TWO_B, *_TWO_C, *_SMALL_CAR, *_ROAD, *_LIMIT, _RECOVERY)
 
 
 def _make_stiffness(stiffness: float) -> dict[str, float]:
@@ -245,23 +235,24 @@ _DAKF_STEP = _DAKF.replace(
     gps_outage=None, lags=True,
     vehicle={**_make_stiffness(7000.0), "motor_lag": 0.0, "steering_lag": 0.03},
 )  # fmt: skip
+_DUAL_RATE: Fields = {
+    "duration": 12.0, "steering": "slalom", "onset": 1.0, "amplitude": 0.1, "frequency": 0.25,
+    "gps_period": 0.1, "vehicle": _make_stiffness(7000.0), "nominal": _make_stiffness(9100.0),
+}  # fmt: skip
 # given: slalom with wind; measured is the course, with or without the gyro
-_DUAL = Scenario(
-    name="dual-rate-fig4", duration=12.0, steering="slalom", onset=1.0, amplitude=0.1,
-    frequency=0.25, gps_period=0.1, vehicle=_make_stiffness(7000.0),
-    nominal=_make_stiffness(9100.0), **_WIND, **_SIMULATED,
-)  # fmt: skip
-_TOO_STIFF = {  # given: 30 % on inertia, damping and stiffness, double-layer-gps (43)
-    "roll_inertia": 1.3 * COMS.roll_inertia,
-    "roll_damping": 1.3 * COMS.roll_damping,
-    "roll_stiffness": 1.3 * COMS.roll_stiffness,
-}
+_DUAL = Scenario(name="dual-rate-fig4", **_DUAL_RATE, **_WIND, **_SIMULATED)
+# given: 30 % on inertia, damping and stiffness, double-layer-gps (43)
+_ROLL = ("roll_inertia", "roll_damping", "roll_stiffness")
+_TOO_STIFF = {name: 1.3 * getattr(COMS, name) for name in _ROLL}
 # given: tyres 7000 against 10000, the roll model 30 % off, course and speed at 5 Hz
+_DOUBLE_LAYER: Fields = {
+    "duration": 20.0, "steering": "slalom", "onset": 1.0, "vehicle": _make_stiffness(7000.0),
+    "nominal": _make_stiffness(10000.0) | _TOO_STIFF,
+}  # fmt: skip
 _DOUBLE = Scenario(
-    name="double-layer-fig9", duration=20.0, steering="slalom", onset=1.0, amplitude=0.15,
-    frequency=0.2, wind_force=200.0, wind_height=0.5, wind_start=8.0, wind_length=6.0, surge=0.5,
-    surge_frequency=0.1, vehicle=_make_stiffness(7000.0),
-    nominal={**_make_stiffness(10000.0), **_TOO_STIFF}, **(_SIMULATED | {"roll": True}),
+    name="double-layer-fig9", amplitude=0.15, frequency=0.2, wind_force=200.0, wind_height=0.5,
+    wind_start=8.0, wind_length=6.0, surge=0.5, surge_frequency=0.1,
+    **_DOUBLE_LAYER, **(_SIMULATED | {"roll": True}),
 )  # fmt: skip
 
 SIMULATIONS = (
@@ -287,18 +278,10 @@ _MOTOR = Scenario(
     name="tie-vision-fig10", duration=5.0, steering="lane-change", onset=0.5, amplitude=0.108,
     frequency=0.5, vehicle=_make_stiffness(7200.0), **_ON_THE_ROAD,
 )  # fmt: skip
-# given: tyres 7000 against 10000, the roll model 30 % off, course and speed at 5 Hz
 _DOUBLE_ROAD = Scenario(
-    name="double-layer-fig9-road", duration=20.0, steering="slalom", onset=1.0, amplitude=0.1,
-    frequency=0.3, vehicle=_make_stiffness(7000.0),
-    nominal={**_make_stiffness(10000.0), **_TOO_STIFF}, **_ON_THE_ROAD,
+    name="double-layer-fig9-road", amplitude=0.1, frequency=0.3, **_DOUBLE_LAYER, **_ON_THE_ROAD
 )  # fmt: skip
-# given: a slalom, RTK-GPS
-_DUAL_ROAD = Scenario(
-    name="dual-rate-fig5", duration=12.0, steering="slalom", onset=1.0, amplitude=0.1,
-    frequency=0.25, gps_period=0.1, vehicle=_make_stiffness(7000.0),
-    nominal=_make_stiffness(9100.0), **_ON_THE_ROAD,
-)  # fmt: skip
+_DUAL_ROAD = Scenario(name="dual-rate-fig5", **_DUAL_RATE, **_ON_THE_ROAD)  # given: RTK-GPS
 # given: a lane change by the driver at 20 km/h, course unused 10.5-13.0 s, tyres 7000 against 10000
 _DAKF_DRIVER = Scenario(
     name="dakf-fig8", duration=16.0, steering="lane-change", onset=10.0, amplitude=0.25,
@@ -370,10 +353,8 @@ _ROADS = (
     _WET_EVASION,
 )  # fmt: skip
 
-SCENARIOS: dict[str, Scenario] = {
-    scenario.name: scenario
-    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
-}
+_ALL = (*_MANOEUVRES, *_EASY, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
+SCENARIOS: dict[str, Scenario] = {scenario.name: scenario for scenario in _ALL}
 
 ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
 """Source of a scenario, which `make_scenario` reads."""
@@ -387,17 +368,13 @@ def make_scenario(source: ScenarioSource) -> Scenario:
     name. A CSV or Parquet file (needs the extra `report`) is a recorded drive: its columns for time
     and steering angle (time_s, steer_rad or steer_deg), and speed (speed_x_mps) if it has one, are
     driven again, with `Scenario`'s defaults for all else. A missing file raises FileNotFoundError,
-    an unknown name and a value out of place ValueError.
+    an unknown name and a value out of place ValueError, an unknown field TypeError.
 
     Args:
         source: Name in `SCENARIOS`, path, mapping of fields, or a `Scenario`, returned as it is.
 
     Returns:
         The scenario.
-
-    Raises:
-        TypeError: For an unknown field or another kind of source.
-        type: The reader's error, with the file's name.
     """
     if isinstance(source, Scenario):
         return source
@@ -412,10 +389,8 @@ def make_scenario(source: ScenarioSource) -> Scenario:
         except (TypeError, ValueError) as error:
             raise type(error)(f"{source}: {error}") from None
     if not isinstance(source, str):
-        raise TypeError(
-            "a scenario is a name, the path of a TOML, JSON, CSV or Parquet file or a mapping of "
-            f"fields, got {short_repr(source)}"
-        )
+        kinds = "a name, the path of a TOML, JSON, CSV or Parquet file or a mapping of fields"
+        raise TypeError(f"a scenario is {kinds}, got {short_repr(source)}")
     check_choice("scenario", source, SCENARIOS)
     return SCENARIOS[source]
 
@@ -436,15 +411,13 @@ def _parse_scenario(values: Fields) -> Scenario:
 
 def _read_trace(source: Path) -> Scenario:
     """Read a scenario that steers as a recorded drive, at its first speed, as long as it lasts."""
-    values, _ = read_quantities(source, {}, ("time", "steer"), {"speed_x"})
     try:
+        values, _ = read_quantities(source, {}, ("time", "steer"), {"speed_x"})
         step = find_step(values["time"])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    trace = tuple(values["steer"].tolist())
-    length = round((len(trace) - 1) * step, 9)
-    fields: Fields = {"trace": trace, "trace_step": step, "duration": length}
-    speed = values.get("speed_x", np.zeros(0))
+    trace, speed = tuple(values["steer"].tolist()), values.get("speed_x", np.zeros(0))
+    fields: Fields = {"trace": trace, "duration": round((len(trace) - 1) * step, 9)}
     if len(known_speed := speed[np.isfinite(speed)]):
         fields["speed"] = max(float(known_speed[0]), 0.0)  # noise at rest
-    return Scenario(name=source.stem, steering="trace", **fields)
+    return Scenario(name=source.stem, steering="trace", trace_step=step, **fields)

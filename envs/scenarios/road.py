@@ -1,12 +1,10 @@
 """Roads along a nominal car's path, and test tracks between cones with the driver's path on them.
 
 ISO 3888-1 (double lane change) and ISO 3888-2 (obstacle avoidance) fix the lengths; the lanes'
-widths grow with the vehicle's. A slower car drives the lengths scaled by its speed: times and
-lateral acceleration stay. ISO 3888-1's offset of 3.5 m is taken between the right edges of the
-lanes; the last lane's right edge is in line with the first's in both.
+widths grow with the vehicle's. A slower car drives the lengths scaled by its speed. ISO 3888-1's
+offset of 3.5 m is taken between the lanes' right edges; the last's is in line with the first's.
 """
 
-from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -50,10 +48,8 @@ def step_nominal_car(
     a11, a12, a21, a22, b11, b21, _ = compute_bicycle_coefficients(car, V)
     dbeta = a11 * nominal_motion.beta + a12 * nominal_motion.gamma + b11 * steer
     dgamma = a21 * nominal_motion.beta + a22 * nominal_motion.gamma + b21 * steer
-    next_motion = NominalMotion(
-        nominal_motion.beta + TICK * dbeta, nominal_motion.gamma + TICK * dgamma
-    )
-    return nominal_motion.gamma + dbeta, next_motion
+    beta, gamma = nominal_motion.beta + TICK * dbeta, nominal_motion.gamma + TICK * dgamma
+    return nominal_motion.gamma + dbeta, NominalMotion(beta, gamma)
 
 
 _TRANSITION_OVERLAP = 0.15  # of a gap's length: the path's transition reaches so far into the lanes
@@ -104,10 +100,7 @@ def _make_iso_3888_2(width: float) -> tuple[Section, ...]:
     )
 
 
-_TRACKS: dict[str, Callable[[float], tuple[Section, ...]]] = {
-    "iso-3888-1": _make_iso_3888_1,
-    "iso-3888-2": _make_iso_3888_2,
-}
+_TRACKS = {"iso-3888-1": _make_iso_3888_1, "iso-3888-2": _make_iso_3888_2}
 PATHS = ("road", *_TRACKS)
 
 
@@ -117,7 +110,7 @@ def make_sections(
     """Make the lanes of a track for a vehicle's width, in the order of driving.
 
     Args:
-        track: Name of the track, of `PATHS`; "road" has no lanes.
+        track: Name of the track, of `PATHS`; "road" has no lanes. ValueError for another.
         width: Width of the vehicle (m).
         start: Place along the road where the first lane begins (m).
         scale: Factor on the lengths.
@@ -125,9 +118,6 @@ def make_sections(
 
     Returns:
         The lanes.
-
-    Raises:
-        ValueError: For an unknown track.
     """
     if track not in PATHS:
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")

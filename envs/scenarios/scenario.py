@@ -59,7 +59,7 @@ def _check_field(entry: dataclasses.Field[object], value: Any) -> None:
         counts = (2,) if name.endswith("outage") else (1, 2, 3, 4)
         fits = isinstance(value, tuple) and len(value) in counts and all(map(is_finite, value))
         if not (fits and min(value) >= 0.0):
-            number = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+            number = " to ".join(map(str, sorted({counts[0], counts[-1]})))
             raise ValueError(f"{name} is {number} times in s, zero or more, got {got}")
         if len(counts) == 1 and value[0] >= value[1]:
             raise ValueError(f"{name} is (from, to), from before to, got {got}")
@@ -70,10 +70,9 @@ def _check_field(entry: dataclasses.Field[object], value: Any) -> None:
         ends = value if is_drawn and isinstance(value, tuple) else (value, value)
         is_any_float = name == "half_width" and isinstance(value, float) and math.isfinite(value)
         is_infinite = entry.default == inf and isinstance(value, float) and value == inf
-        if not ((len(ends) == 2 and all(map(is_finite, ends))) or is_any_float or is_infinite):
+        is_number = len(ends) == 2 and all(map(is_finite, ends))
+        if not (is_number or is_any_float or is_infinite) or (is_drawn and ends[0] > ends[1]):
             raise ValueError(f"{name} {got} is not finite" + is_drawn * ", or its ends are swapped")
-        if is_drawn and ends[0] > ends[1]:
-            raise ValueError(f"{name} {got} is not finite, or its ends are swapped")
         if entry.metadata["plausible"][0] > 0 and ends[0] <= 0.0 and kind != float | None:
             none_text = " or None" if entry.default is None else ""
             raise ValueError(f"{name} must be positive{none_text}, got {value!r}")
@@ -90,9 +89,8 @@ def _check_mapping(name: str, values: object) -> None:
         if name != "noise":
             raise TypeError(describe_unknown(f"parameter of {name}", unknown, known))
         raise ValueError(f"unknown noise {join_names(unknown)}; known: {join_names(known)}")
-    for key, value in values.items() if name == "noise" else ():
-        if not is_finite(value):
-            raise ValueError(f"noise {key} {short_repr(value)} is not finite")
+    if name == "noise" and (bad := [key for key in values if not is_finite(values[key])]):
+        raise ValueError(f"noise {bad[0]} {short_repr(values[bad[0]])} is not finite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,13 +206,11 @@ class Scenario:
 
     def _check_rules(self) -> None:
         """Check what several fields have to fit, or one beyond its type and sign."""
-        path, road, steering, trace = self.path, self.road, self.steering, self.trace
-        is_nominal, period = road == "nominal-path", self.gps_period
-        min_speed = self.range("speed")[0]
+        path, steering, trace, period = self.path, self.steering, self.trace, self.gps_period
+        is_nominal, min_speed = self.road == "nominal-path", self.range("speed")[0]
         n_angles = f"2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none"
         has_angles = (len(trace) > 1) == (steering == "trace") and len(trace) <= _MAX_SAMPLES
         max_slope = max(map(abs, (*self.range("bank"), self.grade)))
-        is_changing = bool(self.speed_change or self.surge)
         rules = [
             (path == "road" or steering == "driver",
              f"path {path!r} needs the steering 'driver', got {steering!r}"),
@@ -225,7 +221,6 @@ class Scenario:
             (self.path_speed is None or path != "road",
              "path_speed needs a track as path; a road has no lengths to scale"),
             (self.duration >= TICK, f"duration {self.duration!r} s is less than {TICK}"),
-            (self.driver_lag >= 0.0, f"driver_lag is zero or more, got {self.driver_lag!r}"),
             *((self.tyre_change_time is not None or self.range(name) == (1.0, 1.0),
                f"{name} {getattr(self, name)!r} needs a tyre_change_time, from which it acts")
               for name in ("front_change", "rear_change", "friction_change")),
@@ -237,7 +232,7 @@ class Scenario:
              "speed must not be negative, with speed_change or without"),
             (self.change_length >= TICK,
              f"change_length is {TICK:g} s at least, got {self.change_length!r}"),
-            (self.acceleration is None or not is_changing,
+            (self.acceleration is None or not (self.speed_change or self.surge),
              "speed_change and surge need the held speed (acceleration None)"),
             (self.path_speed is None or min_speed > 0.0, "path_speed needs a speed above zero"),
             (max_slope <= 0.5,
@@ -248,7 +243,7 @@ class Scenario:
             (period is None or period >= MIN_GPS_PERIOD,
              f"gps_period is {MIN_GPS_PERIOD} s or more, got {period!r}"),
             *((self.range(name)[0] >= 0.0, f"{name} is zero or more, got {getattr(self, name)!r}")
-              for name in ("gps_latency", "camera_jitter", "wind_length")),
+              for name in ("driver_lag", "gps_latency", "camera_jitter", "wind_length")),
             (0.0 <= self.camera_loss < 1.0,
              f"camera_loss is a probability below 1, got {self.camera_loss!r}"),
             (not self.camera_jitter or self.camera_delays is not None,
@@ -281,13 +276,9 @@ class Scenario:
             (low, high), each of shape (len(Draws),).
         """
         sides = (0.0, 1.0) if self.mirror else (1.0, 1.0)
-        ranges = {name: getattr(world, name) for name in World.__dataclass_fields__}
-        ranges |= dict.fromkeys(_SIDES, sides) | {"phase": (0.0, float(not world.is_ideal))}
-        ends = [
-            get_range(ranges[name]) if name in ranges else self.range(name)
-            for name in Draws._fields
-        ]
-        low, high = np.array(ends).T.copy()
+        ranges = vars(self) | vars(world) | dict.fromkeys(_SIDES, sides)
+        ranges["phase"] = (0.0, float(not world.is_ideal))
+        low, high = np.array([get_range(ranges[name]) for name in Draws._fields]).T.copy()
         return low, high
 
     @property
@@ -322,8 +313,7 @@ class Scenario:
         values: dict[str, object] = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
-            default = {} if entry.default_factory is dict else entry.default
-            if value != default:
+            if value != ({} if entry.default_factory is dict else entry.default):
                 value = dict(value) if isinstance(value, Mapping) else value
                 values[entry.name] = list(value) if isinstance(value, tuple) else value
         return values

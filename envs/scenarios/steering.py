@@ -46,10 +46,8 @@ def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
     angle = 0.0
     for i in range(SINES):
         start = load_element(profile, 5 * i + 3)
-        s, _ = sincos(
-            load_element(profile, 5 * i + 1) * ((tick - start) * TICK)
-            + load_element(profile, 5 * i + 2)
-        )
+        turned = load_element(profile, 5 * i + 1) * ((tick - start) * TICK)
+        s, _ = sincos(turned + load_element(profile, 5 * i + 2))
         is_active = (tick >= start) & (tick < load_element(profile, 5 * i + 4))
         angle = angle + select(is_active, load_element(profile, 5 * i) * s, 0.0)
     for i in range(STEPS):
@@ -59,19 +57,17 @@ def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
     k = _RAMP_START
     is_used = load_element(profile, k) != 0.0
     if any_lane(is_used):
-        share = (tick - load_element(profile, k + 1)) / select(
-            is_used, load_element(profile, k + 2), 1.0
-        )
+        rise = select(is_used, load_element(profile, k + 2), 1.0)
+        share = (tick - load_element(profile, k + 1)) / rise
         angle = angle + load_element(profile, k) * minimum(maximum(share, 0.0), 1.0)
     k = _SWEEP_START
     is_used = load_element(profile, k) != 0.0
     if any_lane(is_used):
         t = maximum(tick - load_element(profile, k + 3), 0.0) * TICK
         sweep_time = minimum(t, load_element(profile, k + 4))
-        phase = load_element(profile, k + 1) * t + load_element(profile, k + 2) * (
-            0.5 * sweep_time * sweep_time / select(is_used, load_element(profile, k + 4), 1.0)
-            + (t - sweep_time)
-        )
+        length = select(is_used, load_element(profile, k + 4), 1.0)
+        chirp = 0.5 * sweep_time * sweep_time / length + (t - sweep_time)
+        phase = load_element(profile, k + 1) * t + load_element(profile, k + 2) * chirp
         angle = angle + load_element(profile, k) * sincos(phase)[0]
     k = _LEAD_START
     if any_lane(load_element(profile, k) != 0.0):
@@ -121,11 +117,9 @@ def _write_sine(
     profile: Vector, i: int, amplitude: Scalar, hertz: Scalar, start: Scalar, end: Scalar
 ) -> None:
     """Write sine i (rad) between two ticks, with phase 0 at its start."""
-    profile[5 * i] = amplitude
-    profile[5 * i + 1] = 2.0 * PI * hertz
-    profile[5 * i + 2] = 0.0
-    profile[5 * i + 3] = start
-    profile[5 * i + 4] = end
+    k = 5 * i
+    profile[k], profile[k + 1], profile[k + 2] = amplitude, 2.0 * PI * hertz, 0.0
+    profile[k + 3], profile[k + 4] = start, end
 
 
 @jit
@@ -190,11 +184,10 @@ def write_steering(kind: int, d: Draws, profile: Vector) -> None:
     elif kind == RANDOM:
         second = select(d.side < 0.5, -d.amplitude_2, d.amplitude_2)
         _write_sine(profile, 0, a, d.frequency, start, FOREVER)
+        fourth = -second * (d.frequency_4 / d.frequency_3)
         _write_sine(profile, 1, -a * (d.frequency_2 / d.frequency), d.frequency_2, start, FOREVER)
         _write_sine(profile, 2, second, d.frequency_3, start, FOREVER)
-        _write_sine(
-            profile, 3, -second * (d.frequency_4 / d.frequency_3), d.frequency_4, start, FOREVER
-        )
+        _write_sine(profile, 3, fourth, d.frequency_4, start, FOREVER)
     elif kind == SINE_WITH_DWELL:
         _write_dwell(profile, a, d.frequency, start, round_to_ticks(d.hold))
     elif kind == RAMP:

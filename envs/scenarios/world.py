@@ -1,8 +1,7 @@
 """`World`: what calibration leaves over in car and sensors, drawn by the seed, told to nobody.
 
-A range is what the seed draws from uniformly. The default of every range is the ideal world, in
-which nothing errs; `WORLDS["v1"]` is in `v1.toml` with the source of
-each range. The table in the docs is made of both.
+The default of every range is the ideal world, in which nothing errs; `WORLDS["v1"]` is in
+`v1.toml` with the source of each range. The table in the docs is made of both.
 """
 
 import dataclasses
@@ -102,9 +101,7 @@ class World:
         return self == IDEAL
 
     def scale(self, group: str, factor: float) -> "World":
-        """Scale the ranges of a group about the ideal: 0 takes its errors away, 2 doubles them.
-
-        Lengths, periods and times of an error stay: its amplitude alone is scaled.
+        """Scale a group's amplitudes about the ideal: 0 takes its errors away, 2 doubles them.
 
         Args:
             group: Name in `GROUPS`.
@@ -115,22 +112,20 @@ class World:
         """
         check_choice("group of a world", group, GROUPS)
         changes: dict[str, object] = {}
-        for entry in dataclasses.fields(self):
-            is_shape = entry.name in _SHAPES and factor > 0.0
-            if entry.metadata.get("group") == group and not is_shape:
-                ideal, low_high = getattr(IDEAL, entry.name), get_range(getattr(self, entry.name))
+        for name, entry in self.__dataclass_fields__.items():
+            if entry.metadata.get("group") == group and not (name in _SHAPES and factor > 0.0):
+                ideal, low_high = getattr(IDEAL, name), get_range(getattr(self, name))
                 ends = [ideal + factor * (end - ideal) for end in low_high]
-                changes[entry.name] = tuple(ends) if ends[0] < ends[1] else ends[0]
+                changes[name] = tuple(ends) if ends[0] < ends[1] else ends[0]
         return make_world(self.to_dict() | changes)
 
     def to_dict(self) -> dict[str, object]:
         """Convert to JSON types without defaults, which `make_world` reads back."""
-        changed = {
-            entry.name: getattr(self, entry.name)
-            for entry in dataclasses.fields(self)
-            if getattr(self, entry.name) != entry.default
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+            if value != getattr(IDEAL, name)
         }
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in changed.items()}
 
 
 _SHAPES = ("course_period", "map_length", "bank_length", "friction_length", "torque_rate")
@@ -150,15 +145,13 @@ WorldSource = str | Mapping[str, Any] | World
 def make_world(source: WorldSource) -> World:
     """Make a world from its name, a mapping of fields or a world itself.
 
+    Raises TypeError for an unknown field, and ValueError for an unknown name or a bad value.
+
     Args:
         source: Name in `WORLDS`; mapping of fields, over another world under `base`; or a `World`.
 
     Returns:
         The world.
-
-    Raises:
-        TypeError: For an unknown field or another kind of source.
-        ValueError: For an unknown name or a value out of place.
     """
     if isinstance(source, World):
         return source

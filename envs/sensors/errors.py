@@ -100,13 +100,7 @@ def apply_sensor_errors(
         row[0] + (errors.gyro_scale - 1.0) * motion.gamma + state.gyro,
         row[1] + excess * accel[1] + state.vibration,
         row[2] + excess * accel[0],
-        row[3],
-        errors.wheel_left * row[4],
-        errors.wheel_right * row[5],
-        scale * row[6] + offset,
-        row[7],
-        row[8],
-        scale * row[9] + offset,
-        row[10],
-        state.curvature,
-    )
+        row[3], errors.wheel_left * row[4], errors.wheel_right * row[5],
+        scale * row[6] + offset, row[7], row[8],
+        scale * row[9] + offset, row[10], state.curvature,
+    )  # fmt: skip

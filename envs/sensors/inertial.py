@@ -75,13 +75,8 @@ def compute_fast_row(
         motion.phi_dot + noise.roll_rate * n[3],
         motion.v_x - half + noise.wheel * wheels[0],
         motion.v_x + half + noise.wheel * wheels[1],
-        applied[0],
-        applied[1],
-        applied[2],
-        applied[3],
-        applied[4],
-        applied[5],
-    )
+        applied[0], applied[1], applied[2], applied[3], applied[4], applied[5],
+    )  # fmt: skip
 
 
 class Noise(NamedTuple):

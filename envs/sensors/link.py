@@ -46,10 +46,8 @@ class SlowSensor:
             raise ValueError(f"expected one to four delays, got {short_repr(self.delays)}")
         times = (*self.delays, self.jitter, 0.0 if self.phase is None else self.phase)
         if not all(is_finite(time) and time >= 0.0 for time in times):
-            raise ValueError(
-                "a slow sensor's delays, jitter and phase must be finite and not negative, "
-                f"got {short_repr(times)}"
-            )
+            rule = "a slow sensor's delays, jitter and phase must be finite and not negative"
+            raise ValueError(f"{rule}, got {short_repr(times)}")
         object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
         for name in ("loss", "duplicate"):
             value = getattr(self, name)
@@ -89,11 +87,9 @@ class Link(NamedTuple):
 
 
 def make_link(
-    sensor: SlowSensor | None,
-    outage: tuple[float, float] | None = None,
-    max_stamp: float = 0.0,
+    sensor: SlowSensor | None, outage: tuple[float, float] | None = None, max_stamp: float = 0.0
 ) -> Link:
-    """Convert a slow sensor to ticks.
+    """Convert a slow sensor to ticks; ValueError for more packets under way than the queue holds.
 
     Args:
         sensor: Clock and link; None: an absent sensor.
@@ -102,13 +98,10 @@ def make_link(
 
     Returns:
         The link, whose stamp is 0 until one is drawn.
-
-    Raises:
-        ValueError: If more packets could be under way at once than the queue holds.
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
-    delays = [count_ticks(delay) for delay in sensor.delays]
+    delays = list(map(count_ticks, sensor.delays))
     phase = -1.0 if sensor.phase is None else count_ticks(sensor.phase)
     link = Link._make(
         [count_ticks(sensor.period), phase, float(len(delays)), *delays, *[0.0] * (4 - len(delays)),
@@ -146,10 +139,9 @@ def compute_arrivals(
         jitter_share, loss_share, duplicate_share, second_share = draw_uniforms(
             key_low, key_high, to_int(tick), block
         )
-    delay_index = frame - link.n_delays * floor(frame / link.n_delays)
-    delay = select(delay_index == 1.0, link.delay_1, link.delay_0)
-    delay = select(delay_index == 2.0, link.delay_2, delay)
-    delay = select(delay_index == 3.0, link.delay_3, delay)
+    i = frame - link.n_delays * floor(frame / link.n_delays)
+    delay = select(i == 1.0, link.delay_1, link.delay_0)
+    delay = select(i == 3.0, link.delay_3, select(i == 2.0, link.delay_2, delay))
     first = tick + delay + floor(jitter_share * (link.jitter + 1.0))
     is_outage = (tick >= link.outage_start) & (tick < link.outage_end)
     is_lost = is_outage | (loss_share < link.loss)

@@ -1,7 +1,6 @@
 """The slow sensors: their table, a sample of any of them, the GPS, and the sensors of each id.
 
-A new one is a file beside `camera`, a row of `SLOW` and a branch of `sample_sensor`: packets,
-observation, random numbers, reset and the gradient engine follow from the table.
+A new one is a file beside `camera`, a row of `SLOW` and a branch of `sample_sensor`.
 """
 
 import dataclasses
@@ -32,15 +31,12 @@ from .link import Blocks, Link, PacketValue, SlowKind, SlowSensor
 GPS_KIND = SlowKind(
     "gps",
     (
-        PacketValue("course", "rad", PI),
-        PacketValue("speed", "m/s", 100.0),
-        PacketValue("X", "m", 1e5),
-        PacketValue("Y", "m", 1e5),
-        PacketValue("hdop", "-", 100.0),
-        PacketValue("satellites", "-", 50.0),
+        PacketValue("course", "rad", PI), PacketValue("speed", "m/s", 100.0),
+        PacketValue("X", "m", 1e5), PacketValue("Y", "m", 1e5),
+        PacketValue("hdop", "-", 100.0), PacketValue("satellites", "-", 50.0),
     ),
     Blocks(noise=CHANNELS.gps, link=CHANNELS.gps_link, drift=CHANNELS.sky),
-)
+)  # fmt: skip
 COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
 HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
 """Weights w by law: the GPS's standard deviations are (1 + w (HDOP - 1)) times those of `Noise`."""
@@ -193,7 +189,7 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
 def apply_changes(
     sensors: dict[str, SlowSensor], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, SlowSensor]:
-    """Replace some fields of slow sensors.
+    """Replace some fields of slow sensors; ValueError for an absent one, TypeError for a field.
 
     Args:
         sensors: Slow sensors by name.
@@ -201,10 +197,6 @@ def apply_changes(
 
     Returns:
         Slow sensors by name.
-
-    Raises:
-        ValueError: For a sensor that is absent.
-        TypeError: For an unknown field.
     """
     changed = dict(sensors)
     for name, fields in changes.items():

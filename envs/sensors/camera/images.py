@@ -1,7 +1,6 @@
 """Pictures of the road: markings, bends, roll and pitch, shadow, wear, blur and noise.
 
-Each pixel has the road's brightness, averaged over the pixel's footprint on the road's plane. Needs
-the extra `vision`.
+Each pixel has the road's brightness averaged over its footprint. Needs the extra `vision`.
 """
 
 from dataclasses import dataclass, fields
@@ -77,30 +76,27 @@ class RoadRenderer:
         rows: tuple[int, int] | None = None,
     ) -> None:
         self.camera, self.appearance = camera, appearance or Appearance()
-        first, last = rows or (0, camera.size[1])
-        self.rows = slice(first, last)
-        self._rays = np.moveaxis(camera.compute_rays(first, last), -1, 0).astype(np.float32).copy()
+        self.rows = slice(*(rows or (0, camera.size[1])))
+        self._rays = np.array(_compute_rays(camera, self.rows), np.float32)
 
     def render_picture(self, scene: RoadScene, seed: int | tuple[int, int] = 0) -> Image:
         """Render the picture of a scene.
 
         Args:
             scene: Place of the car on the road.
-            seed: Seed of the noise: a number, or (key, tick) for key and counter of
-                `np.random.Philox`.
+            seed: Key of the noise's `np.random.Philox`, or (key, tick) with its counter.
 
         Returns:
             Grey levels, shape (height, width).
         """
-        camera, style = self.camera, self.appearance
-        light = self._render_road(scene)
+        style, light = self.appearance, self._render_road(scene)
         if style.blur > 0.0:
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), style.blur), np.float32)
         if style.noise > 0.0:
             key, tick = seed if isinstance(seed, tuple) else (int(seed), 0)
             rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, tick]))
             light += style.noise * rng.standard_normal(light.shape, np.float32)
-        image = np.zeros(camera.size[::-1], np.uint8)
+        image = np.zeros(self.camera.size[::-1], np.uint8)
         image[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
         return image
 
@@ -133,6 +129,14 @@ class RoadRenderer:
         verge = np.abs(d) > 0.5 * style.lane_width + _VERGE
         light = np.where(is_road, np.where(verge, np.float32(_GRASS), light), np.float32(_SKY))
         return np.asarray(light, np.float32)
+
+
+def _compute_rays(camera: Pinhole, rows: slice) -> npt.NDArray[np.float64]:
+    """Compute the pixels' directions in car axes, of unit depth, shape (3, rows, width)."""
+    grid = np.stack(np.meshgrid(np.arange(camera.size[0]), np.arange(rows.start, rows.stop)), -1)
+    across, down = np.moveaxis(camera.undistort(grid.astype(float)), -1, 0)
+    s, c = sin(camera.tilt), cos(camera.tilt)
+    return np.stack([c - s * down, -across, -s - c * down])
 
 
 def _make_rotation(roll: float, pitch: float) -> npt.NDArray[np.float64]:

@@ -93,10 +93,8 @@ def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> li
     a, b, c = _draw_triples(x, y, weight, rng).astype(np.float32)[..., None]
     if not len(a):
         return []
-    if len(x) > _MAX_COUNTED:
-        subset = rng.permutation(len(x))[:_MAX_COUNTED]
-        x, y, weight = x[subset], y[subset], weight[subset]
-    x, y, weight = (array.astype(np.float32) for array in (x, y, weight))
+    subset = rng.permutation(len(x))[:_MAX_COUNTED] if len(x) > _MAX_COUNTED else slice(None)
+    x, y, weight = (array[subset].astype(np.float32) for array in (x, y, weight))
     residual, reach = y - (c + b * x + 0.5 * a * x * x), _compute_tolerance(x)
     own_score = (np.abs(residual) < reach) @ weight
     starts = []
@@ -177,10 +175,9 @@ def _fit_lane(
         values = values - inverse @ (rows.T @ (weight * r) + prior * values)
     _, d = project_points(*values[3:])
     side = np.sign(d) * (np.abs(d - half * np.sign(d)) < 0.8 * _compute_tolerance(x))
-    l_pre = mount.preview
-    preview_row = np.array([l_pre, 1.0, -0.5 * l_pre * l_pre])
-    error = np.sqrt(np.array([inverse[0, 0], preview_row @ inverse[:3, :3] @ preview_row]))
-    psi, offset, kappa, pitch, roll = map(float, values)
+    row = np.array([mount.preview, 1.0, -0.5 * mount.preview * mount.preview])
+    error = np.sqrt(np.array([inverse[0, 0], row @ inverse[:3, :3] @ row]))
+    psi, offset, kappa, pitch, roll = values.tolist()
     return _LaneFit(psi, offset, kappa, pitch, roll, side.astype(np.int64), error)
 
 
@@ -197,14 +194,12 @@ class Lane(NamedTuple):
         """Describe the lane in one line."""
         if self.quality == 0.0:
             return "no lane"
-        return (
-            f"psi {np.degrees(self.psi):+.2f} deg, offset {self.y:+.2f} m, "
-            f"curvature {self.curvature:+.4f} 1/m, quality {self.quality:.2f}"
-        )
+        place = f"psi {np.degrees(self.psi):+.2f} deg, offset {self.y:+.2f} m"
+        return f"{place}, curvature {self.curvature:+.4f} 1/m, quality {self.quality:.2f}"
 
 
 class LaneFinder:
-    """Finds the lane in a camera's pictures.
+    """Finds the lane in a camera's pictures; ValueError for a camera that does not see the road.
 
     Args:
         camera: Camera with its mounting.
@@ -212,12 +207,6 @@ class LaneFinder:
         near: Distance ahead of the car where the search begins (m).
         far: Distance ahead where it ends (m).
         view: Limits beyond which the lane counts as lost; None for no limits.
-
-    Attributes:
-        rows_ahead: Distance ahead of each row that is searched (m), shape (rows,).
-
-    Raises:
-        ValueError: For distances out of order, or a camera that does not see this part of the road.
     """
 
     def __init__(
@@ -235,7 +224,7 @@ class LaneFinder:
         self._scale = scale = camera.size[0] / WORKING_WIDTH
         self._mount = _CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
-        self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
+        self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))  # m
         self._y = np.arange(_SEARCHED, -_SEARCHED, -_CELL)
         pixels = camera.project_points(self.rows_ahead[:, None], self._y)
         self._visible = np.isfinite(pixels[..., 0])
@@ -257,22 +246,18 @@ class LaneFinder:
         self.points: Array = np.zeros((0, 2))
 
     def find(self, picture: Image) -> Lane:
-        """Find the lane in a picture.
+        """Find the lane in a picture; ValueError for one of another size than the camera's.
 
         Args:
             picture: Bytes, grey (height, width) or blue, green, red (height, width, 3).
 
         Returns:
             The lane, all 0 where none was found.
-
-        Raises:
-            ValueError: For a picture of another size than the camera's.
         """
-        if picture.shape[1::-1] != self.camera.size or picture.dtype != np.uint8:
-            raise ValueError(
-                f"expected a picture of {self.camera.size} pixels in bytes, got "
-                f"{picture.shape[1::-1]} in {picture.dtype}"
-            )
+        size = picture.shape[1::-1]
+        if size != self.camera.size or picture.dtype != np.uint8:
+            got = f"{size} in {picture.dtype}"
+            raise ValueError(f"expected a picture of {self.camera.size} pixels in bytes, got {got}")
         x, y, strength = self._find_ridges(resample(picture))
         self.points, self.fit = np.stack([x, y], 1), None
         focal = self.camera.K[0][0] / self._scale
@@ -308,12 +293,9 @@ class LaneFinder:
 
     def _compute_quality(self, lane_fit: _LaneFit, x: Array) -> float:
         """The rarer marking's rows, of those that suffice; less in bad light or if uncertain."""
-        uncertainty = float(np.max(lane_fit.error / _WORST))
-        if uncertainty > 1.0:
-            return 0.0
-        if self.view is not None and (
-            abs(lane_fit.psi) > self.view.heading or abs(lane_fit.y) > self.view.offset
-        ):
+        uncertainty, view = float(np.max(lane_fit.error / _WORST)), self.view
+        is_outside = view and (abs(lane_fit.psi) > view.heading or abs(lane_fit.y) > view.offset)
+        if uncertainty > 1.0 or is_outside:
             return 0.0
         shares = []
         density = len(x) / max(self._inner.sum() * _CELL, 1.0)  # points in a metre of a row
@@ -331,11 +313,10 @@ class LaneFinder:
 
     def _find_visible_rows(self, lane_fit: _LaneFit, side: int) -> Array:
         """Whether a marking would be seen in each row, shape (rows,)."""
-        y = self.locate_marking(lane_fit, side)
-        column = np.round((self._y[0] - y) / _CELL)
+        column = np.round((self._y[0] - self.locate_marking(lane_fit, side)) / _CELL)
         is_inside = (column >= 1) & (column <= len(self._y) - 2)
         inner_column = np.where(is_inside, column, 1).astype(int) - 1
-        return np.asarray(is_inside & self._inner[np.arange(len(y)), inner_column])
+        return np.asarray(is_inside & self._inner[np.arange(len(column)), inner_column])
 
     def locate_marking(self, lane_fit: _LaneFit, side: int) -> Array:
         """Compute the lateral place of a marking in every row, at `rows_ahead`.
@@ -347,12 +328,10 @@ class LaneFinder:
         Returns:
             Y to the left of the car (m), shape (rows,).
         """
-        offset = 0.5 * side * self._mount.width
+        psi, offset, kappa, pitch, roll = lane_fit[:5]
         y = np.zeros_like(self.rows_ahead)
         for _ in range(6):  # Newton, on the distance across the lane
-            x, level = _correct_attitude(
-                self.rows_ahead, y, lane_fit.pitch, lane_fit.roll, self._mount
-            )
-            _, d = _project_to_lane(x, level, lane_fit.psi, lane_fit.y, lane_fit.kappa)
-            y = y - (d - offset) / np.cos(lane_fit.psi - lane_fit.kappa * x)
+            x, level = _correct_attitude(self.rows_ahead, y, pitch, roll, self._mount)
+            _, d = _project_to_lane(x, level, psi, offset, kappa)
+            y = y - (d - 0.5 * side * self._mount.width) / np.cos(psi - kappa * x)
         return y

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator, Sequence
 from math import atan, cos
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -23,16 +23,13 @@ PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def read_picture(path: "str | os.PathLike[str]") -> Image:
-    """Read a picture from a file; FileNotFoundError where it is missing.
+    """Read a picture from a file; FileNotFoundError without it, ValueError for a broken one.
 
     Args:
         path: Path of the file.
 
     Returns:
         Bytes in blue, green, red, shape (height, width, 3).
-
-    Raises:
-        ValueError: For a file that is no whole picture.
     """
     _check_file(path)
     data = np.fromfile(path, np.uint8)
@@ -43,26 +40,18 @@ def read_picture(path: "str | os.PathLike[str]") -> Image:
 
 
 class Film:
-    """The frames of a film, as pictures; FileNotFoundError where the file is missing.
+    """The frames of a film; FileNotFoundError without the file, ValueError without a first frame.
 
     Args:
         path: Path of the file.
-
-    Attributes:
-        frame_count: Number of frames by the file's header.
-        rate: Frames per second.
-
-    Raises:
-        ValueError: For a file without a first frame.
     """
 
     def __init__(self, path: "str | os.PathLike[str]") -> None:
         _check_file(path)
         self._reader = cv2.VideoCapture(str(path))
-        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0
-        first = self._read_frame()
-        if first is None:
+        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)  # of the header
+        self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0  # frames a second
+        if (first := self._read_frame()) is None:
             raise ValueError(f"{path}: this is no film that can be read")
         self._buffer = [first]
 
@@ -86,10 +75,8 @@ class Film:
 
     def __iter__(self) -> Iterator[Image]:
         """Iterate over the frames, once, until the file or its undamaged part ends."""
-        while self._buffer:
+        while self.read_head(1):
             yield self._buffer.pop(0)
-        while (frame := self._read_frame()) is not None:
-            yield frame
 
 
 def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
@@ -114,13 +101,11 @@ def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
         shown = cv2.addWeighted(filled, 0.3, shown, 0.7, 0.0)
         for edge, colour in ((left, (0, 120, 255)), (right, (255, 160, 0))):
             cv2.polylines(shown, [edge], False, colour, 2 * thick, cv2.LINE_AA)
-    size = 0.3 * thick
+    size, font = 0.3 * thick, cv2.FONT_HERSHEY_SIMPLEX
     place = int(30 * size), int(50 * size)
-    for colour, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
-        cv2.putText(
-            shown, lane.describe(), place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width,
-            cv2.LINE_AA,
-        )  # fmt: skip
+    for grey, width in ((0, 3 * thick), (255, thick)):
+        style = font, size, (grey, grey, grey), width, cv2.LINE_AA
+        cv2.putText(shown, lane.describe(), place, *style)
     return np.asarray(shown, np.uint8)
 
 
@@ -158,6 +143,8 @@ def make_default_camera(size: tuple[int, int]) -> Pinhole:
 def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
     """Estimate the tilt and the height of a camera from a picture of a straight lane.
 
+    Raises ValueError if two markings are not found, or fit no straight lane from a car's height.
+
     Args:
         camera: The camera, whose tilt and height are not used.
         picture: Bytes, grey (height, width) or in colour (height, width, 3).
@@ -165,13 +152,8 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
 
     Returns:
         The camera with this tilt and height.
-
-    Raises:
-        ValueError: If two markings are not found, or fit no straight lane from a car's height.
     """
-    points, weight = _find_ridges(camera, picture)
-    pair = _find_pair(points, weight)
-    if pair is None:
+    if (pair := _find_pair(*_find_ridges(camera, picture))) is None:
         raise ValueError("no lane: no pair of markings was found; pass the camera tilt and height")
     (a, b), (c, d) = pair  # across = a + b down, left and right
     down = (a - c) / (d - b)
@@ -216,8 +198,8 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
         b = (across[j] - across[i]) / (down[j] - down[i])
     is_marking = (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
     is_marking &= np.abs(down[j] - down[i]) > 0.05
-    b = b[is_marking, None]
-    a = across[i[is_marking], None] - b * down[i[is_marking], None]
+    b, i = b[is_marking, None], i[is_marking]
+    a = across[i, None] - b * down[i, None]
     support = (np.abs(across - a - b * down) < _LINE_TOLERANCE * (1.0 + np.abs(b))) @ weight
     a, b = a[:, 0], b[:, 0]
     left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
@@ -244,15 +226,14 @@ def calibrate_camera(
 ) -> tuple[Pinhole, float]:
     """Compute a camera's intrinsics from photographs of a chessboard; tilt and height are defaults.
 
+    Raises ValueError if fewer than three show a board, or photographs have different sizes.
+
     Args:
         paths: Files of the photographs; those without a board are skipped.
         corners: Inner corners of the board along its two sides.
 
     Returns:
         The camera, and the root mean square error of the corners (px).
-
-    Raises:
-        ValueError: If fewer than three show a board, or photographs have different sizes.
     """
     board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
@@ -267,16 +248,13 @@ def calibrate_camera(
             stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
             corner_sets.append(cv2.cornerSubPix(grey, places, (8, 8), (-1, -1), stop))
             sizes.add((grey.shape[1], grey.shape[0]))
-    if len(corner_sets) < _MIN_BOARDS:
+    if (count := len(corner_sets)) < _MIN_BOARDS:
         raise ValueError(
-            f"{len(corner_sets)} of {len(paths)} files show a chessboard of {corners[0]} x "
-            f"{corners[1]} inner corners; expected {_MIN_BOARDS} or more"
+            f"{count} of {len(paths)} files show a chessboard of {corners[0]} x {corners[1]} inner "
+            f"corners; expected {_MIN_BOARDS} or more"
         )
     if len(sizes) > 1:
         raise ValueError(f"the boards' photographs have different sizes: {sorted(sizes)}")
-    (size,) = sizes
-    start: Any = None
-    error, K, dist, *_ = cv2.calibrateCamera(
-        [board] * len(corner_sets), corner_sets, size, start, start
-    )
+    (size,), start = sizes, cast(Any, None)
+    error, K, dist, *_ = cv2.calibrateCamera([board] * count, corner_sets, size, start, start)
     return Pinhole(K=tuple(map(tuple, K)), dist=tuple(dist.ravel()[:5]), size=size), float(error)

@@ -52,26 +52,21 @@ class Pinhole:
             if not is_finite(getattr(self, name)):
                 raise ValueError(f"{name} is a number, got {short_repr(getattr(self, name))}")
         if not (self.height > 0.0 and self.rate > 0.0 and abs(self.tilt) < 1.0):
-            raise ValueError(
-                "height and rate are positive and the tilt is within 1 rad, got "
-                f"{self.height} m, {self.rate} 1/s, {self.tilt} rad"
-            )
+            rule = "height and rate are positive and the tilt is within 1 rad"
+            raise ValueError(f"{rule}, got {self.height} m, {self.rate} 1/s, {self.tilt} rad")
         object.__setattr__(self, "K", tuple(map(tuple, K.tolist())))
         object.__setattr__(self, "dist", tuple(dist.tolist()))
         object.__setattr__(self, "size", size)
 
     @classmethod
     def read(cls, path: "str | os.PathLike[str]") -> "Pinhole":
-        """Read a camera from a TOML or JSON file.
+        """Read a camera from a TOML or JSON file; ValueError for a field missing or out of place.
 
         Args:
             path: Path of the file, which has at least K, dist and size.
 
         Returns:
             The camera.
-
-        Raises:
-            ValueError: For a missing field, an unknown name or a value out of place.
         """
         values = read_document(path, "camera")
         if missing := {"K", "dist", "size"} - values.keys():
@@ -103,10 +98,10 @@ class Pinhole:
             Points, shape (..., 2).
         """
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
-        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+        stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
         K, dist = np.array(self.K), np.array(self.dist)
-        undistorted = cv2.undistortPoints(points, K, dist, criteria=criteria)
-        return np.asarray(undistorted, float).reshape(np.shape(pixels))
+        straight = cv2.undistortPoints(points, K, dist, criteria=stop)
+        return np.asarray(straight, float).reshape(np.shape(pixels))
 
     def project_points(self, x: Array, y: Array) -> Array:
         """Project points of the road to pixels.
@@ -125,28 +120,12 @@ class Pinhole:
         points = np.stack([-y, down, np.where(is_in_front, depth, 1.0)], -1).reshape(-1, 1, 3)
         K, dist = np.array(self.K), np.array(self.dist)
         pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)
-        pixels = np.asarray(pixels, float).reshape(*x.shape, 2)
-        width, height = self.size
-        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+        pixels, size = np.asarray(pixels, float).reshape(*x.shape, 2), np.array(self.size, float)
+        corners = size * [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
         edge = np.linalg.norm(self.undistort(corners), axis=1).max()  # the polynomial's folds
-        is_inside = np.hypot(y, down) <= 1.02 * edge * depth
-        is_inside &= (pixels >= 0.0).all(-1) & (pixels <= np.array([width, height]) - 1.0).all(-1)
-        return np.where((is_in_front & is_inside)[..., None], pixels, np.nan)
-
-    def compute_rays(self, first: int, last: int) -> Array:
-        """Compute the directions of the pixels of some rows in car axes, of unit depth.
-
-        Args:
-            first: Index of the first row.
-            last: Row behind the last one.
-
-        Returns:
-            Directions, shape (last - first, width, 3).
-        """
-        grid = np.stack(np.meshgrid(np.arange(self.size[0]), np.arange(first, last)), -1)
-        across, down = np.moveaxis(self.undistort(grid.astype(float)), -1, 0)
-        s, c = sin(self.tilt), cos(self.tilt)
-        return np.stack([c - s * down, -across, -s - c * down], -1)
+        is_inside = is_in_front & (np.hypot(y, down) <= 1.02 * edge * depth)
+        is_inside &= (pixels >= 0.0).all(-1) & (pixels <= size - 1.0).all(-1)
+        return np.where(is_inside[..., None], pixels, np.nan)
 
 
 def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

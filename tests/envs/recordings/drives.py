@@ -35,8 +35,8 @@ def saved(table: pd.DataFrame, folder: Path, name: str = "drive.csv", sep: str =
 
 def read_log(path: Path, mapping: Mapping[str, str] | None = None) -> Log:
     """The drive of a table that `read_parts` would leave whole."""
-    values, _ = read_quantities(path, mapping or {}, NEEDED, _GAPS)
     try:
+        values, _ = read_quantities(path, mapping or {}, NEEDED, _GAPS)
         return _make_log(values, f"{path.resolve().parent.name}/{path.stem}")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

@@ -138,7 +138,7 @@ def test_the_chart_begins_anew_with_an_episode_and_slides() -> None:
     trace = env.make_render_state().trace
     assert len(trace.select_since(0.0, 10_000)[0]) == 1101
     assert len(trace.select_since(0.0)[0]) <= 800
-    newest = trace.newest[TRACE_POINT.t]
+    newest = trace.rows[-1][TRACE_POINT.t]
     assert newest - trace.select_since(newest - MAX_SPAN)[0][0, 0] <= MAX_SPAN
     env.reset()
     assert len(env.make_render_state().trace.select_since(0.0)[0]) == 1

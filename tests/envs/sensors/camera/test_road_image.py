@@ -14,7 +14,13 @@ from math import atan2, hypot, radians, tan
 from pathlib import Path
 from typing import Any
 
-from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene, _make_rotation
+from sideslip.envs.sensors.camera.images import (
+    Appearance,
+    RoadRenderer,
+    RoadScene,
+    _compute_rays,
+    _make_rotation,
+)
 from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.vehicle.dynamics import RoadParams
 
@@ -122,7 +128,7 @@ def test_a_point_lies_where_its_angles_put_it(x: float, y: float) -> None:
 
 def test_rays_meet_the_road_where_its_points_are_seen() -> None:
     camera = Pinhole()
-    rays = camera.compute_rays(400, 601)
+    rays = np.moveaxis(_compute_rays(camera, slice(400, 601)), 0, -1)
     rows, columns = np.array([400, 450, 600]), np.array([80, 700, 1250])
     ray = rays[rows - 400, columns]
     reach = -camera.height / ray[:, 2]
