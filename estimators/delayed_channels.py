@@ -166,9 +166,6 @@ class LateEstimator(Estimator):
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
 
-    def _step(self, fast: Array, packets: Array) -> None:
-        self.take(fast, len(fast), packets, len(packets))
-
     def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
         """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS."""
         (fast, rows, packets, count), (X, S, nis) = record, outputs

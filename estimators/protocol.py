@@ -84,18 +84,13 @@ EstimatorFactory = Callable[..., EstimatorLike]
 class ForeignEstimator:
     """A user's estimator behind the names that it shares with `Estimator`, its states checked.
 
+    TypeError says that `inner` lacks a member, ValueError that its names are not distinct words.
+
     Args:
         inner: The user's object.
         name: Name for messages.
         dt: Tick (s).
         sensors: Slow sensors of this episode by name.
-
-    Attributes:
-        names: Names of its n states; `units` has their units.
-
-    Raises:
-        TypeError: `inner` lacks a member.
-        ValueError: Its names are not distinct words.
     """
 
     unobservable: tuple[str, ...] = ()
@@ -160,13 +155,10 @@ class ForeignEstimator:
         """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
         Args:
-            source: Record, or a log that has one.
+            source: Record, or a log that has one; ValueError if it is empty or has another tick.
 
         Returns:
             States and standard deviations of the record.
-
-        Raises:
-            ValueError: The record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:

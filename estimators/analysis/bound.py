@@ -1,9 +1,8 @@
 """The best that any estimator can do: the covariance of the optimal filter of the true model.
 
-Defined where the plant is linear (small-angle plant, linear tyres, speed held) and the filter
-knows the vehicle, the noise and the disturbances' statistics; deterministic wind and biases do
-not change it. Of tyres that change and of a gust the filter knows when. A gust's strength is not
-Gaussian: with it this is the least error of a linear estimator.
+Defined where the plant is linear (small-angle plant, linear tyres, speed held) and the filter knows
+vehicle, noise and disturbances' statistics, and when tyres change or a gust blows. Of a gust, whose
+strength is not Gaussian, this is the least error of a linear estimator.
 """
 
 import warnings
@@ -20,8 +19,6 @@ from ..design.models import select_states
 from ..estimator import Estimator
 from ..make import make_estimator
 from ..protocol import UnobservableWarning
-
-_MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
 class VehicleChange(NamedTuple):
@@ -68,12 +65,8 @@ def compute_error_bound(
 
     Returns:
         Standard deviation (rad), shape (K,).
-
-    Raises:
-        ValueError: There are latencies, and the model varies with time.
     """
-    late = any(options.get("latency", {}).values())
-    if late and not (change is None and gust is None):
+    if any(options.get("latency", {}).values()) and not (change is None and gust is None):
         raise ValueError("a bound with latency has no change and no gust")
     prior = dict.fromkeys(select_states(tuple(sensors)), 0.0)
     if gust is not None:  # a state that is a constant, as the road's bank is, but pushes as a force
@@ -108,7 +101,7 @@ def _set_gust_input(filter_: Estimator, arm: float) -> None:
 
 def _copy_model(filter_: Estimator, later: Estimator) -> None:
     """Copy the model of a later filter at its held speed."""
-    for name in _MODEL:
+    for name in ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast"):
         filter_.filters[0][name] = later.filters[0][name]
 
 
@@ -124,7 +117,7 @@ def _run_events(
 ) -> Array:
     """Compute the deviations of beta over the record; each event follows the row at its time."""
     fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)
-    X, S = (np.empty((len(fast), len(filter_.names))) for _ in range(2))
+    X, S = np.empty((2, len(fast), len(filter_.names)))
     ends = [min(round(time / record.dt) + 1, len(fast)) for time, _ in events]
     row = n_arrived = 0
     for i, end in enumerate([*ends, len(fast)]):

@@ -60,12 +60,9 @@ class _DiscreteModel(NamedTuple):
 
 
 def _find_unobservable_subspace(
-    sensors: tuple[str, ...],
-    unknowns: tuple[str, ...],
-    steer: float = 0.0,
-    vehicle: Vehicle = COMS,
-    speed: float = 7.0,
-) -> _UnobservableSubspace:
+    sensors: tuple[str, ...], unknowns: tuple[str, ...], steer: float = 0.0,
+    vehicle: Vehicle = COMS, speed: float = 7.0,
+) -> _UnobservableSubspace:  # fmt: skip
     """Find the unobservable directions of exact-kf's model with unknown constants (Kalman)."""
     names, rows, sd, is_ground = _build_model(sensors, unknowns, vehicle, speed)
     n = len(names)
@@ -124,10 +121,9 @@ def _build_model(
 ) -> _DiscreteModel:
     """Build exact-kf's model at a speed."""
     slow = [name for name in sensors if name in SLOW_NAMES]
-    options: dict[str, object] = {
-        f"{name}_sd": UNKNOWNS[name] for name in unknowns if name != WHEELS
-    }
-    options |= {"slow": slow, "fast": [name for name in sensors if name in ("gyro", "accel_y")]}
+    fast = [name for name in sensors if name in ("gyro", "accel_y")]
+    deviations = {f"{name}_sd": UNKNOWNS[name] for name in unknowns if name != WHEELS}
+    options: dict[str, object] = {"slow": slow, "fast": fast, **deviations}
     clocks = {name: SlowSensor(0.1) for name in slow}
     config = parse_config("exact-kf", FILTERS["exact-kf"], clocks, options)
     layers, _ = assemble(config, vehicle, TICK, speed)

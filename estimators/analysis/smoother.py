@@ -33,9 +33,10 @@ def smooth(
 ) -> Estimates:
     """Compute every state of a log given what was measured up to `lag_seconds` later, or longer.
 
-    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445. ValueError also stands for what
-    `Estimator.run` refuses, and for a filter that is more, or less, than one Kalman filter: two
-    layers, precomputed gains, corrections between samples.
+    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445. ValueError stands for what
+    `Estimator.run` refuses, a lag that is not positive, and a filter that is no single Kalman
+    filter: two layers, precomputed gains, corrections between samples; TypeError for one that is
+    built and has options, or has no `filters` to smooth.
 
     Args:
         estimator: One with gains "covariance" that listens at every tick, whatever its rule for
@@ -47,10 +48,6 @@ def smooth(
 
     Returns:
         States, standard deviations, and the NIS of each packet used at its capture.
-
-    Raises:
-        TypeError: The estimator is built and has options, or has no `filters` to smooth.
-        ValueError: The lag is not positive.
     """
     if isinstance(estimator, str):
         defaults: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
@@ -146,8 +143,7 @@ def _smooth_blocks(
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
     f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
-    span = min(2 * lag, rows)
-    # two, side by side
+    span = min(2 * lag, rows)  # two blocks side by side
     blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,), (n,))]
     done = position = 0  # rows, packets
     for start in range(0, rows, lag):

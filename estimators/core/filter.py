@@ -11,7 +11,7 @@ holds its states in between (`stride`) or predicts them.
 import numpy as np
 
 from ...envs.numerics.functions import sincos
-from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
+from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
@@ -282,28 +282,6 @@ def advance(
             _write_row(layers, gains, j, X, S)
     f.counts[COUNTERS.future] += count - position  # packets of a call without rows
     return rows
-
-
-@jit_nrt
-def step_all(
-    layers: FilterRecords, gains: GainTables, fast: Matrix, packets: Matrix, count: int
-) -> int:
-    """Call `advance` over all rows without outputs: fewer arguments to hand over.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        fast: Fast rows, shape (rows, FAST_WIDTH).
-        packets: Packets, shape (count or more, PACKET_WIDTH).
-        count: Number of packets.
-
-    Returns:
-        Number of rows done.
-    """
-    empty = fast[:0]  # its length is a 0 that is no literal, which would compile `advance` again
-    return advance(
-        layers, gains, fast, len(fast), packets, count, len(empty), empty, empty, empty.reshape(0)
-    )
 
 
 @jit

@@ -36,9 +36,8 @@ _LATENCY = NumberRule(f"is 0 to {_MAX_LATENCY} s or {FIND!r}", lambda v: 0.0 <= 
 _Values = dict[str, Any]  # options by name
 
 
-_NUMBERS = (  # options that every filter has
-    *("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable"),
-)
+# options that every filter has
+_NUMBERS = ("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable")
 _DISTURBANCES = {"F_d", "N_d", "d", "d1", "d2", "d3"}
 
 
@@ -47,9 +46,6 @@ class _Reader:
 
     def __init__(self, name: str, options: Mapping[str, object]) -> None:
         self.name, self._unread, self._known = name, dict(options), list[str]()
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._unread
 
     def add_defaults(self, defaults: Mapping[str, object]) -> None:
         """Add options that the caller left out."""
@@ -130,9 +126,6 @@ def parse_config(
 
     Returns:
         The complete options.
-
-    Raises:
-        reader.make_error: The ValueError for poles that are not one a state.
     """
     reader = _Reader(name, options)
     used = _select_slow_sensors(row, sensors, reader)
@@ -219,14 +212,11 @@ def _select_defaults(
     defaults = dict(row.options)
     fast = options.get("fast", defaults.get("fast", row.fast))
     sensors = {*used, *(fast if isinstance(fast, list | tuple) else [fast]), ""}
-    absent = [
-        name
-        for name, sensor in BIASES.items()
-        if sensor not in sensors or options.get(f"{name}_sd") == 0.0
-    ]
-    left_out = {f"{name}_sd" for name in absent} | {f"{name}_time" for name in absent}
-    left_out |= {f"q_{name}" for name in absent}
-    left_out |= {"model_error"} if TYRES[0] in absent else set()
+    left_out = set[str]()
+    for name, sensor in BIASES.items():
+        if sensor not in sensors or options.get(f"{name}_sd") == 0.0:
+            left_out |= {f"{name}_sd", f"{name}_time", f"q_{name}"}
+            left_out |= {"model_error"} if name == TYRES[0] else set()
     return {key: value for key, value in defaults.items() if key not in left_out}
 
 
@@ -240,9 +230,9 @@ def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) ->
         chosen["intersample"] = reader.read_choice("intersample", default, words)
     known_gains = dual_rate.GAINS if is_dual_rate else ("", "periodic", "covariance")
     gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
-    if gains == "from-29" and chosen["intersample"] != "pseudo":
-        text = "is 'pseudo' for gains='from-29'"
-        raise reader.make_error("intersample", text, chosen["intersample"])
+    rule = chosen["intersample"]
+    if gains == "from-29" and rule != "pseudo":
+        raise reader.make_error("intersample", "is 'pseudo' for gains='from-29'", rule)
     if row.intersample == "single-rate":
         chosen["between"] = reader.read_choice("between", "hold", ("hold", "predict"))
         if chosen["between"] == "hold" and len(used) > 1:
@@ -271,10 +261,10 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
     fast = tuple(word for word in known if word in words)
     if len(fast) != len(words) or known[0] not in fast:
         raise reader.make_error("fast", f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
-    biases: dict[str, float] = {}
-    for name in BIASES:
-        key, unit = f"{name}_sd", STATES[name].unit
-        biases[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, unit)
+    biases = {
+        name: reader.read_number(f"{name}_sd", 0.0, NOT_NEGATIVE, STATES[name].unit)
+        for name in BIASES
+    }
     nominal = [name for name in TYRES if not biases[name] > 0.0]
     if nominal not in (list(TYRES), list(TYRES[2:]), []):
         raise ValueError(f"{reader.name}: {nominal[0]}_sd is above 0 where another tyre's state is")
@@ -287,8 +277,7 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         if BIASES[name] not in (*usable, ""):
             raise reader.make_error(f"{name}_sd", f"needs {BIASES[name]} among {option}", usable)
         if name in WANDER:
-            key = f"{name}_time"
-            times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
+            times[name] = reader.read_number(f"{name}_time", 0.0, NOT_NEGATIVE, "s")
     return {"fast": fast, "bias_sds": biases, "bias_times": times}
 
 

@@ -1,6 +1,5 @@
 """Which states a filter has, what drives them and what its sensors measure.
 
-A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
 A bicycle's states stand in the order of `_ORDER`, as many of them as its sensors need. The first
 states of a model follow its physics ("dense"), the disturbances behind them decay by themselves.
 """
@@ -129,10 +128,8 @@ WANDER = {
 }
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
-"""States that nothing drives but noise, and the sensor that each needs, if any: biases of fast
-sensors, the road's bank, the camera's yaw against the car, what the map's heading errs, what the
-steering sensor measures too much, the error of the accelerometer's scale. The tyres' states count
-as biases too: factors of stiffness, and the reciprocal of friction."""
+"""States that nothing drives but noise, and the sensor that each needs, if any. Option `bias_sds`
+says what they are. The tyres' count too: factors of stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
 _WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 _WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)

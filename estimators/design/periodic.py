@@ -1,13 +1,9 @@
 """The schedule of a slow sensor, and the gains of a filter that repeat with it.
 
-The covariance filter is run over the schedule until its gains repeat. A table of gains has a head
-row; for each step of the cycle a row for every fast measurement (one where there is none); for
-each frame of the pattern a row for every slow row. Pseudo-residuals add K^T and the transposed
-inverse, dual-rate rules a fraction of the innovation for each step. Behind the gains of a step
-stands the upper half of the states' covariance after it.
-
-Without noise the estimation error after a cycle is a matrix times the error before it. Its
-spectral radius decides: above one the filter diverges; at one it has an unobservable direction.
+A table of gains has a head row; for each step of the cycle a row for every fast measurement (one
+where there is none); for each frame of the pattern a row for every slow row. Pseudo-residuals add
+K^T and the transposed inverse, dual-rate rules a fraction of the innovation for each step. Behind
+the gains of a step stands the upper half of the states' covariance after it.
 """
 
 import pickle
@@ -39,7 +35,7 @@ from .options import FilterConfig
 
 
 def count_ticks(seconds: float, dt: float, label: str) -> int:
-    """Convert a time to a number of ticks.
+    """Convert a time to a number of ticks; ValueError where it is no whole number.
 
     Args:
         seconds: Time (s).
@@ -48,9 +44,6 @@ def count_ticks(seconds: float, dt: float, label: str) -> int:
 
     Returns:
         Number of ticks.
-
-    Raises:
-        ValueError: The time is no whole number of ticks.
     """
     count = round(seconds / dt)
     if abs(seconds / dt - count) > 1e-6 * max(1.0, count):

@@ -72,19 +72,15 @@ class _GainPool:
 class BatchEstimator:
     """N filters of one name in one compiled call.
 
-    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. Filters of equal
-    specs, but for the phases of clocks, share one table of gains. ValueError says that the filters
-    have different states.
+    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory in `filters`, shape
+    (N, layers). Filters of equal specs, but for the phases of clocks, share one table of gains.
+    ValueError says that the filters have different states.
 
     Args:
         name: Name of the filters.
         specs: Vehicle, sensors and speed of each filter, N of them.
         dt: Tick (s).
         build: Function that builds one filter from its spec.
-
-    Attributes:
-        filters: Records of all filters, dtype `FILTER`, shape (N, layers).
-        names: Names of their states; `units` has their units.
     """
 
     def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:

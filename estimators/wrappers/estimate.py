@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, Self
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +32,7 @@ from .outputs import (
     StepRecord,
     compile_observe,
     write_outputs,
-)  # fmt: skip
+)
 from .truth import TRUTH, calibrate, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
@@ -91,22 +91,16 @@ class Arguments:
     recorded: dict[str, Any] = dataclasses.field(init=False, default_factory=dict)  # for a spec
 
     @classmethod
-    def read(
-        cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any
-    ) -> "Arguments":
+    def read(cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any) -> Self:
         """Read and check arguments, choose an estimator where there is none, make the vehicle.
 
         Args:
             slow_sensors: Slow sensors of the env by name.
             *values: Arguments of the wrapper.
-            **named: Arguments by name.
+            **named: Arguments by name; TypeError for a misplaced one has the nearest name.
 
         Returns:
-            The arguments.
-
-        Raises:
-            TypeError: An argument is misplaced; the message has the nearest name.
-            ValueError: An object has a vehicle or options, which would not reach it.
+            The arguments; ValueError where a vehicle or options would not reach an object.
         """
         names = [field.name for field in dataclasses.fields(cls)][:-1]
         misplaced = {name: named.pop(name) for name in list(named) if name not in names}
@@ -118,8 +112,7 @@ class Arguments:
             if isinstance(self.estimator, str) and "did you mean" not in wrong:
                 # this names the nearest option
                 make_estimator(self.estimator, sensors=slow_sensors, **misplaced)
-                passed = short_repr(dict(misplaced))
-                wrong = f"options of an estimator are passed as options={passed}"
+                wrong = f"options of an estimator are passed as options={short_repr(misplaced)}"
             raise TypeError(wrong)
         self.options = dict(self.options or {})
         recorded, car = self.estimator, self.vehicle
@@ -171,10 +164,7 @@ class Arguments:
             inner: Entries of the inner observation, which `replace` leaves out.
 
         Returns:
-            The entries, and how `observe` writes them.
-
-        Raises:
-            ValueError: An output is no state, or names would stand twice.
+            The entries, and how `observe` writes them; ValueError for unknown or repeated ones.
         """
         for output in self.outputs:
             if output not in states:
@@ -187,9 +177,8 @@ class Arguments:
             for s, (unit, _, bound) in zip(self.outputs, kinds, strict=True):
                 layout.append(ObservationEntry(f"{prefix}{s}_{ending}", unit, low * bound, bound))
         names = [entry.name for entry in layout]
-        if duplicates := sorted({entry for entry in names if names.count(entry) > 1}):
-            text = "would stand twice; give this wrapper a name=..."
-            raise ValueError(f"{', '.join(duplicates)} {text}")
+        if duplicates := ", ".join(sorted({entry for entry in names if names.count(entry) > 1})):
+            raise ValueError(f"{duplicates} would stand twice; give this wrapper a name=...")
         truths = [_TRUTHS.get(s, 0) for s in self.outputs]
         columns = [states.index(s) for s in self.outputs], [s in _WRAPPED for s in self.outputs]
         keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
@@ -395,13 +384,10 @@ def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
     """Find the base env, with no wrapper in between that may hide ticks from the estimator.
 
     Args:
-        env: Environment, wrapped or not.
+        env: Environment, wrapped or not; TypeError if it has another wrapper or no record.
 
     Returns:
         The environment that has the record.
-
-    Raises:
-        TypeError: Another wrapper is inside, or the environment has no record.
     """
     layer = env
     while isinstance(layer, gym.Wrapper):
@@ -413,8 +399,7 @@ def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
                 f"environment; inside it is {kind.__name__}"
             )
         layer = layer.env
-    missing = [name for name in _BASE_MEMBERS if not hasattr(layer, name)]
-    if missing:
+    if missing := [name for name in _BASE_MEMBERS if not hasattr(layer, name)]:
         raise TypeError(
             f"EstimateObservation reads the record of a sideslip environment; "
             f"{type(layer).__name__} has no {', '.join(missing)}"
