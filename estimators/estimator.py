@@ -177,9 +177,8 @@ class Estimator:
         for name, sensor in self.sensors.items():
             new = sensor if sensors is None else sensors.get(name)
             if new is None or replace(new, phase=0.0) != replace(sensor, phase=0.0):
-                raise ValueError(
-                    f"{self.name} was built for the {name} {sensor}, the reset has {new}"
-                )
+                built = f"{self.name} was built for the {name} {sensor}"
+                raise ValueError(f"{built}, the reset has {new}")
             label = f"{self.name}: the {name}'s phase"
             phase = count_ticks(new.phase or 0.0, self.dt, label)
             for f in self.filters:
@@ -286,9 +285,8 @@ class Estimator:
         if len(record.fast) == 0:
             raise ValueError(f"{self.name}: the record is empty")
         if abs(record.dt - self.dt) > 1e-9:
-            raise ValueError(
-                f"{self.name} was built for ticks of {self.dt:g} s, the record has {record.dt:g} s"
-            )
+            built = f"{self.name} was built for ticks of {self.dt:g} s"
+            raise ValueError(f"{built}, the record has {record.dt:g} s")
         for column in self.needs:
             if column not in record.present:
                 raise ValueError(f"{self.name} needs the column {column!r}, the log has none")

@@ -143,10 +143,8 @@ class Registry:
         if isinstance(factory, str) and not is_user_file(factory):
             _split_entry_point(factory)
         elif not (isinstance(factory, str) or callable(factory)):
-            raise TypeError(
-                f"{name!r}: a factory is callable or 'package.module:Name', "
-                f"got {type(factory).__name__}"
-            )
+            text = f"{name!r}: a factory is callable or 'package.module:Name'"
+            raise TypeError(f"{text}, got {type(factory).__name__}")
         known = self._factories.setdefault(name, factory)
         if known != factory:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")

@@ -210,11 +210,8 @@ class Stream:
         packets = make_packets(values, before, self.dt)[0]
         packets = packets[packets[:, PACKET.captured] >= start]
         move_course(fast, packets, start, self._at)
-        self._snapshots = {
-            tick: state
-            for tick, state in self._snapshots.items()
-            if end - self._memory - 2 * _SNAPSHOT_ROWS <= tick <= start
-        }
+        oldest, snapshots = end - self._memory - 2 * _SNAPSHOT_ROWS, self._snapshots
+        self._snapshots = {tick: snapshots[tick] for tick in snapshots if oldest <= tick <= start}
         while start < end:
             if start == self._first or start % _SNAPSHOT_ROWS == 0:
                 self._snapshots.setdefault(start, self._filter.get_state())

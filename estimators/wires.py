@@ -54,10 +54,8 @@ class SignalCalibration(NamedTuple):
             low = 0.0 if channel in SLOW_NAMES else -_MAX_LATENCY
             is_possible = is_finite(late) and low <= late <= _MAX_LATENCY
             if channel not in _CHANNELS or not is_possible:
-                raise ValueError(
-                    f"a latency is CHANNEL=S, {low:g} to {_MAX_LATENCY:g} s, of "
-                    f"{', '.join(_CHANNELS)}; got {channel}={late}"
-                )
+                wanted = f"a latency is CHANNEL=S, {low:g} to {_MAX_LATENCY:g} s"
+                raise ValueError(f"{wanted}, of {', '.join(_CHANNELS)}; got {channel}={late}")
         for name, value in self.noise.items():
             check_choice("noise", name, NOISES.values())
             if not (is_finite(value) and value >= 0.0):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Vector
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import PACKET, Array, Log
 from ..core.filter import run_tick
 from ..core.innovation import IGNORE, NONE
 from ..core.model import BETA, LATERAL
@@ -55,9 +55,8 @@ def smooth(
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
     if not (isinstance(estimator, Estimator) and estimator.compiled):
-        raise TypeError(
-            f"the smoother needs a filter of the catalogue without latency, got {estimator!r}"
-        )
+        text = "the smoother needs a filter of the catalogue without latency"
+        raise TypeError(f"{text}, got {estimator!r}")
     if not lag_seconds > 0.0:
         raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
     undelayed = _remove_delay(estimator)
@@ -116,7 +115,7 @@ def _filter_forwards(
     n, dense = f.n, f.dense
     F, before, x, P, Q = block
     for j in range(len(fast)):
-        read_fast_row(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
+        read_fast_row(f, fast[j])
         run_tick(f, gains)
         for i in range(n):
             before[j, i] = f.predicted[f.tick % WINDOW, i]

@@ -1,9 +1,8 @@
 """A packet that has arrived: whether it is sound, and the rule "buffer", which rewinds to it.
 
-Every tick's inputs, fast measurements and speed are stored, and every few ticks the states and
-their covariance. For a late sample the newest snapshot not after its capture is restored, and the
-ticks up to now are filtered anew with all samples known by now: exact for any delay and order.
-The gate judges a sample once, by what was known before it; a refused one changes nothing.
+For a late sample the newest snapshot not after its capture is restored, and the stored ticks up to
+now are filtered anew with all samples known by now: exact for any delay and order. The gate judges
+a sample once, by what was known before it; a refused one changes nothing.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Corrections: by the fast sensors, by a sample, and between samples of a slow sensor.
 
-Rules between samples: predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay
-(20)-(22), double-layer-gps (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate
-of the error, by one constant gain K, columns in the order fast rows, slow rows, or by a fraction of
-the last sample's gain. dual-rate: fractions of the last innovation from a table.
+Rules between samples: pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22),
+double-layer-gps (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the
+error, by a constant gain K (columns: fast rows, slow rows) or a fraction of the last sample's gain.
+dual-rate: fractions of the last innovation from a table.
 """
 
 import numpy as np

@@ -83,9 +83,8 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
             f"delay={rule.RULES[f.delay_rule]!r} has a window of {window * dt:g} s ({window} ticks)"
         )
         checks.append((sensor.longest_delay > (window + 1e-6) * dt, text))
-        n_samples += 2 + math.ceil(
-            (sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt) / sensor.period
-        )
+        longest = sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt
+        n_samples += 2 + math.ceil(longest / sensor.period)
     text = (
         f"{n_samples} samples of {' and '.join(sensors)} can come within the longest delay; "
         f"delay='buffer' stores {size.N_RECENT}"

@@ -59,6 +59,7 @@ class StateInfo(NamedTuple):
     bound: float  # largest magnitude of an estimate in an observation
 
 
+TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 STATES = {
     "beta": StateInfo("rad", 0.02, np.pi / 2.0),
     "gamma": StateInfo("rad/s", 0.05, 10.0),
@@ -66,12 +67,10 @@ STATES = {
     "y_l": StateInfo("m", 0.3, 200.0),
     "psi_late": StateInfo("rad", 0.05, np.pi),
     "y_l_late": StateInfo("m", 0.3, 200.0),
-    "v_x": StateInfo("m/s", 0.1, 100.0),
-    "v_y": StateInfo("m/s", 0.1, 100.0),
+    **dict.fromkeys(("v_x", "v_y"), StateInfo("m/s", 0.1, 100.0)),
     "phi": StateInfo("rad", 0.02, np.pi / 2.0),
     "phi_rate": StateInfo("rad/s", 0.05, 10.0),
-    "F_yf": StateInfo("N", 500.0, 1e5),
-    "F_yr": StateInfo("N", 500.0, 1e5),
+    **dict.fromkeys(("F_yf", "F_yr"), StateInfo("N", 500.0, 1e5)),
     "d1": StateInfo("rad/s", 0.1, 100.0),
     "d2": StateInfo("rad/s2", 1.0, 1000.0),
     "d3": StateInfo("rad/s", 0.1, 100.0),
@@ -81,13 +80,9 @@ STATES = {
     "bias": StateInfo("rad/s", 0.0, 10.0),
     "accel_bias": StateInfo("m/s2", 0.0, 50.0),
     "accel_scale": StateInfo("-", 0.0, 1.0),
-    "bank": StateInfo("rad", 0.0, 1.0),
-    "camera_yaw": StateInfo("rad", 0.0, 1.0),
-    "map_heading": StateInfo("rad", 0.0, 1.0),
+    **dict.fromkeys(("bank", "camera_yaw", "map_heading"), StateInfo("rad", 0.0, 1.0)),
     "steer_offset": StateInfo("rad", 0.0, 1.0),
-    "front_tyres": StateInfo("-", 0.0, 5.0),
-    "rear_tyres": StateInfo("-", 0.0, 5.0),
-    "inverse_friction": StateInfo("-", 0.0, 5.0),
+    **dict.fromkeys(TYRES, StateInfo("-", 0.0, 5.0)),
 }
 """All states of all models, by name."""
 FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
@@ -117,14 +112,9 @@ class FilterModel:
 _ORDER = ("beta", "gamma", "psi", "y_l")
 _BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
-TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 WANDER = {
-    "bias": "gyro",
-    "accel_bias": "accel_y",
-    "bank": "",
-    "camera_yaw": "camera",
-    "map_heading": "camera",
-    "steer_offset": "",
+    **{"bias": "gyro", "accel_bias": "accel_y", "bank": "", "camera_yaw": "camera"},
+    **{"map_heading": "camera", "steer_offset": ""},
 }
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")

@@ -23,13 +23,8 @@ from .kalman import INVERSES
 from .models import BIASES, MEASUREMENTS, NONLINEAR, STATES, WANDER, FilterModel
 
 FAST_CHANNELS: dict[str, tuple[int, ...]] = {
-    "steer": (FAST.steer,),
-    "gyro": (FAST.gyro,),
-    "accel_x": (FAST.accel_x,),
-    "accel_y": (FAST.accel_y,),
-    "roll_rate": (FAST.roll_rate,),
-    "wheels": (FAST.wheel_left, FAST.wheel_right),
-}
+    name: (getattr(FAST, name),) for name in ("steer", "gyro", "accel_x", "accel_y", "roll_rate")
+} | {"wheels": (FAST.wheel_left, FAST.wheel_right)}
 """The columns of a fast row that are late together."""
 FIND = "find"
 NOISE = {

@@ -42,9 +42,8 @@ class _GainPool:
         if design not in self._estimators:
             estimator = self._build(**spec._asdict())
             if not isinstance(estimator, Estimator):
-                raise TypeError(
-                    f"a batch is of filters of ours or of none, got {estimator!r} as well"
-                )
+                text = "a batch is of filters of ours or of none"
+                raise TypeError(f"{text}, got {estimator!r} as well")
             self._estimators[design] = estimator
         return self._estimators[design]
 
@@ -137,10 +136,9 @@ class BatchEstimator:
 
     def _check_states(self, i: int, names: tuple[str, ...]) -> None:
         if names != self.names:
-            raise ValueError(
-                f"{self.name}: the filters of a batch have the same states, row 0 has "
-                f"{', '.join(self.names)} and row {i} {', '.join(names)}"
-            )
+            first, other = ", ".join(self.names), ", ".join(names)
+            text = f"{self.name}: the filters of a batch have the same states"
+            raise ValueError(f"{text}, row 0 has {first} and row {i} {other}")
 
     def reset(self, mask: _Mask) -> None:
         """Reset some filters to the clocks of their specs.

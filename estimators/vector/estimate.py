@@ -124,10 +124,8 @@ class EstimateObservation(VectorObservation):
         values = estimator, outputs, std, replace, vehicle, options, name
         self._arguments = Arguments.read(clocks, *values, **misplaced)
         if self._arguments.is_object:
-            raise TypeError(
-                f"one {self._arguments.label} cannot estimate {env.num_envs} rows: pass its class, "
-                "another factory or a name"
-            )
+            text = f"one {self._arguments.label} cannot estimate {env.num_envs} rows"
+            raise TypeError(f"{text}: pass its class, another factory or a name")
         super().__init__(env, Single, self._arguments.recorded)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
@@ -156,15 +154,13 @@ class EstimateObservation(VectorObservation):
 
     def _make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
-        specs = self._records.make_specs(rows)
+        specs, car = self._records.make_specs(rows), self._arguments.vehicle
         if self._arguments.is_told_truth:
             truths = self._get_truths(rows)
             self._calibration[rows] = [item.calibration for item in truths]
             pairs = zip(specs, truths, strict=True)
             return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
-        if self._arguments.vehicle is None:
-            return specs
-        return [spec._replace(vehicle=self._arguments.vehicle) for spec in specs]
+        return specs if car is None else [spec._replace(vehicle=car) for spec in specs]
 
     def _update_cars(self, rows: Sequence[int]) -> None:
         """Fit the estimators of some rows to the cars of their present episodes."""
@@ -229,17 +225,13 @@ class EstimateObservation(VectorObservation):
 def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:
     """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
-        raise TypeError(
-            f"{type(env).__name__} is no vector environment; the wrapper of a single one is "
-            "sideslip.estimators.EstimateObservation"
-        )
+        text = f"{type(env).__name__} is no vector environment; the wrapper of a single one"
+        raise TypeError(f"{text} is sideslip.estimators.EstimateObservation")
     layer = env
     while isinstance(layer, VectorWrapper):
         if not isinstance(layer, EstimateObservation):
-            raise TypeError(
-                "EstimateObservation must be the innermost wrapper, directly around the vector "
-                f"environment; inside it is {type(layer).__name__}"
-            )
+            text = "EstimateObservation must be the innermost wrapper, directly around the vector"
+            raise TypeError(f"{text} environment; inside it is {type(layer).__name__}")
         layer = layer.env
     if isinstance(layer, AsyncVectorEnv):
         raise TypeError(
@@ -251,10 +243,8 @@ def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecor
     if isinstance(layer, SyncVectorEnv):
         return _SyncRecords(layer)
     if missing := [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]:
-        raise TypeError(
-            "EstimateObservation reads the records of a sideslip vector environment; "
-            f"{type(layer).__name__} has no {', '.join(missing)}"
-        )
+        text = "EstimateObservation reads the records of a sideslip vector environment"
+        raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
     return _BatchedRecords(layer)
 
 
@@ -282,10 +272,8 @@ class TruthObservation(VectorObservation):
         recorded = {"parameters": list(parameters), "states": list(states)}
         super().__init__(env, SingleTruth, recorded)
         if not hasattr(env, "layout"):
-            raise TypeError(
-                f"{type(env).__name__} has no layout; wrap it in "
-                "sideslip.estimators.vector.EstimateObservation first"
-            )
+            text = f"{type(env).__name__} has no layout; wrap it in"
+            raise TypeError(f"{text} sideslip.estimators.vector.EstimateObservation first")
         self._entries = TruthEntries(parameters, states, env.layout)
         self._set_layout(self._entries.layout)
         if self._same_step and states:

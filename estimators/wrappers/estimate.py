@@ -102,7 +102,7 @@ class Arguments:
         Returns:
             The arguments; ValueError where a vehicle or options would not reach an object.
         """
-        names = [field.name for field in dataclasses.fields(cls)][:-1]
+        names = [field.name for field in dataclasses.fields(cls) if field.init]
         misplaced = {name: named.pop(name) for name in list(named) if name not in names}
         self = cls(*values, **named)
         if self.estimator is None:
@@ -126,8 +126,8 @@ class Arguments:
         elif not isinstance(recorded, str):
             recorded = find_entry_point(recorded) or recorded
         car = car.to_dict() if isinstance(car, Vehicle) else car
-        values = recorded, list(self.outputs), bool(self.std), bool(self.replace)
         car = dict(car) if isinstance(car, Mapping) else car
+        values = recorded, list(self.outputs), bool(self.std), bool(self.replace)
         self.recorded = dict(zip(names, (*values, car, self.options, self.name), strict=True))
         return self
 
@@ -184,21 +184,17 @@ class Arguments:
         keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
         keys += [("nees", NEES)] if any(truths) else []
         keys += [("healthy", HEALTHY)] if self._finds_noise else []
-        table = OutputTable(
-            n_inner,
-            np.array([*columns, truths], np.int64).T.copy(),
-            np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
-        )
+        plan = np.array([*columns, truths], np.int64).T.copy()
+        limits = np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64)
+        table = OutputTable(n_inner, plan, limits)
         title = self.label if self.name is None else f"{self.label} ({self.name})"
         return Outputs(title, tuple(layout), table, tuple((prefix + k, place) for k, place in keys))
 
 
 def _refuse_rebuild(label: str, **_: object) -> NoReturn:
     """Raise the reason why a spec with an object cannot be built, in the place of a factory."""
-    raise TypeError(
-        f"a spec cannot build {label} once more: it was passed as an object; pass its class, a "
-        "factory or a name"
-    )
+    text = f"a spec cannot build {label} once more: it was passed as an object"
+    raise TypeError(f"{text}; pass its class, a factory or a name")
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
@@ -394,14 +390,10 @@ def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
         kind = type(layer)
         is_allowed = isinstance(layer, (*_ALLOWED_WRAPPERS, EstimateObservation))
         if not is_allowed and (kind.__module__, kind.__name__) != _MONITOR:
-            raise TypeError(
-                "EstimateObservation must be the innermost wrapper, directly around the "
-                f"environment; inside it is {kind.__name__}"
-            )
+            text = "EstimateObservation must be the innermost wrapper, directly around the"
+            raise TypeError(f"{text} environment; inside it is {kind.__name__}")
         layer = layer.env
     if missing := [name for name in _BASE_MEMBERS if not hasattr(layer, name)]:
-        raise TypeError(
-            f"EstimateObservation reads the record of a sideslip environment; "
-            f"{type(layer).__name__} has no {', '.join(missing)}"
-        )
+        text = "EstimateObservation reads the record of a sideslip environment"
+        raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
     return layer

@@ -99,9 +99,8 @@ class TruthEntries:
         Returns:
             Values and calibration.
         """
-        values = [
-            getattr(truth if name in _MOTORS else truth.vehicle, name) for name in self.parameters
-        ]
+        sources = {name: truth if name in _MOTORS else truth.vehicle for name in self.parameters}
+        values = [getattr(source, name) for name, source in sources.items()]
         calibration = truth.calibration[:, self.columns].astype(np.float32)
         return np.array(values, np.float32), calibration
 
@@ -168,12 +167,9 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
 class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
-    Beside states `true_friction` is the present one.
-
-    Readings of steering, wheels and motors lose the constant errors that a `World` draws; the
-    references, by which all are judged, are made from what the env's own sensors read.
-
-    No sensor measures these: it makes the oracles with which others are compared
+    Beside states `true_friction` is the present one. Readings of steering, wheels and motors lose
+    the constant errors that a `World` draws; the references, by which all are judged, are made from
+    what the env's own sensors read. It makes the oracles with which others are compared
     (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
     whole observation.
 
