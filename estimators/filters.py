@@ -22,7 +22,7 @@ class FilterDefinition:
     fast: tuple[str, ...] = ("gyro",)  # measured in every row
     intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
     gains: str = "periodic"  # or "covariance", "placed"
-    disturbances: str = "none"  # a name of `models.DISTURBANCES`
+    disturbances: str = "none"  # or "walk", "walk-all", "forces"
     delay: str = "clone"  # a name of `innovation.RULES`
     poles: tuple[float, ...] = ()  # rad/s, where gains are placed
     second: str = ""  # model of a second layer

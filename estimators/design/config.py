@@ -12,11 +12,12 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import describe_unknown
 from ..core.innovation import RULES
+from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
 from . import dual_rate, models
 from .kalman import INVERSES, check_covariance
-from .models import BIASES, SCALE, STATES, TYRES, WANDER
+from .models import BIASES, SCALE, STATES, TYRES, WANDER, FilterModel
 from .options import (
     FAST_CHANNELS,
     FIND,
@@ -39,6 +40,10 @@ _Values = dict[str, Any]  # options by name
 # options that every filter has
 _NUMBERS = ("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable")
 _DISTURBANCES = {"F_d", "N_d", "d", "d1", "d2", "d3"}
+_BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
+_WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
+# states that disturbances are, and what they push; dual-rate (4): one for every state of (37)
+_WALKS = {"none": (), "walk": _WALK, "walk-all": (*_WALK, ("d3", "psi")), "forces": ()}
 
 
 class _Reader:
@@ -133,11 +138,9 @@ def parse_config(
     chosen: _Values = {"slow": used} | _parse_rules(row, used, reader)
     chosen |= _parse_inertial(row, used, reader)
     if row.model == "bicycle":
-        disturbances = reader.read_choice("disturbances", row.disturbances, models.DISTURBANCES)
+        disturbances = reader.read_choice("disturbances", row.disturbances, list(_WALKS))
         chosen |= {"disturbances": disturbances} | reader.read("steer_rate")
-        late, rolls = chosen["delay"] in ("literal", "lag"), chosen["fast"] != row.fast
-        biases = tuple(chosen["bias_sds"])
-        first = models.make_bicycle_model(used, chosen["fast"], disturbances, late, rolls, biases)
+        first = _make_bicycle_model(used, chosen, rolls=chosen["fast"] != row.fast)
     else:
         first = models.MODELS[row.model]
     layers = (first, models.MODELS[row.second]) if row.second else (first,)
@@ -177,6 +180,18 @@ def parse_config(
         prior=prior,
         **chosen,
     )
+
+
+def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) -> FilterModel:
+    """Make the bicycle model with the states that slow sensors need; `rolls`: the body does."""
+    states = models.select_states(sensors)
+    lags = chosen["delay"] in ("literal", "lag") and "camera" in sensors  # tie-vision (12)-(13)
+    late = tuple(models.LATE[state] for state in states if lags and state in models.LATE)
+    walking = tuple(pair for pair in _WALKS[chosen["disturbances"]] if pair[1] in states)
+    inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
+    forces, states = chosen["disturbances"] == "forces", states + _BODY * rolls
+    biases = tuple(chosen["bias_sds"])
+    return FilterModel(LATERAL, states, inputs, chosen["fast"], walking, forces, late, biases)
 
 
 def _select_slow_sensors(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.model import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
+from ..core.model import FORCES, KINEMATIC, ROLL, VELOCITY_ROLL, YAW
 
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
@@ -110,7 +110,6 @@ class FilterModel:
 
 
 _ORDER = ("beta", "gamma", "psi", "y_l")
-_BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
 WANDER = {
     **{"bias": "gyro", "accel_bias": "accel_y", "bank": "", "camera_yaw": "camera"},
@@ -121,9 +120,6 @@ BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
 """States that nothing drives but noise, and the sensor that each needs, if any. Option `bias_sds`
 says what they are. The tyres' count too: factors of stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
-_WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
-_WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)
-DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
 MODELS: dict[str, FilterModel] = {
     "roll": FilterModel(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
@@ -156,33 +152,3 @@ def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
     """
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
     return _ORDER[: max([2, *(1 + _ORDER.index(state) for row in rows for state in row.states)])]
-
-
-def make_bicycle_model(
-    sensors: tuple[str, ...],
-    fast: tuple[str, ...],
-    disturbances: str,
-    late: bool,
-    rolls: bool = False,
-    biases: tuple[str, ...] = (),
-) -> FilterModel:
-    """Make the bicycle model with the states that slow sensors need.
-
-    Args:
-        sensors: Names of the slow sensors.
-        fast: Names of the fast sensors.
-        disturbances: Name of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" d_3 of psi too.
-        late: Whether the camera measures states that lag (tie-vision (12)-(13)).
-        rolls: Whether the body rolls.
-        biases: Names of `BIASES`.
-
-    Returns:
-        The model.
-    """
-    states, walks = select_states(sensors), {"walk": _WALK, "walk-all": _WALK_ALL}
-    lags = late and "camera" in sensors
-    late_states = tuple(LATE[state] for state in states if lags and state in LATE)
-    walking = tuple(pair for pair in walks.get(disturbances, ()) if pair[1] in states)
-    inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
-    forces, states = disturbances == "forces", states + _BODY * rolls
-    return FilterModel(LATERAL, states, inputs, fast, walking, forces, late_states, biases)
