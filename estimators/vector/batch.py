@@ -1,8 +1,7 @@
 """Many filters of one kind side by side, compiled together, or an object a row."""
 
 import copy
-import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,6 @@ from ...envs.numerics.simd8 import allocate_aligned
 from ...envs.record import Array
 from ..core.record import FILTER
 from ..estimator import Estimator
-from ..filters import FILTERS
-from ..make import make_estimator
-from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import Observed, StepRecord, write_outputs
 from .lane_ticks import FilterBank
@@ -253,31 +249,3 @@ class ForeignBatch(BatchEstimator):
         """
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)
-
-
-def build_batch(
-    source: str | EstimatorFactory,
-    specs: Sequence[EstimatorSpec],
-    dt: float,
-    options: Mapping[str, Any],
-) -> BatchEstimator:
-    """Build an estimator for each spec, compiled together where all are ours and none is late.
-
-    Args:
-        source: Name or factory.
-        specs: Vehicle, sensors and speed of each estimator.
-        dt: Tick (s).
-        options: Options of `make_estimator`, whose errors it raises.
-
-    Returns:
-        The batch.
-    """
-    build_one = functools.partial(make_estimator, source, dt=dt, **options)
-    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
-        first = build_one(**specs[0]._asdict())
-        if isinstance(first, ForeignEstimator):
-            batch_class = getattr(first.inner, "batch", ForeignBatch)
-            return batch_class(first, specs, dt, build_one)
-        if not first.compiled:
-            return ForeignBatch(first, specs, dt, build_one)
-    return BatchEstimator(get_label(source), specs, dt, build_one)

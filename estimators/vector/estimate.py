@@ -1,5 +1,6 @@
 """Observations of vector environments: all rows' estimates in one compiled call, or the truth."""
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -9,12 +10,15 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry
 from ...envs.vehicle.parameters import VehicleSource
+from ..filters import FILTERS
+from ..make import make_estimator
+from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
 from ..wrappers.truth import STIFFNESSES, TruthEntries, calibrate, choose_vehicle, set_stiffness
 from ..wrappers.truth import TruthObservation as SingleTruth
-from .batch import build_batch
+from .batch import BatchEstimator, ForeignBatch
 from .records import BatchedEnv, Mask, Observations, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
@@ -133,7 +137,7 @@ class EstimateObservation(VectorObservation):
         self._calibration = np.ones((env.num_envs, 2, FAST_WIDTH))
         specs, arguments = self._make_specs(range(env.num_envs)), self._arguments
         self._first_vehicle, dt = specs[0].vehicle, self._records.dt
-        self.estimator = build_batch(arguments.estimator, specs, dt, arguments.options)
+        self.estimator = _build_batch(arguments.estimator, specs, dt, arguments.options)
         inner = getattr(env, "layout", self._records.layout)
         self._outputs = self._arguments.make_outputs(self.estimator.names, inner)
         self._set_layout(self._outputs.layout)
@@ -220,6 +224,24 @@ class EstimateObservation(VectorObservation):
             infos[key], infos[f"_{key}"] = values, present
             if index == BETA:
                 self._records.annotate(self._outputs.title, values, summary[:, STD], mask)
+
+
+def _build_batch(
+    source: str | EstimatorFactory,
+    specs: Sequence[EstimatorSpec],
+    dt: float,
+    options: Mapping[str, Any],
+) -> BatchEstimator:
+    """Build an estimator for each spec, compiled together where all are ours and none is late."""
+    build_one = functools.partial(make_estimator, source, dt=dt, **options)
+    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
+        first = build_one(**specs[0]._asdict())
+        if isinstance(first, ForeignEstimator):
+            batch_class = getattr(first.inner, "batch", ForeignBatch)
+            return batch_class(first, specs, dt, build_one)
+        if not first.compiled:
+            return ForeignBatch(first, specs, dt, build_one)
+    return BatchEstimator(get_label(source), specs, dt, build_one)
 
 
 def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:
