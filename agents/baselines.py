@@ -25,7 +25,7 @@ from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice
 from ..envs.vehicle.parameters import GRAVITY
 from ..estimators.vector import estimate as vector
-from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
+from ..estimators.vector.estimate import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller

@@ -14,7 +14,6 @@ from ..envs.task import GAMMA_SCALE, STEER_SCALE, ObservationEntry, make_info, m
 from ..envs.vector import StabilityVectorEnv
 from ..envs.vehicle.dynamics import Motion
 from ..estimators.vector import estimate as vector_estimate
-from ..estimators.vector import truth as vector_truth
 from ..estimators.vector.estimate import EstimateObservation
 from ..estimators.wrappers import estimate as single_estimate
 from ..estimators.wrappers import truth as single_truth
@@ -45,7 +44,7 @@ _SCALES = {  # by unit, what is much in a drive; other units keep their numbers
 _WIDE_SCALES = {"gps_X": 100.0, "gps_Y": 100.0}  # m, positions on a map
 _TWINS: dict[type, type] = {
     single_estimate.EstimateObservation: vector_estimate.EstimateObservation,
-    single_truth.TruthObservation: vector_truth.TruthObservation,
+    single_truth.TruthObservation: vector_estimate.TruthObservation,
 }
 
 

@@ -125,8 +125,8 @@ class _LatencySearch:
         packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
         is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
         packets = np.ascontiguousarray(packets[is_past])
-        nis, empty = np.full(len(packets), np.nan), np.zeros((0, 0))
-        record = fast, count, packets, len(packets), 0, empty, empty, nis
+        nis = np.full(len(packets), np.nan)
+        record = fast, count, packets, len(packets), 0, EMPTY, EMPTY, nis
         compile_filter_call(advance)(filters, gains, *record)
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
@@ -165,9 +165,6 @@ class LateEstimator(Estimator):
 
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
-
-    def _step(self, fast: Array, packets: Array) -> None:
-        self.take(fast, len(fast), packets, len(packets))
 
     def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
         """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS."""

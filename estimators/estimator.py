@@ -15,21 +15,14 @@ from numba.extending import is_jitted
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.filter import advance, process_packet_all, reset_filters, step_all, write_estimate
+from .core.filter import advance, process_packet_all, reset_filters, write_estimate
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
+from .design import periodic
 from .design.models import STATES
 from .design.options import FilterConfig
-from .design.periodic import (
-    MARGINAL,
-    Schedule,
-    allocate_gains,
-    count_ticks,
-    design_and_map,
-    find_unobservable,
-    spectral_radius,
-)
+from .design.periodic import MARGINAL, Schedule, allocate_gains, count_ticks, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
 _T = TypeVar("_T")
@@ -64,7 +57,6 @@ _EXAMPLES: dict[_Call, tuple[object, ...]] = {
     advance: (_MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX, _VECTOR),
     process_packet_all: (np.zeros(PACKET_WIDTH),),
     write_estimate: (_VECTOR, _MATRIX),
-    step_all: (_MATRIX, _MATRIX, 0),
 }
 
 
@@ -73,7 +65,7 @@ def compile_filter_call(function: _Call) -> _Call:
     """Compile a function of `core.filter` to a plain call.
 
     Args:
-        function: `advance`, `process_packet_all`, `write_estimate` or `step_all`.
+        function: `advance`, `process_packet_all` or `write_estimate`.
 
     Returns:
         A callable with the same positional arguments.
@@ -146,7 +138,7 @@ class Estimator:
                 radius = spectral_radius(M)
                 self.spectral_radius = max(radius, self.spectral_radius)
                 if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
-                    self.unobservable = find_unobservable(M, names)
+                    self.unobservable = periodic.find_unobservable(M, names)
             first += int(f.n)
         if self.unobservable:
             text = f"{self.name} cannot see: {'; '.join(self.unobservable)}"
@@ -155,7 +147,7 @@ class Estimator:
     def _design_table(self, f: FilterRecord, schedule: Schedule, v: float) -> tuple[Array, Array]:
         """Compute the table of gains at a speed and the error's map; ValueError if that grows."""
         try:
-            table, M = design_and_map(f, schedule, v, self.config)
+            table, M = periodic.design_and_map(f, schedule, v, self.config)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         radius = spectral_radius(M)
@@ -179,18 +171,14 @@ class Estimator:
         """Set the filter back to its prior.
 
         Args:
-            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
+            sensors: Slow sensors by name; ValueError if more than a phase is new; None keeps all.
             first: Tick of the next fast row.
-
-        Raises:
-            ValueError: A sensor differs in more than its phase from that of the construction.
         """
         for name, sensor in self.sensors.items():
             new = sensor if sensors is None else sensors.get(name)
             if new is None or replace(new, phase=0.0) != replace(sensor, phase=0.0):
-                raise ValueError(
-                    f"{self.name} was built for the {name} {sensor}, the reset has {new}"
-                )
+                built = f"{self.name} was built for the {name} {sensor}"
+                raise ValueError(f"{built}, the reset has {new}")
             label = f"{self.name}: the {name}'s phase"
             phase = count_ticks(new.phase or 0.0, self.dt, label)
             for f in self.filters:
@@ -202,33 +190,18 @@ class Estimator:
         """Reset what a subclass has beside `filters`."""
 
     def step(self, fast: Array, packets: Array) -> None:
-        """Process fast rows and packets, which follow the last ones taken.
+        """Process fast rows and packets, which follow the last ones taken; else ValueError.
 
         Args:
             fast: Fast rows, shape (k, FAST_WIDTH).
             packets: Packets ordered as in a `Record`, shape (count, PACKET_WIDTH).
-
-        Raises:
-            ValueError: An array has another shape.
         """
         fast, packets = (np.ascontiguousarray(array, np.float64) for array in (fast, packets))
         tables = ("fast rows", fast, FAST_WIDTH), ("packets", packets, PACKET_WIDTH)
         for label, array, width in tables:
             if array.shape[1:] != (width,):
                 raise ValueError(f"{label} have shape (k, {width}), got {array.shape}")
-        self._step(fast, packets)
-
-    def _step(self, fast: Array, packets: Array) -> None:
-        done = compile_filter_call(step_all)(self.filters, self.gains, fast, packets, len(packets))
-        if done < len(fast):
-            record = fast, len(fast), packets, len(packets)
-            self._finish(done, record, (EMPTY, EMPTY, NO_NIS))
-
-    def _finish(self, done: int, record: TickRecord, outputs: TickOutputs) -> None:
-        """Process the rows behind the first `done`, whose tables of gains may be missing."""
-        while done < record[1]:
-            self.design_missing()
-            done = compile_filter_call(advance)(self.filters, self.gains, *record, done, *outputs)
+        self.take(fast, len(fast), packets, len(packets))
 
     def take(
         self,
@@ -255,8 +228,11 @@ class Estimator:
 
     def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
         """Process rows and packets: record, outputs are arguments of `advance` around `start`."""
-        done = compile_filter_call(advance)(self.filters, self.gains, *record, 0, *outputs)
-        self._finish(done, record, outputs)
+        call = compile_filter_call(advance)
+        done = call(self.filters, self.gains, *record, 0, *outputs)
+        while done < record[1]:
+            self.design_missing()
+            done = call(self.filters, self.gains, *record, done, *outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Process one fast row: from the last tick to this one, with the gyro.
@@ -270,10 +246,7 @@ class Estimator:
         """Process one packet that has arrived, after the fast row of this tick.
 
         Args:
-            packet: Packet, shape (PACKET_WIDTH,).
-
-        Raises:
-            ValueError: The packet has another shape.
+            packet: Packet, shape (PACKET_WIDTH,); ValueError for another one.
         """
         values = np.ascontiguousarray(packet, np.float64)
         if values.shape != (PACKET_WIDTH,):
@@ -300,24 +273,20 @@ class Estimator:
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
     def prepare_record(self, source: Log | Record) -> Record:
-        """Reset for a record and check that it fits.
+        """Reset for a record and check that it fits: its rows, its tick and its columns.
 
         Args:
             source: Record, or a log that has one.
 
         Returns:
-            The record.
-
-        Raises:
-            ValueError: The record is empty, has another tick than `dt`, or lacks a column.
+            The record; ValueError for one that does not fit.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
             raise ValueError(f"{self.name}: the record is empty")
         if abs(record.dt - self.dt) > 1e-9:
-            raise ValueError(
-                f"{self.name} was built for ticks of {self.dt:g} s, the record has {record.dt:g} s"
-            )
+            built = f"{self.name} was built for ticks of {self.dt:g} s"
+            raise ValueError(f"{built}, the record has {record.dt:g} s")
         for column in self.needs:
             if column not in record.present:
                 raise ValueError(f"{self.name} needs the column {column!r}, the log has none")
@@ -369,7 +338,7 @@ class Estimator:
 
         Filters whose noise is fixed (`noise_time=0`) keep no account of it and say True.
         """
-        return bool(is_healthy(self.filters[0]))
+        return bool(is_healthy(self._f))
 
     @property
     def nis(self) -> float:

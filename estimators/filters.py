@@ -1,11 +1,9 @@
-"""Every filter of the papers and its rivals: a row of a table.
+"""Every filter of the papers and its rivals: a model, rules between and for late samples, a tuning.
 
-A filter is a model x a rule between slow samples x a rule for late ones x a tuning. A bicycle has
-the states that the slow sensor measures. Where the papers differ: every model is discretised
-exactly (double-layer-gps (38), (42) take A T + I); disturbances and process noise are per second
-(double-layer-gps (34) and dual-rate (5) count them per step); misprints (docs/reference/papers.md)
-are corrected; with pseudo-residuals every tick takes an even fraction of the gain that the filter
-without them applies at a sample.
+Where the papers differ: models are discretised exactly (double-layer-gps (38), (42) take A T + I);
+disturbances and process noise are per second (double-layer-gps (34), dual-rate (5): per step);
+misprints (docs/reference/papers.md) are corrected; with pseudo-residuals every tick takes an even
+fraction of the gain that the filter without them applies at a sample.
 """
 
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ class FilterDefinition:
     fast: tuple[str, ...] = ("gyro",)  # measured in every row
     intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
     gains: str = "periodic"  # or "covariance", "placed"
-    disturbances: str = "none"  # a name of `models.DISTURBANCES`
+    disturbances: str = "none"  # or "walk", "walk-all", "forces"
     delay: str = "clone"  # a name of `innovation.RULES`
     poles: tuple[float, ...] = ()  # rad/s, where gains are placed
     second: str = ""  # model of a second layer
@@ -35,43 +33,18 @@ class FilterDefinition:
 
 _GPS = ("gps",)
 _CAMERA = ("camera",)
-
 _JOINT = (
-    ("fast", ("gyro", "accel_y")),
-    ("wary", 10),
-    ("steer_rate", 3.0),
-    ("prior", {"beta": 0.063, "gamma": 0.3}),
-    ("force_share", 0.032),
-    ("moment_share", 0.039),
-    ("force_sd", 6.0),
-    ("moment_sd", 450.0),
-    ("disturbance_time", 0.11),
-    ("moment_time", 0.057),
-    ("model_error", 0.046),
-    ("front_tyres_sd", 0.22),
-    ("rear_tyres_sd", 0.22),
-    ("q_front_tyres", 0.0045),
-    ("q_rear_tyres", 0.0045),
-    ("inverse_friction_sd", 1.6),
-    ("q_inverse_friction", 0.0085),
-    ("gyro_noise", 0.0012),
-    ("accel_y_noise", 0.52),
-    ("noise_time", 5.5),
-    ("robust", 0.32),
-    ("bias_sd", 0.0048),
-    ("q_bias", 5.6e-09),
-    ("accel_bias_sd", 0.48),
-    ("accel_bias_time", 61.0),
-    ("accel_scale_sd", 0.019),
-    ("steer_offset_sd", 0.0068),
-    ("bank_sd", 0.03),
-    ("bank_time", 14.0),
-    ("course_noise", 0.014),
-    ("camera_yaw_sd", 0.005),
-    ("psi_noise", 0.02),
-    ("y_l_noise", 0.052),
-    ("map_heading_sd", 0.0027),
-    ("map_heading_time", 1.2),
+    *(("fast", ("gyro", "accel_y")), ("prior", {"beta": 0.063, "gamma": 0.3})),
+    *(("wary", 10), ("steer_rate", 3.0), ("noise_time", 5.5), ("robust", 0.32)),
+    *(("force_share", 0.032), ("force_sd", 6.0), ("disturbance_time", 0.11)),
+    *(("moment_share", 0.039), ("moment_sd", 450.0), ("moment_time", 0.057)),
+    *(("front_tyres_sd", 0.22), ("rear_tyres_sd", 0.22), ("inverse_friction_sd", 1.6)),
+    *(("q_front_tyres", 0.0045), ("q_rear_tyres", 0.0045), ("q_inverse_friction", 0.0085)),
+    *(("model_error", 0.046), ("gyro_noise", 0.0012), ("bias_sd", 0.0048), ("q_bias", 5.6e-09)),
+    *(("accel_y_noise", 0.52), ("accel_bias_sd", 0.48), ("accel_bias_time", 61.0)),
+    *(("accel_scale_sd", 0.019), ("steer_offset_sd", 0.0068), ("bank_sd", 0.03)),
+    *(("bank_time", 14.0), ("course_noise", 0.014), ("psi_noise", 0.02), ("y_l_noise", 0.052)),
+    *(("camera_yaw_sd", 0.005), ("map_heading_sd", 0.0027), ("map_heading_time", 1.2)),
     ("map_lag_sd", 0.19),
 )
 """For an unknown car; `benchmarks.tuning.levels` finds them on simulated drives. Meaning and

@@ -33,7 +33,8 @@ def estimate(
     The log needs time, speed, yaw rate and steering at the road wheels, in columns such as time_s,
     speed_x_kmh, yaw_rate_degps and steer_deg. Lateral acceleration, wheel speeds, course and camera
     are used where they are there. A slow sensor's column is NaN, held or interpolated between its
-    samples. Rows are read as `read_parts` does; across a hole the filter begins anew.
+    samples. Rows are read as `read_parts` does; across a hole the filter begins anew. ValueError
+    stands for a missing column, no number, an unknown channel, or what is later than the memory.
 
     Args:
         log: Table, or its file (CSV, Parquet, MATLAB, MDF, CAN trace, ROS bag, MCAP, VBO).
@@ -46,10 +47,6 @@ def estimate(
     Returns:
         Time (s), sideslip angle and its standard deviation (rad), yaw rate (rad/s), and whether
         the filter is healthy; a row each tick of an even clock, close to the log's.
-
-    Raises:
-        ValueError: A missing column, a value that is no number, an unknown channel, a latency out
-            of range, or a sensor later than the filter's memory.
     """
     with require_extra("report", "estimating from a table needs pandas"):
         import pandas as pd

@@ -41,7 +41,8 @@ def make_estimator(
 ) -> Estimator | ForeignEstimator:
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
 
-    An unknown option raises TypeError.
+    An unknown option raises TypeError; unknown names, absent sensors and options that are at odds
+    ValueError, as do noise that is no covariance, a sensor later than the window, and divergence.
 
     Args:
         name: Name of `FILTERS`, registered name, entry point "package.module:Name", class in a
@@ -56,10 +57,6 @@ def make_estimator(
 
     Returns:
         The estimator; what a factory builds comes as a `ForeignEstimator`.
-
-    Raises:
-        ValueError: Unknown name, absent sensor, Q or noise that is no covariance, schedule without
-            repetition, sensor later than the filter's window, options at odds, divergence.
     """
     available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:

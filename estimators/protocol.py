@@ -84,18 +84,13 @@ EstimatorFactory = Callable[..., EstimatorLike]
 class ForeignEstimator:
     """A user's estimator behind the names that it shares with `Estimator`, its states checked.
 
+    TypeError says that `inner` lacks a member, ValueError that its names are not distinct words.
+
     Args:
         inner: The user's object.
         name: Name for messages.
         dt: Tick (s).
         sensors: Slow sensors of this episode by name.
-
-    Attributes:
-        names: Names of its n states; `units` has their units.
-
-    Raises:
-        TypeError: `inner` lacks a member.
-        ValueError: Its names are not distinct words.
     """
 
     unobservable: tuple[str, ...] = ()
@@ -104,10 +99,8 @@ class ForeignEstimator:
         self, inner: EstimatorLike, name: str, dt: float, sensors: Mapping[str, SlowSensor]
     ) -> None:
         if missing := [word for word in ("names", "reset", "step") if not hasattr(inner, word)]:
-            raise TypeError(
-                f"{name} is no estimator: {type(inner).__name__} has no "
-                f"{', '.join(missing)}; see sideslip.estimators.EstimatorLike"
-            )
+            text = f"{name} is no estimator: {type(inner).__name__} has no {', '.join(missing)}"
+            raise TypeError(f"{text}; see sideslip.estimators.EstimatorLike")
         self.inner, self.name, self.dt, self.sensors = inner, name, dt, dict(sensors)
         self.names = () if isinstance(inner.names, str) else tuple(inner.names)
         are_words = all(isinstance(word, str) and word for word in self.names)
@@ -150,30 +143,23 @@ class ForeignEstimator:
         except (AttributeError, TypeError, ValueError) as error:
             raise TypeError(f"{self.name}: {member} is no array of numbers: {error}") from error
         if value.shape != shape:
-            raise ValueError(
-                f"{self.name}: {member} has shape {shape} for the states "
-                f"{', '.join(self.names)}, got {value.shape}"
-            )
+            text = f"{self.name}: {member} has shape {shape} for the states {', '.join(self.names)}"
+            raise ValueError(f"{text}, got {value.shape}")
         return value
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
         Args:
-            source: Record, or a log that has one.
+            source: Record, or a log that has one; ValueError if it is empty or has another tick.
 
         Returns:
             States and standard deviations of the record.
-
-        Raises:
-            ValueError: The record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
-            raise ValueError(
-                f"{self.name} was built for ticks of {self.dt:g} s, the record has "
-                f"{len(record.fast)} of {record.dt:g} s"
-            )
+            built = f"{self.name} was built for ticks of {self.dt:g} s"
+            raise ValueError(f"{built}, the record has {len(record.fast)} of {record.dt:g} s")
         self.reset(source.slow if isinstance(source, Log) else None, record.first)
         ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right").tolist()
         x, std = np.empty((2, len(record.fast), len(self.names)))

@@ -31,17 +31,13 @@ def is_user_file(text: str) -> bool:
 
 
 def find_class(text: str) -> tuple[Path, str]:
-    """Find the class of a user's file, without running the file.
+    """Find the class of a user's file without running it; FileNotFoundError if there is none.
 
     Args:
         text: "FILE.py:Name", or "FILE.py" for its only class.
 
     Returns:
-        File and name of the class.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: With file and line: it is no Python, or has no such name or no single class.
+        File and name of the class; ValueError if it is no Python or has no such or no single class.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
@@ -53,8 +49,8 @@ def find_class(text: str) -> tuple[Path, str]:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from None
     except ValueError as error:  # a null byte
         raise ValueError(f"{path} is no Python: {error}") from None
-    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    classes = [word for word in classes if not word.startswith("_")]
+    names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    classes = [word for word in names if not word.startswith("_")]
     definitions = f"it defines {', '.join(classes) or 'no class'}"
     if name and name not in set(_iterate_bindings(tree)):
         raise ValueError(f"{path} has no {name!r}; {definitions}")
@@ -87,8 +83,8 @@ def _load_user_class(text: str) -> _Factory:
 
 
 def _load_module(path: Path) -> ModuleType:
-    content = path.read_bytes()
-    name = f"{_PREFIX}{path.stem}_{hashlib.sha256(str(path).encode() + content).hexdigest()[:12]}"
+    key = hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:12]
+    name = f"{_PREFIX}{path.stem}_{key}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -134,34 +130,27 @@ class Registry:
         self._factories: dict[str, _Factory | str] = dict(builtin)
 
     def register(self, name: str, factory: _Factory | str) -> None:
-        """Register a name; the same factory once more changes nothing.
+        """Register a name, else TypeError or ValueError; the same factory again changes nothing.
 
         Args:
             name: New name, without a colon.
             factory: A callable, "package.module:Name" or "FILE.py:Name", loaded at its first use.
-
-        Raises:
-            TypeError: The name is no str, or the factory neither a callable nor a str.
-            ValueError: The name is invalid or another factory's, or a str is no entry point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
         if not name or ":" in name:
             raise ValueError(f"the name of an {self._kind} has letters and no colon, got {name!r}")
-        if isinstance(factory, str):
-            if not is_user_file(factory):
-                _split_entry_point(factory)
-        elif not callable(factory):
-            raise TypeError(
-                f"{name!r}: a factory is callable or 'package.module:Name', "
-                f"got {type(factory).__name__}"
-            )
+        if isinstance(factory, str) and not is_user_file(factory):
+            _split_entry_point(factory)
+        elif not (isinstance(factory, str) or callable(factory)):
+            text = f"{name!r}: a factory is callable or 'package.module:Name'"
+            raise TypeError(f"{text}, got {type(factory).__name__}")
         known = self._factories.setdefault(name, factory)
         if known != factory:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
     def load(self, name: str, others: Iterable[str] = ()) -> _Factory:
-        """Load the factory of a name or an entry point.
+        """Load the factory of a name or an entry point; ValueError if there is none.
 
         A user's file is run once a process while its content stays; it may import its neighbours.
 
@@ -171,9 +160,6 @@ class Registry:
 
         Returns:
             The factory.
-
-        Raises:
-            ValueError: The name is not registered, or there is no such file, module or name.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):

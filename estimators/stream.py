@@ -52,26 +52,19 @@ class Stream:
     Args:
         vehicle: Vehicle as for `make_vehicle`. A file brings along the steering's ratio, sign and
             offset, latencies, and the antenna's place.
-        channels: Names with units, such as "yaw_rate_degps", that will come; speed_x, yaw_rate and
-            steer must be among them.
+        channels: Names with units, such as "yaw_rate_degps", that will come, each once; speed_x,
+            yaw_rate and steer must be among them, else ValueError.
         dt: Time from one yaw rate to the next (s).
         memory: Time back to which a late sample is used (s).
 
     Attributes:
         counts: Samples ignored: "outside" the memory.
-
-    Raises:
-        ValueError: An unknown or missing channel, one given twice, or a time out of range.
     """
 
     def __init__(
-        self,
-        vehicle: VehicleSource,
-        channels: Sequence[str],
-        *,
-        dt: float = 0.01,
+        self, vehicle: VehicleSource, channels: Sequence[str], *, dt: float = 0.01,
         memory: float = 1.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         parsed = {name: parse_column_name(name.casefold()) for name in channels}
         quantities = [quantity for quantity, _, _ in parsed.values()]
         if missing := [name for name in NEEDED[1:] if name not in quantities]:
@@ -116,11 +109,8 @@ class Stream:
         self._sd: Array
         self._strange, self._origin = 0, 0  # ticks in here are not negative
         self._begin(0)
-        sensors = {
-            name: SlowSensor(period=dt, phase=0.0)
-            for name, values in SENSORS.items()
-            if values[0] in quantities
-        }
+        slow = [name for name, values in SENSORS.items() if values[0] in quantities]
+        sensors = dict.fromkeys(slow, SlowSensor(period=dt, phase=0.0))
         self._filter = make_estimator(
             "joint", vehicle=make_vehicle(vehicle), sensors=sensors, dt=dt, present=quantities
         )
@@ -140,11 +130,8 @@ class Stream:
         Args:
             channel: Name of the channel, one of those of the construction.
             stamp: Time at which it was taken, or, if the vehicle's file has the channel's latency,
-                at which it came (s).
-            value: Value in the channel's unit.
-
-        Raises:
-            ValueError: An unknown channel, or a number that is not finite.
+                at which it came (s), finite, else ValueError.
+            value: Value in the channel's unit, finite, else ValueError.
         """
         if channel not in self._channels:
             raise ValueError(f"unknown channel {channel!r}; known: {', '.join(self._channels)}")
@@ -231,11 +218,8 @@ class Stream:
         packets = make_packets(values, before, self.dt)[0]
         packets = packets[packets[:, PACKET.captured] >= start]
         move_course(fast, packets, start, self._at)
-        self._snapshots = {
-            tick: state
-            for tick, state in self._snapshots.items()
-            if end - self._memory - 2 * _SNAPSHOT_ROWS <= tick <= start
-        }
+        oldest, snapshots = end - self._memory - 2 * _SNAPSHOT_ROWS, self._snapshots
+        self._snapshots = {tick: snapshots[tick] for tick in snapshots if oldest <= tick <= start}
         while start < end:
             if start == self._first or start % _SNAPSHOT_ROWS == 0:
                 self._snapshots.setdefault(start, self._filter.get_state())

@@ -22,8 +22,6 @@ NOISES = {
     for name in ("gyro", "accel_y", "roll_rate", "wheel_left", "course", "gps_speed")
 }
 """The estimators' options for a standard deviation, by what it is of."""
-
-
 PLACED = ("gps", "accel", "sideslip")
 """Sensors that sit somewhere: the antenna, both accelerometers, and a slip sensor."""
 _REACH = 10.0  # m
@@ -56,10 +54,8 @@ class SignalCalibration(NamedTuple):
             low = 0.0 if channel in SLOW_NAMES else -_MAX_LATENCY
             is_possible = is_finite(late) and low <= late <= _MAX_LATENCY
             if channel not in _CHANNELS or not is_possible:
-                raise ValueError(
-                    f"a latency is CHANNEL=S, {low:g} to {_MAX_LATENCY:g} s, of "
-                    f"{', '.join(_CHANNELS)}; got {channel}={late}"
-                )
+                wanted = f"a latency is CHANNEL=S, {low:g} to {_MAX_LATENCY:g} s"
+                raise ValueError(f"{wanted}, of {', '.join(_CHANNELS)}; got {channel}={late}")
         for name, value in self.noise.items():
             check_choice("noise", name, NOISES.values())
             if not (is_finite(value) and value >= 0.0):
@@ -75,16 +71,13 @@ class SignalCalibration(NamedTuple):
 
 
 def read_wires(source: VehicleSource | None) -> SignalCalibration:
-    """Read the calibration in a vehicle's file, with its errors; that of others is unknown.
+    """Read the calibration in a vehicle's file; that of others is unknown.
 
     Args:
         source: Vehicle as for `make_vehicle`, or "identify".
 
     Returns:
-        The calibration.
-
-    Raises:
-        type: The error of a value out of place, with the file's name.
+        The calibration; the error of a value out of place has the file's name.
     """
     if source is None or source == "identify" or not is_document(source):
         return SignalCalibration()

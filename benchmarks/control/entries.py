@@ -27,9 +27,9 @@ from ...envs.scenarios.world import make_world
 from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import short_repr
+from ...estimators import vector
 from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
-from ...estimators.vector import estimate, truth
 from ...estimators.wrappers.estimate import EstimateObservation
 from ...estimators.wrappers.truth import TruthObservation
 from ..harness.drives import call_quietly
@@ -148,7 +148,7 @@ class Entry:
             wrappers: tuple[Any, Any] = EstimateObservation, TruthObservation
         else:
             env = gym.make_vec(env_id, num_envs=n, **case.env_options)
-            wrappers = estimate.EstimateObservation, truth.TruthObservation
+            wrappers = vector.EstimateObservation, vector.TruthObservation
         if self.estimator == TRUTH:
             env = wrappers[1](env, (), ("beta", "gamma"))
         elif self.estimator:

@@ -20,6 +20,8 @@ from ..protocol import Estimates, UnobservableWarning
 class DualRate:
     """A filter for x_{k+1} = A x_k + B u_k measured as y = C x once every `ratio` steps.
 
+    ValueError: a wrong shape, no covariance, poles that cannot be placed, or a growing error.
+
     Args:
         A: Transition matrix, shape (m, m).
         B: Input matrix, shape (m, p).
@@ -45,9 +47,6 @@ class DualRate:
         spectral_radius: Spectral radius of the error from sample to sample.
         unobservable: Directions that the measurement cannot see.
         shares: L_{k+i} G_{k+i} of (14) and (19), shape (r, m + d, q).
-
-    Raises:
-        ValueError: A wrong shape, no covariance, poles that cannot be placed, a growing error.
     """
 
     def __init__(
@@ -133,13 +132,10 @@ class DualRate:
             self.x = self.x + self.shares[self._since] @ self._innovation
 
     def update(self, y: npt.ArrayLike) -> None:
-        """Correct by the sample of this k, a multiple of r: dual-rate (13).
+        """Correct by the one sample of this k, a multiple of r, else ValueError: dual-rate (13).
 
         Args:
             y: Sample, finite, shape (q,).
-
-        Raises:
-            ValueError: Another k, or a second sample.
         """
         if self.k % self.ratio:
             raise ValueError(f"a sample comes every {self.ratio} steps, this is step {self.k}")
@@ -153,14 +149,11 @@ class DualRate:
         """Reset, then filter inputs and samples of k = 0, r, 2 r, ...
 
         Args:
-            U: Inputs, shape (K, p).
+            U: Inputs, finite, shape (K, p), else ValueError.
             Y: Samples, shape (K // r + 1, q); a row that holds a NaN is a sample that never came.
 
         Returns:
             Estimates of k = 0 .. K, time in steps.
-
-        Raises:
-            ValueError: Other shapes or an infinite number.
         """
         u, y = np.array(U, np.float64), np.array(Y, np.float64)
         p, q = self._B.shape[1], len(self._C)

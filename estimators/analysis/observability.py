@@ -14,7 +14,7 @@ from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.ticks import TICK
-from ...envs.vehicle.parameters import COMS, Vehicle
+from ...envs.vehicle.parameters import COMS
 from ..core.filter import reset_filters
 from ..design.assemble import assemble
 from ..design.config import parse_config
@@ -37,6 +37,7 @@ _NEEDS = {"accel_bias": "accel_y", "camera_yaw": "camera"}
 _ROAD = "road"  # rad, error of the road's direction, which is known at the start
 _MOVING = ("beta", "gamma", "phi", "phi_rate")  # states that settle in a turn
 _DRIVES = {"straight": 0.0, "steady turn": 0.1}  # rad, steering angle
+_SPEED = 7.0  # m/s
 _SPEED_STEP = 1e-4  # relative, of a difference by speed
 _TOLERANCE = 1e-6  # of a singular value where the largest is about 1, what counts as zero
 
@@ -60,25 +61,21 @@ class _DiscreteModel(NamedTuple):
 
 
 def _find_unobservable_subspace(
-    sensors: tuple[str, ...],
-    unknowns: tuple[str, ...],
-    steer: float = 0.0,
-    vehicle: Vehicle = COMS,
-    speed: float = 7.0,
+    sensors: tuple[str, ...], unknowns: tuple[str, ...], steer: float = 0.0
 ) -> _UnobservableSubspace:
     """Find the unobservable directions of exact-kf's model with unknown constants (Kalman)."""
-    names, rows, sd, is_ground = _build_model(sensors, unknowns, vehicle, speed)
+    names, rows, sd, is_ground = _build_model(sensors, unknowns)
     n = len(names)
     A, C = rows[:n, :n], rows[n:, :n]
     if WHEELS in unknowns:
-        turn = _settle_turn(names, rows, steer, speed)
+        turn = _settle_turn(names, rows, steer)
         slower, faster = (
-            _build_model(sensors, unknowns, vehicle, speed * (1.0 + h)).rows @ turn
+            _build_model(sensors, unknowns, _SPEED * (1.0 + h)).rows @ turn
             for h in (-_SPEED_STEP, _SPEED_STEP)
         )
         slope = (slower - faster) / (2.0 * _SPEED_STEP)  # the car is slower than its wheels say
         A = np.pad(A, (0, 2))
-        A[:n, n], A[n + 1, n] = slope[:n], -speed * turn[-1]  # it follows less of the road
+        A[:n, n], A[n + 1, n] = slope[:n], -_SPEED * turn[-1]  # it follows less of the road
         C = np.column_stack([C, slope[n:], is_ground])
         if GPS_SPEED in sensors:
             C = np.vstack([C, np.eye(n + 2)[n]])
@@ -95,12 +92,8 @@ def _find_unobservable_subspace(
     return _UnobservableSubspace(names, sd[:, None] * basis)
 
 
-def make_observability_table(vehicle: Vehicle = COMS, speed: float = 7.0) -> list[dict[str, str]]:
+def make_observability_table() -> list[dict[str, str]]:
     """Make the table of what is seen: one row for each set of sensors, straight on and turning.
-
-    Args:
-        vehicle: Vehicle of the model.
-        speed: Speed (m/s).
 
     Returns:
         Rows: "sensors", "drive", and for each unknown "yes", "alone" (where nothing else is
@@ -110,9 +103,9 @@ def make_observability_table(vehicle: Vehicle = COMS, speed: float = 7.0) -> lis
     for slow, fast, (drive, steer) in itertools.product(_SLOW, _FAST, _DRIVES.items()):
         sensors, line = fast + slow, dict.fromkeys(UNKNOWNS, "")
         unknowns = tuple(name for name in UNKNOWNS if _NEEDS.get(name, "gyro") in sensors)
-        whole = _find_unobservable_subspace(sensors, unknowns, steer, vehicle, speed)
+        whole = _find_unobservable_subspace(sensors, unknowns, steer)
         for name in unknowns:
-            single = _find_unobservable_subspace(sensors, (name,), steer, vehicle, speed)
+            single = _find_unobservable_subspace(sensors, (name,), steer)
             is_alone = "alone" if single.is_observable(name) else "no"
             line[name] = "yes" if whole.is_observable(name) else is_alone
         lines.append({"sensors": ", ".join(sensors), "drive": drive} | line)
@@ -120,17 +113,16 @@ def make_observability_table(vehicle: Vehicle = COMS, speed: float = 7.0) -> lis
 
 
 def _build_model(
-    sensors: tuple[str, ...], unknowns: tuple[str, ...], vehicle: Vehicle, speed: float
+    sensors: tuple[str, ...], unknowns: tuple[str, ...], speed: float = _SPEED
 ) -> _DiscreteModel:
-    """Build exact-kf's model at a speed."""
+    """Build exact-kf's model of `COMS` at a speed (m/s)."""
     slow = [name for name in sensors if name in SLOW_NAMES]
-    options: dict[str, object] = {
-        f"{name}_sd": UNKNOWNS[name] for name in unknowns if name != WHEELS
-    }
-    options |= {"slow": slow, "fast": [name for name in sensors if name in ("gyro", "accel_y")]}
+    fast = [name for name in sensors if name in ("gyro", "accel_y")]
+    deviations = {f"{name}_sd": UNKNOWNS[name] for name in unknowns if name != WHEELS}
+    options: dict[str, object] = {"slow": slow, "fast": fast, **deviations}
     clocks = {name: SlowSensor(0.1) for name in slow}
     config = parse_config("exact-kf", FILTERS["exact-kf"], clocks, options)
-    layers, _ = assemble(config, vehicle, TICK, speed)
+    layers, _ = assemble(config, COMS, TICK, speed)
     reset_filters(layers, 0)
     f, n, used = layers[0], len(config.states), [SLOW_NAMES.index(name) for name in slow]
     F, H = transition_matrix(f, f.G[: f.dense, :n]), np.zeros((n, 3))
@@ -149,11 +141,11 @@ def _find_kernel(M: Array) -> Array:
     return np.asarray(turned[(values > _TOLERANCE).sum() :].T)
 
 
-def _settle_turn(names: tuple[str, ...], rows: Array, steer: float, speed: float) -> Array:
+def _settle_turn(names: tuple[str, ...], rows: Array, steer: float) -> Array:
     """Settle states and inputs (n + 3,) of a turn along a road of its curvature."""
     n, moving = len(names), [i for i, name in enumerate(names) if name in _MOVING]
     turn = np.zeros(n + 3)
     turn[moving] = np.linalg.solve(rows[np.ix_(moving, moving)], -rows[moving, n] * steer)
     turn[names.index("psi")] = -turn[0]  # the course is the road's
-    turn[n], turn[n + 2] = steer, turn[1] / speed
+    turn[n], turn[n + 2] = steer, turn[1] / _SPEED
     return turn

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Vector
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import PACKET, Array, Log
 from ..core.filter import run_tick
 from ..core.innovation import IGNORE, NONE
 from ..core.model import BETA, LATERAL
@@ -33,9 +33,10 @@ def smooth(
 ) -> Estimates:
     """Compute every state of a log given what was measured up to `lag_seconds` later, or longer.
 
-    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445. ValueError also stands for what
-    `Estimator.run` refuses, and for a filter that is more, or less, than one Kalman filter: two
-    layers, precomputed gains, corrections between samples.
+    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445. ValueError stands for what
+    `Estimator.run` refuses, a lag that is not positive, and a filter that is no single Kalman
+    filter: two layers, precomputed gains, corrections between samples; TypeError for one that is
+    built and has options, or has no `filters` to smooth.
 
     Args:
         estimator: One with gains "covariance" that listens at every tick, whatever its rule for
@@ -48,10 +49,6 @@ def smooth(
 
     Returns:
         States, standard deviations, and the NIS of each packet used at its capture.
-
-    Raises:
-        TypeError: The estimator is built and has options, or has no `filters` to smooth.
-        ValueError: The lag is not positive.
     """
     if isinstance(estimator, str):
         defaults: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
@@ -60,9 +57,8 @@ def smooth(
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
     if not (isinstance(estimator, Estimator) and estimator.compiled):
-        raise TypeError(
-            f"the smoother needs a filter of the catalogue without latency, got {estimator!r}"
-        )
+        text = "the smoother needs a filter of the catalogue without latency"
+        raise TypeError(f"{text}, got {estimator!r}")
     if not lag_seconds > 0.0:
         raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
     undelayed = _remove_delay(estimator)
@@ -121,7 +117,7 @@ def _filter_forwards(
     n, dense = f.n, f.dense
     F, before, x, P, Q = block
     for j in range(len(fast)):
-        read_fast_row(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
+        read_fast_row(f, fast[j])
         run_tick(f, gains)
         for i in range(n):
             before[j, i] = f.predicted[f.tick % WINDOW, i]
@@ -148,8 +144,7 @@ def _smooth_blocks(
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
     f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
-    span = min(2 * lag, rows)
-    # two, side by side
+    span = min(2 * lag, rows)  # two blocks side by side
     blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,), (n,))]
     done = position = 0  # rows, packets
     for start in range(0, rows, lag):

@@ -1,9 +1,8 @@
 """The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
 
 Only the first n of N = `total` states move; the others are clones. Rows are computed by eights of
-their columns: beyond N all is zero and stays so. Measurements come one scalar at a time, so that
-a gain is a division. One filter's memory is a record of numbers; that of several filters in lanes
-(`vector.lanes`) has fields of the same names, whose columns come one by one.
+columns, zero beyond N. Measurements come one scalar at a time, so that a gain is a division. The
+memory of filters in lanes (`vector.lanes`) has the same fields, whose columns come one by one.
 """
 
 from ...envs.numerics.jit import inline, jit

@@ -1,19 +1,17 @@
 """The filter itself, compiled: fast rows and packets in, states out.
 
-Layers are the records of an estimator: one filter, or the two of double-layer-gps.
-
-A tick first holds what was captured at the last tick, and predicts from there with the inputs of
-this row. Then the fast sensors correct the state, and after them the packets that arrive. A
-filter at the slow sensor's rate listens every `pace` ticks, to the packets that came meanwhile. It
-holds its states in between (`stride`) or predicts them.
+Layers are the records of an estimator: one filter, or the two of double-layer-gps. A tick stores
+what was captured at the last one and predicts from there; then fast sensors correct, then packets.
+A filter at the slow sensor's rate listens every `pace` ticks; in between it holds its states
+(`stride`) or predicts them.
 """
 
 import numpy as np
 
 from ...envs.numerics.functions import sincos
-from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
+from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
-from ...envs.record import FAST, PACKET
+from ...envs.record import PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import BETA, CURVATURE, LATERAL, build_model, is_finite
 from .packets import apply_waiting, process_packet, store_history
@@ -260,14 +258,13 @@ def advance(
     f = layers[0]
     position, end_tick = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
-        wheel_speed = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
         if f.periodic == 1:
-            cell = find_next_cell(f, wheel_speed)
+            cell = find_next_cell(f, fast[j])
             if gains[cell, 0, 0] == 0.0:
                 f.missing_cell, f.cursor = cell, position
                 return j
         for layer in range(len(layers)):
-            read_fast_row(layers[layer], fast[j], wheel_speed)
+            read_fast_row(layers[layer], fast[j])
             run_tick(layers[layer], gains)
         # a packet waits only if it arrives at a later tick of this call; due, overdue or beyond the
         # last row it goes now, and `process_packet` judges it
@@ -282,28 +279,6 @@ def advance(
             _write_row(layers, gains, j, X, S)
     f.counts[COUNTERS.future] += count - position  # packets of a call without rows
     return rows
-
-
-@jit_nrt
-def step_all(
-    layers: FilterRecords, gains: GainTables, fast: Matrix, packets: Matrix, count: int
-) -> int:
-    """Call `advance` over all rows without outputs: fewer arguments to hand over.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        fast: Fast rows, shape (rows, FAST_WIDTH).
-        packets: Packets, shape (count or more, PACKET_WIDTH).
-        count: Number of packets.
-
-    Returns:
-        Number of rows done.
-    """
-    empty = fast[:0]  # its length is a 0 that is no literal, which would compile `advance` again
-    return advance(
-        layers, gains, fast, len(fast), packets, count, len(empty), empty, empty, empty.reshape(0)
-    )
 
 
 @jit

@@ -220,20 +220,19 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
 
 
 @jit
-def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Scalar:
-    """Compute the variance of a packet's row.
+def compute_sample_variance(f: FilterRecord, s: int, i: int) -> Scalar:
+    """Compute the variance of a row of the packet in f.sample.
 
     Args:
         f: Memory of the filter.
         s: Index of the slow sensor.
         i: Index of its row.
-        packet: Packet, shape (PACKET_WIDTH,).
 
     Returns:
         Variance in the row's unit squared.
     """
-    factor, variance = interpolate_hdop(f, s, packet), f.r[s, i]
-    captured = int(packet[PACKET.captured])
+    factor, variance = interpolate_hdop(f, s, f.sample), f.r[s, i]
+    captured = int(f.sample[PACKET.captured])
     if f.delay_rule == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
         slot = (captured - f.phase[s]) // f.period[s] % f.frames[s]
         variance = compute_row_variance(f, s, i, f.speed_captured[s, slot])
@@ -241,12 +240,12 @@ def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> 
 
 
 @jit
-def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
+def _test_innovation(f: FilterRecord, s: int, first: int) -> bool:
     """Compute f.nis = residual^T S^-1 residual (f.residual); return whether it passes the gate."""
     p, S, nis = f.rows[s], f.S, 0.0
     for i in range(p):  # C P C^T + R, its lower half
         projected = project_row(f, s, i, first)
-        S[i, i] = projected + compute_packet_variance(f, s, i, packet)
+        S[i, i] = projected + compute_sample_variance(f, s, i)
         for j in range(i + 1, p):
             S[j, i] = f.PC[first + j] if first >= 0 else dot(f.C[s, j], f.PC, f.n)
     for i in range(p):  # Cholesky and forward substitution in one go
@@ -327,19 +326,18 @@ def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
 
 
 @jit
-def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
-    """Return whether to use a sample: it passes the gate, or the filter re-starts with the sensor.
+def check_sample(f: FilterRecord, s: int, first: int) -> bool:
+    """Return whether to use f.sample: it passes the gate, or the filter re-starts with the sensor.
 
     Args:
         f: Memory of the filter.
         s: Index of the slow sensor.
         first: Clone of its first row, negative where it measures the states.
-        packet: Packet, shape (PACKET_WIDTH,).
 
     Returns:
         True for a sample to use.
     """
-    passed = _test_innovation(f, s, first, packet)
+    passed = _test_innovation(f, s, first)
     if f.recovery_count == 0:
         return passed
     if not passed and f.last_accepted[s] >= 0:

@@ -1,9 +1,9 @@
-"""The linear model of a filter at the present speed: A, B, their exact discretisation, gains' rows.
+"""The linear model of a filter at the present speed: A, B and their exact discretisation.
 
-Tyres that a filter estimates: factors on both axles' stiffness, and the reciprocal of friction,
-are states behind the dense ones. Every few ms each axle's force is expanded at the present state:
-its slope by slip stands in `car` and makes the bicycle's matrices, its slopes by the states are
-columns beside them, and the rest is a known push. `design.periodic` has the tables of gains.
+Estimated tyres, factors on both axles' stiffness and the reciprocal of friction, are states behind
+the dense ones. Every few ms each axle's force is expanded at the present state: its slope by slip
+stands in `car` and makes the bicycle's matrices, its slopes by the states are columns beside them,
+and the rest is a known push.
 """
 
 from ...envs.numerics.functions import sincos

@@ -1,9 +1,8 @@
 """A packet that has arrived: whether it is sound, and the rule "buffer", which rewinds to it.
 
-Every tick's inputs, fast measurements and speed are stored, and every few ticks the states and
-their covariance. For a late sample the newest snapshot not after its capture is restored, and the
-ticks up to now are filtered anew with all samples known by now: exact for any delay and order.
-The gate judges a sample once, by what was known before it; a refused one changes nothing.
+For a late sample the newest snapshot not after its capture is restored, and the stored ticks up to
+now are filtered anew with all samples known by now: exact for any delay and order. The gate judges
+a sample once, by what was known before it; a refused one changes nothing.
 """
 
 import numpy as np
@@ -79,7 +78,7 @@ def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new
     if f.kind == VELOCITY_ROLL:  # its noise comes with each packet
         copy_into(f.recent_r[place], f.r[s])
     copy_into(f.recent[place], f.sample)
-    passed = update_filter(f, gains, s, get_direct(), f.sample, is_new)
+    passed = update_filter(f, gains, s, get_direct(), is_new)
     if not passed:
         f.recent[place, PACKET.quality] = 0.0
     return passed
@@ -132,9 +131,9 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
 
 
 @noinline
-def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Correct by a packet of any age within the window; return whether it was used."""
-    captured = int(packet[PACKET.captured])
+def _rewind_update(f: FilterRecord, gains: GainTables, s: int) -> bool:
+    """Correct by f.sample, of any age within the window; return whether it was used."""
+    captured = int(f.sample[PACKET.captured])
     first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
     if _has_sample(f, s, captured):
         f.counts[COUNTERS.duplicates] += 1
@@ -148,7 +147,7 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
         f.counts[COUNTERS.refused] += 1
         return False
     f.lost = lost
-    copy_into(packet, f.recent[place])
+    copy_into(f.sample, f.recent[place])
     copy_into(f.r[s], f.recent_r[place])
     if captured == f.tick:  # is_new is True then
         return _apply_stored(f, gains, s, place, captured == f.tick)
@@ -156,13 +155,13 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
 
 
 @jit
-def _apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Correct by a sound packet according to its age; return whether it was used."""
+def _apply_sample(f: FilterRecord, gains: GainTables, s: int) -> bool:
+    """Correct by f.sample, a sound packet, according to its age; return whether it was used."""
     if f.delay_rule == BUFFER:
-        return _rewind_update(f, gains, s, packet)
-    first = find_clone(f, s, int(packet[PACKET.captured]))
+        return _rewind_update(f, gains, s)
+    first = find_clone(f, s, int(f.sample[PACKET.captured]))
     is_usable = first != DROPPED  # True where update_filter's is_gated reads it
-    return is_usable and update_filter(f, gains, s, first, packet, is_usable)
+    return is_usable and update_filter(f, gains, s, first, is_usable)
 
 
 @jit
@@ -185,9 +184,9 @@ def _is_timely(f: FilterRecord, captured: Scalar, arrived: Scalar) -> bool:
 
 
 @jit
-def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
-    """Return whether a packet of two values or more repeats the sensor's last while it moves."""
-    last = f.last[s]
+def _is_frozen(f: FilterRecord, s: int) -> bool:
+    """Return whether f.sample, of two values or more, repeats the sensor's last while it moves."""
+    packet, last = f.sample, f.last[s]
     if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
         return False
     n_equal = 0
@@ -201,8 +200,9 @@ def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 
 @jit
-def _is_valid(f: FilterRecord, packet: Vector) -> bool:
-    """Return whether a packet is for this filter and fit for use; what is not is counted."""
+def _is_valid(f: FilterRecord) -> bool:
+    """Return whether f.sample is for this filter and fit for use; what is not is counted."""
+    packet = f.sample
     for i in range(PACKET.value):
         if not is_finite(packet[i]):
             f.counts[COUNTERS.invalid] += 1
@@ -224,7 +224,7 @@ def _is_valid(f: FilterRecord, packet: Vector) -> bool:
     if packet[PACKET.quality] <= 0.0 or has_few:
         f.counts[COUNTERS.poor] += 1
         return False
-    if f.recovery_count > 0 and _is_frozen(f, s, packet):
+    if f.recovery_count > 0 and _is_frozen(f, s):
         f.counts[COUNTERS.stuck] += 1
         return False
     return True
@@ -262,12 +262,12 @@ def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
     """
     copy_into(packet, f.sample)
     f.nis = np.nan
-    if not _is_valid(f, f.sample):
+    if not _is_valid(f):
         return False
     s = int(f.sample[PACKET.sensor])
     if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
         return _store_waiting(f, s, f.sample)
-    return _apply_packet(f, gains, s, f.sample)
+    return _apply_sample(f, gains, s)
 
 
 @jit
@@ -280,5 +280,5 @@ def apply_waiting(f: FilterRecord, gains: GainTables) -> None:
     """
     for i in range(f.waits):
         copy_into(f.waiting[i], f.sample)
-        _apply_packet(f, gains, int(f.sample[PACKET.sensor]), f.sample)
+        _apply_sample(f, gains, int(f.sample[PACKET.sensor]))
     f.waits = 0

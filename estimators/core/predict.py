@@ -60,8 +60,9 @@ def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
 
 
 @jit
-def _filter_speed(f: FilterRecord, sample: float) -> Scalar:
+def _filter_speed(f: FilterRecord, row: Vector) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds (m/s); a bad sample is skipped."""
+    sample = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
     if not is_finite(sample):
         return f.speed
     if f.model_speed == 0.0:  # no sample yet
@@ -79,25 +80,25 @@ def _find_cell(f: FilterRecord, speed: float) -> int:
 
 
 @jit
-def find_next_cell(f: FilterRecord, sample: float) -> Scalar:
+def find_next_cell(f: FilterRecord, row: Vector) -> Scalar:
     """Find the table of gains that the next row will use.
 
     Args:
         f: Memory of the filter.
-        sample: The row's sample of the speed (m/s).
+        row: That fast row, shape (FAST_WIDTH,).
 
     Returns:
         Index of the cell.
     """
     if f.measured == 1:
-        speed = _filter_speed(f, sample)
+        speed = _filter_speed(f, row)
         if is_speed_changed(speed, f.model_speed):
             return _find_cell(f, speed)
     return f.cell
 
 
 @jit
-def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
+def read_fast_row(f: FilterRecord, row: Vector) -> None:
     """Read a fast row: its inputs (the last finite ones), measurements and speed.
 
     The model is built anew where it has to be.
@@ -105,7 +106,6 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     Args:
         f: Memory of the filter.
         row: Fast row, shape (FAST_WIDTH,).
-        wheel_speed: This sample of the speed (m/s).
     """
     is_sound = True
     for i in range(f.inputs):
@@ -131,7 +131,7 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         turning = row[FAST.gyro]
     is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
     if f.measured == 1:
-        f.speed = _filter_speed(f, wheel_speed)
+        f.speed = _filter_speed(f, row)
         if is_speed_changed(f.speed, f.model_speed):
             is_outdated, speed = True, f.speed
             f.cell = _find_cell(f, f.speed)
@@ -255,7 +255,6 @@ def _scale_beta(f: FilterRecord) -> None:
     if f.periodic == 0:
         for i in range(f.total):
             f.P[BETA, i] *= f.beta_scale
-        for i in range(f.total):
             f.P[i, BETA] *= f.beta_scale
         for s in range(N_SLOW):
             for i in range(f.rows[s]):

@@ -1,10 +1,9 @@
 """One filter's memory: a single record that compiled code reads and writes in place.
 
-A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
-so every filter runs on the same compiled code. The codes `kind` (of `core.model`), `delay_rule` and
-`intersample_rule` (of `core.innovation`) and `periodic` (1: gains from a table, 0: from P) say
-which fields are used. `design.assemble` writes what options and vehicle decide; `reset_filters` and
-the ticks write the rest. A missing place is 0 where place 0 is always taken, else -1.
+A copy is a complete snapshot. Sizes are fixed, so every filter runs on the same compiled code; the
+codes `kind`, `delay_rule`, `intersample_rule` and `periodic` say which fields are used.
+`design.assemble` writes what options and vehicle decide, `reset_filters` and the ticks the rest. A
+missing place is 0 where place 0 is always taken, else -1.
 """
 
 import math
@@ -266,7 +265,6 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 
 
 def _count_numbers(row: Any) -> int:
-    """Count the numbers of a row."""
     return math.prod(row[2]) if len(row) > 2 else 1
 
 
@@ -282,6 +280,5 @@ _N_BEFORE_X = sum(_count_numbers(row) for row in _ORDER[: _RANK["x"]])
 _N_PADDING = 8 - _N_BEFORE_X % 8  # with it x and P begin on cache lines
 FILTER = pad_to_cache_line([("padding", _FLOAT, (_N_PADDING,)), *_ORDER, *_WINDOW])
 X_OFFSET = _N_PADDING + _N_BEFORE_X  # numbers before x
-N_SMALL = sum(
-    _count_numbers(row) for row in _ORDER[len(_LEADING) :] if _count_numbers(row) <= 64
-)  # behind P
+_COUNTS = [_count_numbers(row) for row in _ORDER[len(_LEADING) :]]
+N_SMALL = sum(count for count in _COUNTS if count <= 64)  # behind P

@@ -1,9 +1,9 @@
 """Corrections: by the fast sensors, by a sample, and between samples of a slow sensor.
 
-Rules between samples: predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay
-(20)-(22), double-layer-gps (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate
-of the error, by one constant gain K, columns in the order fast rows, slow rows, or by a fraction of
-the last sample's gain. dual-rate: fractions of the last innovation from a table.
+Rules between samples: pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22),
+double-layer-gps (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the
+error, by a constant gain K (columns: fast rows, slow rows) or a fraction of the last sample's gain.
+dual-rate: fractions of the last innovation from a table.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ from .innovation import (
     PSEUDO,
     STORED_ONE,
     check_sample,
-    compute_packet_variance,
+    compute_sample_variance,
     note_surprise,
     propagate_larsen_gains,
 )
@@ -91,15 +91,15 @@ def _correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """Correct as `_correct_sample`, with this packet's gain, split evenly over a period."""
+def _split_sample_gain(f: FilterRecord, s: int, first: int) -> None:
+    """Correct as `_correct_sample`, with this sample's gain, split evenly over a period."""
     m, N, rows = f.fasts, f.total, f.rows[s]
     steps = f.period[s] // f.stride
     for i in range(rows):
         for j in range(N):
             f.x[j] -= f.share[m + i, j] * f.eps[m + i]
     for i in range(rows):
-        r = compute_packet_variance(f, s, i, packet)
+        r = compute_sample_variance(f, s, i)
         correct_scalar(f, project_row(f, s, i, first) + r, 0.0)
         for k in range(i):  # the rows before it correct what it measures
             correction = _apply_row(f, s, i, f.share[m + k])
@@ -160,11 +160,11 @@ def _align_heading(f: FilterRecord, s: int, turn: float) -> None:
 
 
 @jit
-def _compute_residuals(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
+def _compute_residuals(f: FilterRecord, s: int, first: int) -> None:
     """Compute f.residual of every row, wrapped where it is an angle; a heading fix may set psi."""
-    captured = int(packet[PACKET.captured])
+    captured = int(f.sample[PACKET.captured])
     for i in range(f.rows[s]):
-        residual = packet[PACKET.value + i] - _predict_row(f, s, i, first, captured)
+        residual = f.sample[PACKET.value + i] - _predict_row(f, s, i, first, captured)
         f.residual[i] = wrap(residual) if f.angle[s, i] == 1 else residual
     if f.heading_fix[s] == 1 and f.first_fix < 0:
         f.first_fix = captured
@@ -182,11 +182,9 @@ def _reduce_residuals(f: FilterRecord, s: int, first: int, i: int, K: Vector) ->
 
 
 @jit
-def _correct_periodic(
-    f: FilterRecord, gains: GainTables, s: int, first: int, packet: Vector
-) -> None:
+def _correct_periodic(f: FilterRecord, gains: GainTables, s: int, first: int) -> None:
     """Correct x by the gains of the table, one row after the other."""
-    captured = int(packet[PACKET.captured])
+    captured = int(f.sample[PACKET.captured])
     first_row = _locate_frame_row(f, s, (captured - f.phase[s]) // f.period[s] % f.pattern)
     for i in range(f.rows[s]):
         _add_gain(f, gains, first_row + i, f.residual[i])
@@ -194,10 +192,10 @@ def _correct_periodic(
 
 
 @jit
-def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
+def _correct(f: FilterRecord, s: int, first: int) -> None:
     """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
-        residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
+        residual, r = f.residual[i], compute_sample_variance(f, s, i)
         if f.r_scale_weight > 0.0 and r > 0.0:  # R follows the mean of residual^2 - C P C^T
             projected = project_row(f, s, i, first)
             sample_scale = (residual * residual - projected) / r * f.scale[s, i]
@@ -210,17 +208,14 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
 
 
 @noinline
-def update_filter(
-    f: FilterRecord, gains: GainTables, s: int, first: int, packet: Vector, is_gated: bool
-) -> bool:
-    """Correct by a packet of a slow sensor whose values are sound.
+def update_filter(f: FilterRecord, gains: GainTables, s: int, first: int, is_gated: bool) -> bool:
+    """Correct by the packet of a slow sensor in f.sample, whose values are sound.
 
     Args:
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         s: Index of the slow sensor.
         first: Clone of the sample's first row, or negative, as of `find_clone`.
-        packet: Packet, shape (PACKET_WIDTH,).
         is_gated: Whether the gate judges it and its NIS is taken: not once more when rewound.
 
     Returns:
@@ -229,31 +224,31 @@ def update_filter(
     if is_gated:
         f.nis = np.nan
     previous_fix = f.first_fix
-    _compute_residuals(f, s, first, packet)
+    _compute_residuals(f, s, first)
     if f.intersample_rule == PSEUDO and f.periodic == 1:
         _correct_sample(f, gains, s)
     elif f.intersample_rule == PSEUDO:
-        _split_sample_gain(f, s, first, packet)
+        _split_sample_gain(f, s, first)
     elif f.intersample_rule != NONE:
         for i in range(f.rows[s]):
             f.innovation[i] = f.residual[i]
         f.since = 0
         _apply_share(f, gains, s)
     elif f.periodic == 1:
-        _correct_periodic(f, gains, s, first, packet)
+        _correct_periodic(f, gains, s, first)
     elif first == STORED_ONE and f.delay_rule == LARSEN:  # x <- x + M K residual
         for i in range(f.rows[s]):
             for k in range(f.n):
                 f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
     else:
-        is_refused = is_gated and not check_sample(f, s, first, packet)
+        is_refused = is_gated and not check_sample(f, s, first)
         if is_gated and f.r_share > 0.0 and f.nis == f.nis:
             note_surprise(f, 1, f.nis / f.rows[s], _SAMPLE_WEIGHT)
         if is_refused:
             f.counts[COUNTERS.gated] += 1
             f.first_fix = previous_fix
             return False
-        _correct(f, s, first, packet)
+        _correct(f, s, first)
     return True
 
 

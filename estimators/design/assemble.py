@@ -1,7 +1,7 @@
 """From a filter's config to its compiled memory, one record a layer, and its schedules."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from .options import FilterConfig
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
 
-def _refuse(label: str, checks: Iterable[tuple[object, str]]) -> None:
+def _refuse(label: str, *checks: tuple[object, str]) -> None:
     """Raise ValueError with the first message whose condition holds."""
     for is_wrong, message in checks:
         if is_wrong:
@@ -40,18 +40,18 @@ def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
             f"the {name} can be {sensor.longest_delay:g} s late, {frames} of its periods of "
             f"{sensor.period:g} s; delay={delay!r} can hold {max_frames}"
         )
-        _refuse(config.name, [(frames > max_frames, text)])
+        _refuse(config.name, (frames > max_frames, text))
         f.frames[s] = frames
         if delay == "clone":
             f.first_clone[s] = f.total
             f.total += frames * f.rows[s]
-    too_many = (
+    is_twice = delay == "larsen" and f.frames.sum() > 1
+    text = (
         f"{f.n} states and {f.total - f.n} clones are more than the {size.N_TOTAL} of "
         f"delay={delay!r}; delay='buffer' needs no clones"
     )
-    is_twice = delay == "larsen" and f.frames.sum() > 1
-    checks = (is_twice, "delay='larsen' is for one late sensor"), (f.total > size.N_TOTAL, too_many)
-    _refuse(config.name, checks)
+    twice = "delay='larsen' is for one late sensor"
+    _refuse(config.name, (is_twice, twice), (f.total > size.N_TOTAL, text))
 
 
 def _check_window(f: FilterRecord, config: FilterConfig) -> None:
@@ -83,14 +83,13 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
             f"delay={rule.RULES[f.delay_rule]!r} has a window of {window * dt:g} s ({window} ticks)"
         )
         checks.append((sensor.longest_delay > (window + 1e-6) * dt, text))
-        n_samples += 2 + math.ceil(
-            (sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt) / sensor.period
-        )
+        longest = sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt
+        n_samples += 2 + math.ceil(longest / sensor.period)
     text = (
         f"{n_samples} samples of {' and '.join(sensors)} can come within the longest delay; "
         f"delay='buffer' stores {size.N_RECENT}"
     )
-    _refuse(config.name, [*checks, (is_buffer and n_samples > size.N_RECENT, text)])
+    _refuse(config.name, *checks, (is_buffer and n_samples > size.N_RECENT, text))
 
 
 _EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
@@ -122,7 +121,7 @@ def assemble(
         _write_clocks(f, config, dt)
         n, f.step = len(model.names), f.stride * dt
         too_many = f"{n} states are more than the {size.N_CORE} of a filter: {model.names}"
-        _refuse(config.name, [(n > size.N_CORE, too_many)])
+        _refuse(config.name, (n > size.N_CORE, too_many))
         block = slice(first, first + n)
         _write_model(f, model, vehicle, config, config.Q[block, block] * f.step)
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
@@ -197,9 +196,7 @@ def _write_model(
     body = make_roll_model(vehicle)
     f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
     f.sway = vehicle.roll_moment_arm / vehicle.mass
-    f.preview = vehicle.preview
-    f.Q[:n, :n] = Q
-    f.decay[:] = 1.0
+    f.preview, f.Q[:n, :n], f.decay[:] = vehicle.preview, Q, 1.0
     if model.forces:  # exact discretisation of the process
         force_sd, moment_sd = config.force_sd, config.moment_sd
         weight, arm = vehicle.mass * GRAVITY, 0.5 * (vehicle.front_arm + vehicle.rear_arm)
@@ -224,10 +221,8 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     names = model.names
     if TYRES[0] not in names:
         return
-    f.tyres, f.inverse_friction = (
-        names.index(TYRES[0]),
-        names.index(TYRES[2]) if TYRES[2] in names else 0,
-    )
+    f.tyres = names.index(TYRES[0])
+    f.inverse_friction = names.index(TYRES[2]) if TYRES[2] in names else 0
     f.linearise_every = max(1, round(_EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
@@ -278,10 +273,10 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
     """Write what the used slow sensors measure."""
     used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
     f.first_slow = used[0] if used else -1
+    is_second_layer = model.kind == VELOCITY_ROLL
     for s in used:
         name = SLOW_NAMES[s]
         sensor = models.MEASUREMENTS[name]
-        is_second_layer = model.kind == VELOCITY_ROLL
         rows = sensor.velocities if is_second_layer else sensor.rows
         f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
         for place, value in enumerate(SLOW[s].values, PACKET.value):
@@ -321,8 +316,7 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
     def make_schedule(extra: int) -> Schedule:
         # a sample is used in the first step that listens at or after its arrival
         lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
-        if len(set(lags)) == 1:
-            lags = lags[:1]
+        lags = lags[:1] if len(set(lags)) == 1 else lags
         return Schedule(period, tuple(lags * (math.lcm(len(lags), slots) // len(lags))))
 
     shortest, longest = make_schedule(0), make_schedule(jitter)
@@ -352,7 +346,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     is_refused = (f.periodic or f.intersample_rule) and _is_covariance_needed(config)
     cannot_adapt = config.adapt > 0.0 and config.delay in ("larsen", "buffer")
     needed = f"adapt needs delay='clone', got delay={config.delay!r}"
-    _refuse(config.name, [(is_refused, text), (cannot_adapt, needed)])
+    _refuse(config.name, (is_refused, text), (cannot_adapt, needed))
 
 
 def _is_covariance_needed(config: FilterConfig) -> bool:
@@ -362,7 +356,6 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
-
     if f.intersample_rule == rule.DUAL_RATE or config.row.gains == "placed":
         return True
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
@@ -371,9 +364,9 @@ def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
         impossible = "its model changes with the yaw rate"
     elif f.intersample_rule == rule.PSEUDO:
         early = f"a sample must arrive before the next one is captured, got {config.sensors}"
-        is_covariance = config.gains == "covariance"
         refusal = "no gains='covariance': it has one constant gain"
-        _refuse(config.name, [(is_covariance, refusal), (f.frames.max() > 1, early)])
+        is_refused = config.gains == "covariance"
+        _refuse(config.name, (is_refused, refusal), (f.frames.max() > 1, early))
         return True
     elif any(model.biases for model in config.models):
         impossible = "a constant bias has no settled gain"
@@ -381,7 +374,7 @@ def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
         impossible = "two slow sensors" if is_multi_sensor else "random delay"
     if impossible:
         text = f"no gains='periodic': {impossible}; use gains='covariance'"
-        _refuse(config.name, [(config.gains == "periodic", text)])
+        _refuse(config.name, (config.gains == "periodic", text))
         return False
     default = "covariance" if _is_covariance_needed(config) else config.row.gains
     return (config.gains or default) == "periodic"

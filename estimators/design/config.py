@@ -12,11 +12,12 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import describe_unknown
 from ..core.innovation import RULES
+from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
 from . import dual_rate, models
 from .kalman import INVERSES, check_covariance
-from .models import BIASES, SCALE, STATES, TYRES, WANDER
+from .models import BIASES, SCALE, STATES, TYRES, WANDER, FilterModel
 from .options import (
     FAST_CHANNELS,
     FIND,
@@ -36,10 +37,13 @@ _LATENCY = NumberRule(f"is 0 to {_MAX_LATENCY} s or {FIND!r}", lambda v: 0.0 <= 
 _Values = dict[str, Any]  # options by name
 
 
-_NUMBERS = (  # options that every filter has
-    *("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable"),
-)
+# options that every filter has
+_NUMBERS = ("satellites", "robust", "map_lag_sd", "noise_time", "adapt", "allow_unstable")
 _DISTURBANCES = {"F_d", "N_d", "d", "d1", "d2", "d3"}
+_BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
+_WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
+# states that disturbances are, and what they push; dual-rate (4): one for every state of (37)
+_WALKS = {"none": (), "walk": _WALK, "walk-all": (*_WALK, ("d3", "psi")), "forces": ()}
 
 
 class _Reader:
@@ -47,9 +51,6 @@ class _Reader:
 
     def __init__(self, name: str, options: Mapping[str, object]) -> None:
         self.name, self._unread, self._known = name, dict(options), list[str]()
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._unread
 
     def add_defaults(self, defaults: Mapping[str, object]) -> None:
         """Add options that the caller left out."""
@@ -130,9 +131,6 @@ def parse_config(
 
     Returns:
         The complete options.
-
-    Raises:
-        reader.make_error: The ValueError for poles that are not one a state.
     """
     reader = _Reader(name, options)
     used = _select_slow_sensors(row, sensors, reader)
@@ -140,11 +138,9 @@ def parse_config(
     chosen: _Values = {"slow": used} | _parse_rules(row, used, reader)
     chosen |= _parse_inertial(row, used, reader)
     if row.model == "bicycle":
-        disturbances = reader.read_choice("disturbances", row.disturbances, models.DISTURBANCES)
+        disturbances = reader.read_choice("disturbances", row.disturbances, list(_WALKS))
         chosen |= {"disturbances": disturbances} | reader.read("steer_rate")
-        late, rolls = chosen["delay"] in ("literal", "lag"), chosen["fast"] != row.fast
-        biases = tuple(chosen["bias_sds"])
-        first = models.make_bicycle_model(used, chosen["fast"], disturbances, late, rolls, biases)
+        first = _make_bicycle_model(used, chosen, rolls=chosen["fast"] != row.fast)
     else:
         first = models.MODELS[row.model]
     layers = (first, models.MODELS[row.second]) if row.second else (first,)
@@ -186,6 +182,18 @@ def parse_config(
     )
 
 
+def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) -> FilterModel:
+    """Make the bicycle model with the states that slow sensors need; `rolls`: the body does."""
+    states = models.select_states(sensors)
+    lags = chosen["delay"] in ("literal", "lag") and "camera" in sensors  # tie-vision (12)-(13)
+    late = tuple(models.LATE[state] for state in states if lags and state in models.LATE)
+    walking = tuple(pair for pair in _WALKS[chosen["disturbances"]] if pair[1] in states)
+    inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
+    forces, states = chosen["disturbances"] == "forces", states + _BODY * rolls
+    biases = tuple(chosen["bias_sds"])
+    return FilterModel(LATERAL, states, inputs, chosen["fast"], walking, forces, late, biases)
+
+
 def _select_slow_sensors(
     row: FilterDefinition, available: Mapping[str, SlowSensor], reader: _Reader
 ) -> tuple[str, ...]:
@@ -219,14 +227,11 @@ def _select_defaults(
     defaults = dict(row.options)
     fast = options.get("fast", defaults.get("fast", row.fast))
     sensors = {*used, *(fast if isinstance(fast, list | tuple) else [fast]), ""}
-    absent = [
-        name
-        for name, sensor in BIASES.items()
-        if sensor not in sensors or options.get(f"{name}_sd") == 0.0
-    ]
-    left_out = {f"{name}_sd" for name in absent} | {f"{name}_time" for name in absent}
-    left_out |= {f"q_{name}" for name in absent}
-    left_out |= {"model_error"} if TYRES[0] in absent else set()
+    left_out = set[str]()
+    for name, sensor in BIASES.items():
+        if sensor not in sensors or options.get(f"{name}_sd") == 0.0:
+            left_out |= {f"{name}_sd", f"{name}_time", f"q_{name}"}
+            left_out |= {"model_error"} if name == TYRES[0] else set()
     return {key: value for key, value in defaults.items() if key not in left_out}
 
 
@@ -240,9 +245,9 @@ def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) ->
         chosen["intersample"] = reader.read_choice("intersample", default, words)
     known_gains = dual_rate.GAINS if is_dual_rate else ("", "periodic", "covariance")
     gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
-    if gains == "from-29" and chosen["intersample"] != "pseudo":
-        text = "is 'pseudo' for gains='from-29'"
-        raise reader.make_error("intersample", text, chosen["intersample"])
+    rule = chosen["intersample"]
+    if gains == "from-29" and rule != "pseudo":
+        raise reader.make_error("intersample", "is 'pseudo' for gains='from-29'", rule)
     if row.intersample == "single-rate":
         chosen["between"] = reader.read_choice("between", "hold", ("hold", "predict"))
         if chosen["between"] == "hold" and len(used) > 1:
@@ -271,10 +276,10 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
     fast = tuple(word for word in known if word in words)
     if len(fast) != len(words) or known[0] not in fast:
         raise reader.make_error("fast", f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
-    biases: dict[str, float] = {}
-    for name in BIASES:
-        key, unit = f"{name}_sd", STATES[name].unit
-        biases[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, unit)
+    biases = {
+        name: reader.read_number(f"{name}_sd", 0.0, NOT_NEGATIVE, STATES[name].unit)
+        for name in BIASES
+    }
     nominal = [name for name in TYRES if not biases[name] > 0.0]
     if nominal not in (list(TYRES), list(TYRES[2:]), []):
         raise ValueError(f"{reader.name}: {nominal[0]}_sd is above 0 where another tyre's state is")

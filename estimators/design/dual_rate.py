@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...envs.record import Array
-from . import kalman
-from .kalman import Poles, compute_inverse, observer_gain
+from .kalman import Poles, compute_inverse, joseph_form, kalman_gain, observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
@@ -66,8 +65,8 @@ class SampledSystem(NamedTuple):
             power, noise = F @ power, F @ noise @ F.T + Q
         P, K = noise.copy(), np.zeros((n, len(C)))
         for _ in range(_CYCLES):
-            before, K = K, kalman.kalman_gain(P, C, R)
-            P = power @ kalman.joseph_form(P, K, C, R) @ power.T + noise
+            before, K = K, kalman_gain(P, C, R)
+            P = power @ joseph_form(P, K, C, R) @ power.T + noise
             if np.abs(K - before).max() <= _SETTLED * np.abs(K).max():
                 break
         return K
@@ -110,8 +109,8 @@ class SampledSystem(NamedTuple):
                     v = G + C @ Lambda
                     noise = C @ Upsilon @ C.T + v @ R @ v.T  # (29)
                     P = F @ P @ F.T + Q
-                L = kalman.kalman_gain(P, C, noise)
-                P = kalman.joseph_form(P, L, C, noise)
+                L = kalman_gain(P, C, noise)
+                P = joseph_form(P, L, C, noise)
                 shares[i] = L @ G
             if np.abs(shares - before).max() <= _SETTLED * np.abs(shares).max():
                 break
@@ -131,13 +130,12 @@ class SampledSystem(NamedTuple):
         P = np.zeros((n + q, n + q))  # of the error and the last innovation
         predict_map = np.eye(n + q)
         predict_map[:n, :n] = self.F
+        measure_map = np.block([[np.eye(n), np.zeros((n, q))], [self.C, np.zeros((q, q))]])
         for _ in range(30):
             for i, share in enumerate(B):
                 P = predict_map @ P @ predict_map.T
                 P[:n, :n] += self.Q
                 if i == 0:
-                    zero = np.zeros((n, q))
-                    measure_map = np.block([[np.eye(n), zero], [self.C, np.zeros((q, q))]])
                     P = measure_map @ P @ measure_map.T
                     P[n:, n:] += self.R
                 correct_map = np.eye(n + q)

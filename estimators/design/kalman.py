@@ -1,7 +1,4 @@
-"""The Kalman filter in textbook letters, generalised inverses and gains by pole placement.
-
-Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
-"""
+"""The Kalman filter in textbook letters, generalised inverses and gains by pole placement."""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,15 +8,12 @@ from ..core.record import FilterRecord
 
 
 def check_covariance(name: str, M: Array, definite: bool = False) -> None:
-    """Check that a matrix is a covariance.
+    """Check that a matrix is a covariance: finite, symmetric, semidefinite; else ValueError.
 
     Args:
         name: Name for messages.
         M: Matrix, shape (n, n).
         definite: Whether it must be positive definite.
-
-    Raises:
-        ValueError: It is not finite, symmetric and positive semidefinite (or definite).
     """
     if not np.isfinite(M).all():
         raise ValueError(f"{name} is not finite")
@@ -70,8 +64,7 @@ def joseph_form(P: Array, K: Array, C: Array, R: Array) -> Array:
         Covariance, shape (n, n).
     """
     rest = np.eye(len(P)) - K @ C
-    after: Array = rest @ P @ rest.T + K @ R @ K.T
-    return after
+    return np.asarray(rest @ P @ rest.T + K @ R @ K.T)
 
 
 def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
@@ -90,11 +83,9 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     Returns:
         Inverse, shape (n, p).
     """
-    I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
-    ridge = _RIDGE * np.eye(len(C))
-    kinds = {"moore-penrose": (I, zero), "p-weighted": (P, zero), "bayes": (P, R)}
-    weight, noise = kinds.get(kind, (I, ridge))
-    return kalman_gain(weight, C, noise)
+    zero, ridge = np.zeros((len(C), len(C))), _RIDGE * np.eye(len(C))
+    noises = {"moore-penrose": zero, "p-weighted": zero, "tikhonov": ridge, "bayes": R}
+    return kalman_gain(P if kind in ("p-weighted", "bayes") else np.eye(len(P)), C, noises[kind])
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:
@@ -120,13 +111,10 @@ def observer_gain(F: Array, C: Array, poles: Poles) -> Array:
     Args:
         F: Transition matrix, shape (n, n).
         C: Measurement matrix, shape (p, n).
-        poles: Poles in the z-plane, shape (n,).
+        poles: Poles in the z-plane, shape (n,), no more equal ones than there are outputs.
 
     Returns:
-        Gain, shape (n, p).
-
-    Raises:
-        ValueError: It is not observable, or more poles are equal than there are outputs.
+        Gain, shape (n, p); ValueError where the poles cannot be placed.
     """
     try:
         from scipy.signal import place_poles  # slow to load

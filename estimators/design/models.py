@@ -1,6 +1,5 @@
 """Which states a filter has, what drives them and what its sensors measure.
 
-A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
 A bicycle's states stand in the order of `_ORDER`, as many of them as its sensors need. The first
 states of a model follow its physics ("dense"), the disturbances behind them decay by themselves.
 """
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.model import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
+from ..core.model import FORCES, KINEMATIC, ROLL, VELOCITY_ROLL, YAW
 
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
@@ -60,6 +59,7 @@ class StateInfo(NamedTuple):
     bound: float  # largest magnitude of an estimate in an observation
 
 
+TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 STATES = {
     "beta": StateInfo("rad", 0.02, np.pi / 2.0),
     "gamma": StateInfo("rad/s", 0.05, 10.0),
@@ -67,12 +67,10 @@ STATES = {
     "y_l": StateInfo("m", 0.3, 200.0),
     "psi_late": StateInfo("rad", 0.05, np.pi),
     "y_l_late": StateInfo("m", 0.3, 200.0),
-    "v_x": StateInfo("m/s", 0.1, 100.0),
-    "v_y": StateInfo("m/s", 0.1, 100.0),
+    **dict.fromkeys(("v_x", "v_y"), StateInfo("m/s", 0.1, 100.0)),
     "phi": StateInfo("rad", 0.02, np.pi / 2.0),
     "phi_rate": StateInfo("rad/s", 0.05, 10.0),
-    "F_yf": StateInfo("N", 500.0, 1e5),
-    "F_yr": StateInfo("N", 500.0, 1e5),
+    **dict.fromkeys(("F_yf", "F_yr"), StateInfo("N", 500.0, 1e5)),
     "d1": StateInfo("rad/s", 0.1, 100.0),
     "d2": StateInfo("rad/s2", 1.0, 1000.0),
     "d3": StateInfo("rad/s", 0.1, 100.0),
@@ -82,13 +80,9 @@ STATES = {
     "bias": StateInfo("rad/s", 0.0, 10.0),
     "accel_bias": StateInfo("m/s2", 0.0, 50.0),
     "accel_scale": StateInfo("-", 0.0, 1.0),
-    "bank": StateInfo("rad", 0.0, 1.0),
-    "camera_yaw": StateInfo("rad", 0.0, 1.0),
-    "map_heading": StateInfo("rad", 0.0, 1.0),
+    **dict.fromkeys(("bank", "camera_yaw", "map_heading"), StateInfo("rad", 0.0, 1.0)),
     "steer_offset": StateInfo("rad", 0.0, 1.0),
-    "front_tyres": StateInfo("-", 0.0, 5.0),
-    "rear_tyres": StateInfo("-", 0.0, 5.0),
-    "inverse_friction": StateInfo("-", 0.0, 5.0),
+    **dict.fromkeys(TYRES, StateInfo("-", 0.0, 5.0)),
 }
 """All states of all models, by name."""
 FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
@@ -116,27 +110,16 @@ class FilterModel:
 
 
 _ORDER = ("beta", "gamma", "psi", "y_l")
-_BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
-TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 WANDER = {
-    "bias": "gyro",
-    "accel_bias": "accel_y",
-    "bank": "",
-    "camera_yaw": "camera",
-    "map_heading": "camera",
-    "steer_offset": "",
+    **{"bias": "gyro", "accel_bias": "accel_y", "bank": "", "camera_yaw": "camera"},
+    **{"map_heading": "camera", "steer_offset": ""},
 }
 SCALE = "accel_scale"
 BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
-"""States that nothing drives but noise, and the sensor that each needs, if any: biases of fast
-sensors, the road's bank, the camera's yaw against the car, what the map's heading errs, what the
-steering sensor measures too much, the error of the accelerometer's scale. The tyres' states count
-as biases too: factors of stiffness, and the reciprocal of friction."""
+"""States that nothing drives but noise, and the sensor that each needs, if any. Option `bias_sds`
+says what they are. The tyres' count too: factors of stiffness, and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
-_WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
-_WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)
-DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
 MODELS: dict[str, FilterModel] = {
     "roll": FilterModel(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
@@ -169,33 +152,3 @@ def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
     """
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
     return _ORDER[: max([2, *(1 + _ORDER.index(state) for row in rows for state in row.states)])]
-
-
-def make_bicycle_model(
-    sensors: tuple[str, ...],
-    fast: tuple[str, ...],
-    disturbances: str,
-    late: bool,
-    rolls: bool = False,
-    biases: tuple[str, ...] = (),
-) -> FilterModel:
-    """Make the bicycle model with the states that slow sensors need.
-
-    Args:
-        sensors: Names of the slow sensors.
-        fast: Names of the fast sensors.
-        disturbances: Name of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" d_3 of psi too.
-        late: Whether the camera measures states that lag (tie-vision (12)-(13)).
-        rolls: Whether the body rolls.
-        biases: Names of `BIASES`.
-
-    Returns:
-        The model.
-    """
-    states, walks = select_states(sensors), {"walk": _WALK, "walk-all": _WALK_ALL}
-    lags = late and "camera" in sensors
-    late_states = tuple(LATE[state] for state in states if lags and state in LATE)
-    walking = tuple(pair for pair in walks.get(disturbances, ()) if pair[1] in states)
-    inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
-    forces, states = disturbances == "forces", states + _BODY * rolls
-    return FilterModel(LATERAL, states, inputs, fast, walking, forces, late_states, biases)

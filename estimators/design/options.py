@@ -1,9 +1,7 @@
 """The options of filters, each described once, and the tuned process noise.
 
 Messages, the signature of `make_estimator` and the table in the docs of `FilterOptions` come from
-its fields. The process noise of each filter with its slow sensors is in `tunings.toml`, as
-`sideslip tune estimator` found it: per second, in (unit of the state)^2 / s, with the command that
-found it.
+its fields. `tunings.toml` has the process noise of filters as `sideslip tune estimator` found it.
 """
 
 import math
@@ -25,13 +23,8 @@ from .kalman import INVERSES
 from .models import BIASES, MEASUREMENTS, NONLINEAR, STATES, WANDER, FilterModel
 
 FAST_CHANNELS: dict[str, tuple[int, ...]] = {
-    "steer": (FAST.steer,),
-    "gyro": (FAST.gyro,),
-    "accel_x": (FAST.accel_x,),
-    "accel_y": (FAST.accel_y,),
-    "roll_rate": (FAST.roll_rate,),
-    "wheels": (FAST.wheel_left, FAST.wheel_right),
-}
+    name: (getattr(FAST, name),) for name in ("steer", "gyro", "accel_x", "accel_y", "roll_rate")
+} | {"wheels": (FAST.wheel_left, FAST.wheel_right)}
 """The columns of a fast row that are late together."""
 FIND = "find"
 NOISE = {
@@ -49,16 +42,13 @@ FILE = Path(__file__).with_name("tunings.toml")
 
 
 def read_tunings(path: str | Path = FILE) -> list[dict[str, Any]]:
-    """Read the entries of a tunings file.
+    """Read the entries of a tunings file; ValueError with its path if it is none.
 
     Args:
         path: TOML file.
 
     Returns:
         Entries with `estimator`, `sensors` and `q`, process noise by state, (unit)^2 / s.
-
-    Raises:
-        ValueError: It is no file of tunings; the message has the path.
     """
     try:
         entries = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("tuning", [])

@@ -1,13 +1,9 @@
 """The schedule of a slow sensor, and the gains of a filter that repeat with it.
 
-The covariance filter is run over the schedule until its gains repeat. A table of gains has a head
-row; for each step of the cycle a row for every fast measurement (one where there is none); for
-each frame of the pattern a row for every slow row. Pseudo-residuals add K^T and the transposed
-inverse, dual-rate rules a fraction of the innovation for each step. Behind the gains of a step
-stands the upper half of the states' covariance after it.
-
-Without noise the estimation error after a cycle is a matrix times the error before it. Its
-spectral radius decides: above one the filter diverges; at one it has an unobservable direction.
+A table of gains has a head row; for each step of the cycle a row for every fast measurement (one
+where there is none); for each frame of the pattern a row for every slow row. Pseudo-residuals add
+K^T and the transposed inverse, dual-rate rules a fraction of the innovation for each step. Behind
+the gains of a step stands the upper half of the states' covariance after it.
 """
 
 import pickle
@@ -39,7 +35,7 @@ from .options import FilterConfig
 
 
 def count_ticks(seconds: float, dt: float, label: str) -> int:
-    """Convert a time to a number of ticks.
+    """Convert a time to a number of ticks; ValueError where it is no whole number.
 
     Args:
         seconds: Time (s).
@@ -48,9 +44,6 @@ def count_ticks(seconds: float, dt: float, label: str) -> int:
 
     Returns:
         Number of ticks.
-
-    Raises:
-        ValueError: The time is no whole number of ticks.
     """
     count = round(seconds / dt)
     if abs(seconds / dt - count) > 1e-6 * max(1.0, count):
@@ -310,12 +303,10 @@ def design_and_map(
 
 
 def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed: float) -> Array:
-    """Compute the map (size, size) of the error over a cycle by what the compiled filter does.
-
-    Behind the error of the states stands what else a rule carries on: the estimated error e, clones
-    or predictions of the captures under way. A column is what becomes of a small error there, where
-    all that is measured is zero.
-    """
+    """Compute the map (size, size) of the error over a cycle by what the compiled filter does."""
+    # Behind the error of the states stands what else a rule carries on: the estimated error e,
+    # clones or predictions of the captures under way. A column is what becomes of a small error
+    # there, where all that is measured is zero.
     cycle, period, lags = schedule.cycle, schedule.period, schedule.lags
     filters = _copy_for_schedule(f, schedule, speed)
     g = filters.view(np.recarray)[0]
@@ -344,9 +335,8 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
         spans, vectors = [slice(0, f.n)], (g.x, g.e) if f.intersample_rule == PSEUDO else (g.x,)
         if f.delay_rule == CLONE and lags:
             s, p = int(f.first_slow), int(f.rows[f.first_slow])
-            is_carried = (g.stamp[s, : f.frames[s]] >= 0) | (
-                f.intersample_rule == PSEUDO
-            )  # e's is read later
+            is_read = f.intersample_rule == PSEUDO  # e's is read later
+            is_carried = (g.stamp[s, : f.frames[s]] >= 0) | is_read
             firsts = f.first_clone[s] + p * np.flatnonzero(is_carried)
             spans += [slice(first, first + p) for first in firsts]
         late = latest // period if f.delay_rule in (STORED, CONSTANT) else 0
@@ -391,8 +381,7 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     directions = []
     for i in np.flatnonzero(np.abs(values) > 1.0 - MARGINAL):
         v = np.real(vectors[: len(names), i])
-        largest = np.abs(v).max()
-        if largest == 0.0:  # of a clone alone
+        if (largest := np.abs(v).max()) == 0.0:  # of a clone alone
             continue
         leading = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
         parts = zip(names, v / leading, strict=True)

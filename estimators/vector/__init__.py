@@ -1,4 +1,4 @@
 """Observations of vector environments: all rows' estimates in one compiled call, or the truth."""
 
 from .estimate import EstimateObservation as EstimateObservation
-from .truth import TruthObservation as TruthObservation
+from .estimate import TruthObservation as TruthObservation

@@ -1,8 +1,7 @@
 """Many filters of one kind side by side, compiled together, or an object a row."""
 
 import copy
-import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,6 @@ from ...envs.numerics.simd8 import allocate_aligned
 from ...envs.record import Array
 from ..core.record import FILTER
 from ..estimator import Estimator
-from ..filters import FILTERS
-from ..make import make_estimator
-from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import Observed, StepRecord, write_outputs
 from .lane_ticks import FilterBank
@@ -42,9 +38,8 @@ class _GainPool:
         if design not in self._estimators:
             estimator = self._build(**spec._asdict())
             if not isinstance(estimator, Estimator):
-                raise TypeError(
-                    f"a batch is of filters of ours or of none, got {estimator!r} as well"
-                )
+                text = "a batch is of filters of ours or of none"
+                raise TypeError(f"{text}, got {estimator!r} as well")
             self._estimators[design] = estimator
         return self._estimators[design]
 
@@ -72,19 +67,15 @@ class _GainPool:
 class BatchEstimator:
     """N filters of one name in one compiled call.
 
-    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. Filters of equal
-    specs, but for the phases of clocks, share one table of gains. ValueError says that the filters
-    have different states.
+    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory in `filters`, shape
+    (N, layers). Filters of equal specs, but for the phases of clocks, share one table of gains.
+    ValueError says that the filters have different states.
 
     Args:
         name: Name of the filters.
         specs: Vehicle, sensors and speed of each filter, N of them.
         dt: Tick (s).
         build: Function that builds one filter from its spec.
-
-    Attributes:
-        filters: Records of all filters, dtype `FILTER`, shape (N, layers).
-        names: Names of their states; `units` has their units.
     """
 
     def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:
@@ -141,10 +132,9 @@ class BatchEstimator:
 
     def _check_states(self, i: int, names: tuple[str, ...]) -> None:
         if names != self.names:
-            raise ValueError(
-                f"{self.name}: the filters of a batch have the same states, row 0 has "
-                f"{', '.join(self.names)} and row {i} {', '.join(names)}"
-            )
+            first, other = ", ".join(self.names), ", ".join(names)
+            text = f"{self.name}: the filters of a batch have the same states"
+            raise ValueError(f"{text}, row 0 has {first} and row {i} {other}")
 
     def reset(self, mask: _Mask) -> None:
         """Reset some filters to the clocks of their specs.
@@ -259,31 +249,3 @@ class ForeignBatch(BatchEstimator):
         """
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)
-
-
-def build_batch(
-    source: str | EstimatorFactory,
-    specs: Sequence[EstimatorSpec],
-    dt: float,
-    options: Mapping[str, Any],
-) -> BatchEstimator:
-    """Build an estimator for each spec, compiled together where all are ours and none is late.
-
-    Args:
-        source: Name or factory.
-        specs: Vehicle, sensors and speed of each estimator.
-        dt: Tick (s).
-        options: Options of `make_estimator`, whose errors it raises.
-
-    Returns:
-        The batch.
-    """
-    build_one = functools.partial(make_estimator, source, dt=dt, **options)
-    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
-        first = build_one(**specs[0]._asdict())
-        if isinstance(first, ForeignEstimator):
-            batch_class = getattr(first.inner, "batch", ForeignBatch)
-            return batch_class(first, specs, dt, build_one)
-        if not first.compiled:
-            return ForeignBatch(first, specs, dt, build_one)
-    return BatchEstimator(get_label(source), specs, dt, build_one)

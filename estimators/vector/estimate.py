@@ -1,5 +1,6 @@
-"""EstimateObservation for vector environments: all rows' estimators in one compiled call."""
+"""Observations of vector environments: all rows' estimates in one compiled call, or the truth."""
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -9,11 +10,22 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry
 from ...envs.vehicle.parameters import VehicleSource
+from ..filters import FILTERS
+from ..make import make_estimator
+from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
-from ..wrappers.truth import calibrate, choose_vehicle, set_stiffness
-from .batch import build_batch
+from ..wrappers.truth import (
+    STIFFNESSES,
+    TruthEntries,
+    calibrate,
+    check_single,
+    choose_vehicle,
+    set_stiffness,
+)
+from ..wrappers.truth import TruthObservation as SingleTruth
+from .batch import BatchEstimator, ForeignBatch
 from .records import BatchedEnv, Mask, Observations, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
@@ -90,9 +102,8 @@ class EstimateObservation(VectorObservation):
 
     A row whose episode ended starts a new one with a fresh filter; where that is within the step
     that ended it, the old filter first takes the last record into `final_obs`. As the environments
-    do, `infos` has arrays (N,) of `beta_hat`, `beta_std` and `nees` with masks.
-
-    `layout` describes a row; `estimator` is the `BatchEstimator` at work.
+    do, `infos` has arrays (N,) of `beta_hat`, `beta_std` and `nees` with masks. `layout` describes
+    a row; `estimator` is the `BatchEstimator` at work. Errors are those of the single wrapper.
 
     Args:
         env: Vector environment of N rows.
@@ -105,10 +116,6 @@ class EstimateObservation(VectorObservation):
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
-
-    Raises:
-        TypeError: It is not innermost, records are out of reach, or the estimator is one object.
-        ValueError: An output is unknown, names would stand twice, or there is no autoreset.
     """
 
     def __init__(
@@ -128,18 +135,16 @@ class EstimateObservation(VectorObservation):
         values = estimator, outputs, std, replace, vehicle, options, name
         self._arguments = Arguments.read(clocks, *values, **misplaced)
         if self._arguments.is_object:
-            raise TypeError(
-                f"one {self._arguments.label} cannot estimate {env.num_envs} rows: pass its class, "
-                "another factory or a name"
-            )
+            text = f"one {self._arguments.label} cannot estimate {env.num_envs} rows"
+            raise TypeError(f"{text}: pass its class, another factory or a name")
         super().__init__(env, Single, self._arguments.recorded)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
         self._calibration = np.ones((env.num_envs, 2, FAST_WIDTH))
-        specs = self._make_specs(range(env.num_envs))
-        self._first_vehicle, source = specs[0].vehicle, self._arguments.estimator
-        self.estimator = build_batch(source, specs, self._records.dt, self._arguments.options)
+        specs, arguments = self._make_specs(range(env.num_envs)), self._arguments
+        self._first_vehicle, dt = specs[0].vehicle, self._records.dt
+        self.estimator = _build_batch(arguments.estimator, specs, dt, arguments.options)
         inner = getattr(env, "layout", self._records.layout)
         self._outputs = self._arguments.make_outputs(self.estimator.names, inner)
         self._set_layout(self._outputs.layout)
@@ -160,15 +165,13 @@ class EstimateObservation(VectorObservation):
 
     def _make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
-        specs = self._records.make_specs(rows)
+        specs, car = self._records.make_specs(rows), self._arguments.vehicle
         if self._arguments.is_told_truth:
             truths = self._get_truths(rows)
             self._calibration[rows] = [item.calibration for item in truths]
             pairs = zip(specs, truths, strict=True)
             return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
-        if self._arguments.vehicle is None:
-            return specs
-        return [spec._replace(vehicle=self._arguments.vehicle) for spec in specs]
+        return specs if car is None else [spec._replace(vehicle=car) for spec in specs]
 
     def _update_cars(self, rows: Sequence[int]) -> None:
         """Fit the estimators of some rows to the cars of their present episodes."""
@@ -230,20 +233,34 @@ class EstimateObservation(VectorObservation):
                 self._records.annotate(self._outputs.title, values, summary[:, STD], mask)
 
 
+def _build_batch(
+    source: str | EstimatorFactory,
+    specs: Sequence[EstimatorSpec],
+    dt: float,
+    options: Mapping[str, Any],
+) -> BatchEstimator:
+    """Build an estimator for each spec, compiled together where all are ours and none is late."""
+    build_one = functools.partial(make_estimator, source, dt=dt, **options)
+    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
+        first = build_one(**specs[0]._asdict())
+        if isinstance(first, ForeignEstimator):
+            batch_class = getattr(first.inner, "batch", ForeignBatch)
+            return batch_class(first, specs, dt, build_one)
+        if not first.compiled:
+            return ForeignBatch(first, specs, dt, build_one)
+    return BatchEstimator(get_label(source), specs, dt, build_one)
+
+
 def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:
     """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
-        raise TypeError(
-            f"{type(env).__name__} is no vector environment; the wrapper of a single one is "
-            "sideslip.estimators.EstimateObservation"
-        )
+        text = f"{type(env).__name__} is no vector environment; the wrapper of a single one"
+        raise TypeError(f"{text} is sideslip.estimators.EstimateObservation")
     layer = env
     while isinstance(layer, VectorWrapper):
         if not isinstance(layer, EstimateObservation):
-            raise TypeError(
-                "EstimateObservation must be the innermost wrapper, directly around the vector "
-                f"environment; inside it is {type(layer).__name__}"
-            )
+            text = "EstimateObservation must be the innermost wrapper, directly around the vector"
+            raise TypeError(f"{text} environment; inside it is {type(layer).__name__}")
         layer = layer.env
     if isinstance(layer, AsyncVectorEnv):
         raise TypeError(
@@ -254,10 +271,73 @@ def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecor
         )
     if isinstance(layer, SyncVectorEnv):
         return _SyncRecords(layer)
-    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]
-    if missing:
-        raise TypeError(
-            "EstimateObservation reads the records of a sideslip vector environment; "
-            f"{type(layer).__name__} has no {', '.join(missing)}"
-        )
+    if missing := [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]:
+        text = "EstimateObservation reads the records of a sideslip vector environment"
+        raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
     return _BatchedRecords(layer)
+
+
+class TruthObservation(VectorObservation):
+    """`sideslip.estimators.wrappers.truth.TruthObservation` of all rows, with the same bits.
+
+    It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row has the parameters
+    of its new car from the first observation of an episode on; `final_obs` holds the old one's.
+
+    TypeError says that the env has no layout or no vehicles, ValueError that a name is unknown or
+    stands twice, or that rows with states reset in the same step.
+
+    Args:
+        env: Vector environment of N rows with a `layout`.
+        parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
+        states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        parameters: Sequence[str] = STIFFNESSES,
+        states: Sequence[str] = (),
+    ) -> None:
+        recorded = {"parameters": list(parameters), "states": list(states)}
+        super().__init__(env, SingleTruth, recorded)
+        check_single(env, type(self))
+        if not hasattr(env, "layout"):
+            text = f"{type(env).__name__} has no layout; wrap it in"
+            raise TypeError(f"{text} sideslip.estimators.vector.EstimateObservation first")
+        self._entries = TruthEntries(parameters, states, env.layout)
+        self._set_layout(self._entries.layout)
+        if self._same_step and states:
+            raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
+        self._values = np.zeros((env.num_envs, len(parameters)), np.float32)
+        shape = env.num_envs, 2, len(self._entries.columns)
+        self._calibration: Observations = np.ones(shape, np.float32)
+        self._ended = np.ones(env.num_envs, np.bool_)
+
+    def _begin(self, mask: Mask) -> None:
+        rows = np.flatnonzero(mask)
+        for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
+            self._values[i], self._calibration[i] = self._entries.read(truth)
+
+    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+        for i in np.flatnonzero(ended):
+            car = self._values[i], self._calibration[i]
+            infos["final_obs"][i] = self._entries.append(infos["final_obs"][i], *car, None)
+
+    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+        true_states: Any = None
+        if self._entries.states:
+            base: Any = self.unwrapped
+            if isinstance(base, SyncVectorEnv):
+                true_states = np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
+            elif hasattr(base, "true_state"):
+                true_states = np.asarray(base.true_state)
+            else:
+                raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+        return self._entries.append(obs, self._values, self._calibration, true_states)
+
+    def _get_memory(self) -> dict[str, Any]:
+        return {"values": self._values.copy(), "calibration": self._calibration.copy()}
+
+    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
+        self._values = snapshot["values"].copy()
+        self._calibration = snapshot["calibration"].copy()

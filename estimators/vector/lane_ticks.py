@@ -282,11 +282,6 @@ def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> No
 
 
 @jit
-def _average_wheel_speed(row: Vector) -> Scalar:
-    return 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-
-
-@jit
 def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> bool:
     """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
     if b.periodic == 1:
@@ -295,7 +290,7 @@ def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j:
                 i = first + lane
                 f, place = bank.filters[i, 0], bank.places[i]
                 f.speed = b.speed[lane]
-                cell = find_next_cell(f, _average_wheel_speed(fast[i, j]))
+                cell = find_next_cell(f, fast[i, j])
                 if bank.pool[place[0] + cell * place[2] * place[3]] == 0.0:
                     return False
     for lane in range(count_lanes()):
@@ -307,7 +302,7 @@ def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j:
 @noinline
 def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
     """Step one filter by one tick."""
-    read_fast_row(f, row, _average_wheel_speed(row))
+    read_fast_row(f, row)
     run_tick(f, gains)
 
 

@@ -1,10 +1,8 @@
 """The batch's part of an observation, compiled: filters of one shape in SIMD lanes, others alone.
 
-A block has a record's fields of the same names, whose numbers are lanes, so the equations of `core`
-are compiled for it unchanged. Filter i of a batch has lane i mod LANES of block i // LANES. Its
-model stays there and is loaded anew where its speed changed; its state is loaded and stored in
-every call. In all functions b is a block, lane an index in it, and f the record of the lane's
-filter.
+A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
+`core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
+Its model stays there and is loaded anew where its speed changed; its state in every call.
 """
 
 from collections.abc import Callable

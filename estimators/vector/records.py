@@ -25,16 +25,13 @@ Observations = npt.NDArray[np.float32]
 
 
 class BatchedEnv(Protocol):
-    """The attributes of a vector env that steps all cars at once.
-
-    The final_... attributes are a car's record before its newest reset. They are read in the step
-    that ended its episode.
-    """
+    """The attributes of a vector env that steps all cars at once."""
 
     rows: Array  # fast samples of each car, (N, k, FAST_WIDTH)
     ticks_done: IntArray  # number of fast samples of each car, (N,)
     packets: Array  # (N, capacity, PACKET_WIDTH)
     delivered: IntArray  # number of packets of each car, (N,)
+    # a car's record before its newest reset, which is read in the step that ended its episode
     final_rows: Array
     final_ticks_done: IntArray
     final_packets: Array
@@ -70,8 +67,7 @@ class VectorObservation(
         VectorWrapper.__init__(self, env)
         self._single = single
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
-        # rows that the next step resets; None: all are to be reset
-        self._ended: Mask | None = None
+        self._ended: Mask | None = None  # rows that the next step resets; None: all are to be
 
     def _set_layout(self, layout: tuple[ObservationEntry, ...]) -> None:
         """Set the entries of a row's observation."""
@@ -118,7 +114,7 @@ class VectorObservation(
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows, or those of options["reset_mask"].
+        """Reset the rows, or those of options["reset_mask"], else ResetNeeded: all come first.
 
         Args:
             seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
@@ -126,9 +122,6 @@ class VectorObservation(
 
         Returns:
             Observations and infos.
-
-        Raises:
-            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
         """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
@@ -148,16 +141,13 @@ class VectorObservation(
         return self._append(obs, infos, rows), infos
 
     def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows.
+        """Step all rows; ResetNeeded before `reset`, and after a step that failed.
 
         Args:
             actions: Actions of all rows.
 
         Returns:
             Observations, rewards, terminations, truncations and infos.
-
-        Raises:
-            ResetNeeded: It is called before `reset`, or after a step that failed.
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, Self
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +32,7 @@ from .outputs import (
     StepRecord,
     compile_observe,
     write_outputs,
-)  # fmt: skip
+)
 from .truth import TRUTH, calibrate, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
@@ -91,24 +91,18 @@ class Arguments:
     recorded: dict[str, Any] = dataclasses.field(init=False, default_factory=dict)  # for a spec
 
     @classmethod
-    def read(
-        cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any
-    ) -> "Arguments":
+    def read(cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any) -> Self:
         """Read and check arguments, choose an estimator where there is none, make the vehicle.
 
         Args:
             slow_sensors: Slow sensors of the env by name.
             *values: Arguments of the wrapper.
-            **named: Arguments by name.
+            **named: Arguments by name; TypeError for a misplaced one has the nearest name.
 
         Returns:
-            The arguments.
-
-        Raises:
-            TypeError: An argument is misplaced; the message has the nearest name.
-            ValueError: An object has a vehicle or options, which would not reach it.
+            The arguments; ValueError where a vehicle or options would not reach an object.
         """
-        names = [field.name for field in dataclasses.fields(cls)][:-1]
+        names = [field.name for field in dataclasses.fields(cls) if field.init]
         misplaced = {name: named.pop(name) for name in list(named) if name not in names}
         self = cls(*values, **named)
         if self.estimator is None:
@@ -118,8 +112,7 @@ class Arguments:
             if isinstance(self.estimator, str) and "did you mean" not in wrong:
                 # this names the nearest option
                 make_estimator(self.estimator, sensors=slow_sensors, **misplaced)
-                passed = short_repr(dict(misplaced))
-                wrong = f"options of an estimator are passed as options={passed}"
+                wrong = f"options of an estimator are passed as options={short_repr(misplaced)}"
             raise TypeError(wrong)
         self.options = dict(self.options or {})
         recorded, car = self.estimator, self.vehicle
@@ -133,8 +126,8 @@ class Arguments:
         elif not isinstance(recorded, str):
             recorded = find_entry_point(recorded) or recorded
         car = car.to_dict() if isinstance(car, Vehicle) else car
-        values = recorded, list(self.outputs), bool(self.std), bool(self.replace)
         car = dict(car) if isinstance(car, Mapping) else car
+        values = recorded, list(self.outputs), bool(self.std), bool(self.replace)
         self.recorded = dict(zip(names, (*values, car, self.options, self.name), strict=True))
         return self
 
@@ -171,10 +164,7 @@ class Arguments:
             inner: Entries of the inner observation, which `replace` leaves out.
 
         Returns:
-            The entries, and how `observe` writes them.
-
-        Raises:
-            ValueError: An output is no state, or names would stand twice.
+            The entries, and how `observe` writes them; ValueError for unknown or repeated ones.
         """
         for output in self.outputs:
             if output not in states:
@@ -187,29 +177,24 @@ class Arguments:
             for s, (unit, _, bound) in zip(self.outputs, kinds, strict=True):
                 layout.append(ObservationEntry(f"{prefix}{s}_{ending}", unit, low * bound, bound))
         names = [entry.name for entry in layout]
-        if duplicates := sorted({entry for entry in names if names.count(entry) > 1}):
-            text = "would stand twice; give this wrapper a name=..."
-            raise ValueError(f"{', '.join(duplicates)} {text}")
+        if duplicates := ", ".join(sorted({entry for entry in names if names.count(entry) > 1})):
+            raise ValueError(f"{duplicates} would stand twice; give this wrapper a name=...")
         truths = [_TRUTHS.get(s, 0) for s in self.outputs]
         columns = [states.index(s) for s in self.outputs], [s in _WRAPPED for s in self.outputs]
         keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
         keys += [("nees", NEES)] if any(truths) else []
         keys += [("healthy", HEALTHY)] if self._finds_noise else []
-        table = OutputTable(
-            n_inner,
-            np.array([*columns, truths], np.int64).T.copy(),
-            np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
-        )
+        plan = np.array([*columns, truths], np.int64).T.copy()
+        limits = np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64)
+        table = OutputTable(n_inner, plan, limits)
         title = self.label if self.name is None else f"{self.label} ({self.name})"
         return Outputs(title, tuple(layout), table, tuple((prefix + k, place) for k, place in keys))
 
 
 def _refuse_rebuild(label: str, **_: object) -> NoReturn:
     """Raise the reason why a spec with an object cannot be built, in the place of a factory."""
-    raise TypeError(
-        f"a spec cannot build {label} once more: it was passed as an object; pass its class, a "
-        "factory or a name"
-    )
+    text = f"a spec cannot build {label} once more: it was passed as an object"
+    raise TypeError(f"{text}; pass its class, a factory or a name")
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
@@ -406,28 +391,20 @@ def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
     """Find the base env, with no wrapper in between that may hide ticks from the estimator.
 
     Args:
-        env: Environment, wrapped or not.
+        env: Environment, wrapped or not; TypeError if it has another wrapper or no record.
 
     Returns:
         The environment that has the record.
-
-    Raises:
-        TypeError: Another wrapper is inside, or the environment has no record.
     """
     layer = env
     while isinstance(layer, gym.Wrapper):
         kind = type(layer)
         is_allowed = isinstance(layer, (*_ALLOWED_WRAPPERS, EstimateObservation))
         if not is_allowed and (kind.__module__, kind.__name__) != _MONITOR:
-            raise TypeError(
-                "EstimateObservation must be the innermost wrapper, directly around the "
-                f"environment; inside it is {kind.__name__}"
-            )
+            text = "EstimateObservation must be the innermost wrapper, directly around the"
+            raise TypeError(f"{text} environment; inside it is {kind.__name__}")
         layer = layer.env
-    missing = [name for name in _BASE_MEMBERS if not hasattr(layer, name)]
-    if missing:
-        raise TypeError(
-            f"EstimateObservation reads the record of a sideslip environment; "
-            f"{type(layer).__name__} has no {', '.join(missing)}"
-        )
+    if missing := [name for name in _BASE_MEMBERS if not hasattr(layer, name)]:
+        text = "EstimateObservation reads the record of a sideslip environment"
+        raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
     return layer

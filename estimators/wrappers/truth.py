@@ -56,19 +56,15 @@ class TruthEntries:
         states: States of a `TrueState`, each as `<state>_hat`.
         inner: Entries of the observation.
 
+    ValueError says that a parameter or state is unknown, or that a name would stand twice.
+
     Attributes:
         layout: All entries.
         columns: Fast columns of the k readings in the observation.
-
-    Raises:
-        ValueError: A parameter or state is unknown, or a name would stand twice.
     """
 
     def __init__(
-        self,
-        parameters: Sequence[str],
-        states: Sequence[str],
-        inner: Sequence[ObservationEntry],
+        self, parameters: Sequence[str], states: Sequence[str], inner: Sequence[ObservationEntry]
     ) -> None:
         self.parameters, self.states = tuple(parameters), tuple(states)
         fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
@@ -76,8 +72,7 @@ class TruthEntries:
         entries = list(inner)
         for name in parameters:
             if name not in units:
-                known = ", ".join(units)
-                raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
+                raise ValueError(f"a vehicle has no parameter {name!r}; it has: {', '.join(units)}")
             limits = -_MAX_PARAMETER, _MAX_PARAMETER
             entries.append(ObservationEntry(f"true_{name}", units[name], *limits))
         for name in states:
@@ -86,12 +81,10 @@ class TruthEntries:
             unit, limit = _STATES[name]
             entries.append(ObservationEntry(f"{name}_hat", unit, -limit, limit))
         names = [entry.name for entry in entries]
-        duplicates = sorted({name for name in names if names.count(name) > 1})
-        if duplicates:
-            raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
+        if duplicates := ", ".join(sorted({name for name in names if names.count(name) > 1})):
+            raise ValueError(f"{duplicates} would stand twice in the observation")
         self.layout = tuple(entries)
         stems = [re.sub(r"_(mean|\d+)$", "", entry.name) for entry in inner]
-        # of the readings of fast sensors
         self._places = [i for i, stem in enumerate(stems) if stem in FAST._fields]
         self.columns = [FAST._fields.index(stems[i]) for i in self._places]
         self._limits = np.array([_STATES[name][1] for name in states])
@@ -106,8 +99,8 @@ class TruthEntries:
         Returns:
             Values and calibration.
         """
-        sources = [truth if name in _MOTORS else truth.vehicle for name in self.parameters]
-        values = [getattr(x, name) for x, name in zip(sources, self.parameters, strict=True)]
+        sources = {name: truth if name in _MOTORS else truth.vehicle for name in self.parameters}
+        values = [getattr(source, name) for name, source in sources.items()]
         calibration = truth.calibration[:, self.columns].astype(np.float32)
         return np.array(values, np.float32), calibration
 
@@ -189,12 +182,9 @@ def check_single(env: Any, kind: type) -> None:
 class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
-    Beside states `true_friction` is the present one.
-
-    Readings of steering, wheels and motors lose the constant errors that a `World` draws; the
-    references, by which all are judged, are made from what the env's own sensors read.
-
-    No sensor measures these: it makes the oracles with which others are compared
+    Beside states `true_friction` is the present one. Readings of steering, wheels and motors lose
+    the constant errors that a `World` draws; the references, by which all are judged, are made from
+    what the env's own sensors read. It makes the oracles with which others are compared
     (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
     whole observation.
 

@@ -15,7 +15,7 @@ from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs.engine import views
 from sideslip.envs.vehicle.tyres import fit_fiala
 from sideslip.estimators.vector import estimate
-from sideslip.estimators.vector.truth import TruthObservation as VectorTruth
+from sideslip.estimators.vector.estimate import TruthObservation as VectorTruth
 from sideslip.estimators.wrappers.estimate import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits

@@ -17,7 +17,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.env_info import get_env_facts, get_layout, list_plant_kinds
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
-from sideslip.estimators.vector.truth import TruthObservation as BatchTruth
+from sideslip.estimators.vector.estimate import TruthObservation as BatchTruth
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.policies import VISION
 

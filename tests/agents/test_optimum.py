@@ -16,7 +16,7 @@ from sideslip.agents.optimum import (
     wrap_optimal_estimate,
 )
 from sideslip.envs.record import FAST
-from sideslip.estimators.vector.truth import TruthObservation
+from sideslip.estimators.vector.estimate import TruthObservation
 
 IDS = ("sideslip/LinearYawVision-v0", "sideslip/LinearYawGps-v0")
 LINEAR: Any = gym.spec(IDS[0]).kwargs["scenario"]

@@ -13,7 +13,7 @@ from sideslip.agents.design.sampled_model import SPEEDS, DesignSpec, make_design
 from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs import COMS
 from sideslip.envs.task import MODEL, compute_reference, make_reference_params
-from sideslip.estimators.vector.truth import TruthObservation as VectorTruth
+from sideslip.estimators.vector.estimate import TruthObservation as VectorTruth
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.agents.controllers.test_lqr import SMALL
 from tests.agents.helpers import observe

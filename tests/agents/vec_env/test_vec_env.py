@@ -15,7 +15,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.env_info import get_env_facts
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.vector import truth as vector_truth
+from sideslip.estimators.vector import TruthObservation as VectorTruth
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 pytest.importorskip("stable_baselines3")
@@ -342,7 +342,7 @@ def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) ->
 
 def test_a_wrapper_that_adds_entries_has_its_own_scales() -> None:
     """Of an angle 0.05 rad is one, in the wrapper's entries as in the env's."""
-    wrapper = vector_truth.TruthObservation
+    wrapper = VectorTruth
     plain: Any = make_vec_env(VISION, 2, 0, wrapper_class=wrapper, scaled=False)
     scaled: Any = make_vec_env(VISION, 2, 0, wrapper_class=wrapper)
     bare: Any = make_vec_env(VISION, 2, 0)

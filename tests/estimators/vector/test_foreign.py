@@ -9,8 +9,7 @@ import pytest
 from sideslip.envs import COMS
 from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.estimators import make_estimator
-from sideslip.estimators.vector.estimate import EstimateObservation
-from sideslip.estimators.vector.truth import TruthObservation
+from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs import batches
 from tests.estimators.vector.fleets import (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.estimators import FILTERS
-from sideslip.estimators.vector.estimate import EstimateObservation
-from sideslip.estimators.vector.truth import TruthObservation
+from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS

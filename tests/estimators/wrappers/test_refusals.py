@@ -13,7 +13,7 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator, smooth, vector
 from sideslip.estimators.make import ESTIMATORS, register_estimator
-from sideslip.estimators.vector.truth import TruthObservation as VectorTruthObservation
+from sideslip.estimators.vector.estimate import TruthObservation as VectorTruthObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.estimators.wrappers.constant import Constant
 

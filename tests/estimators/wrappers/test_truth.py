@@ -12,7 +12,7 @@ from sideslip.envs import COMS
 from sideslip.envs.engine.views import TRUE_STATE
 from sideslip.estimators import EstimateObservation, make_estimator
 from sideslip.estimators.vector import estimate as vectorised
-from sideslip.estimators.vector.truth import TruthObservation as VectorTruthObservation
+from sideslip.estimators.vector.estimate import TruthObservation as VectorTruthObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits
 
