@@ -17,6 +17,7 @@ from .base import StepEnds, Tensor, TensorVectorEnv
 from .cuda_kernel import (
     ASKED,
     RUNS,
+    SIMULATED,
     WORDS,
     DeviceArrays,
     KernelConstants,
@@ -24,7 +25,6 @@ from .cuda_kernel import (
     make_specification,
 )
 from .cuda_launch import load_kernel
-from .cuda_text import SIMULATED
 
 _NEW_ARRAYS = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
 """Arrays that are new in every step; the others stay at their place."""
