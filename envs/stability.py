@@ -17,7 +17,7 @@ from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
 from .engine.views import CarTruth, Episode, compute_true_states
-from .engine.workspace import Workspace
+from .engine.window import Workspace
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record
@@ -124,6 +124,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         slow: By sensor ("camera", "gps"), fields of `SlowSensor` that replace the id's.
     """
 
+    dt = TICK  # s, the base tick
     _spec: EnvSpec | None = None
 
     def __init__(
@@ -223,8 +224,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
-        camera = self.camera
-        row = self._workspace.row
+        camera, row = self.camera, self._workspace.row
         before = row.z if camera is None else row.z.copy()
         done = self._advance(command)
         if done <= 0:
@@ -258,8 +258,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def _start_episode(self) -> None:
         """Begin an episode whose tick 0 is packed, with its picture."""
         if self.camera is not None:
-            row = self._row
-            self.camera.capture(row.p, row.z, self.motion, 0)
+            self.camera.capture(self._row.p, self._row.z, self.motion, 0)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -302,11 +301,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def record(self) -> Record:
         """The record of the newest step, or of tick 0 after a reset (a copy)."""
         return self._get_episode().record
-
-    @property
-    def dt(self) -> float:
-        """The base tick in seconds."""
-        return TICK
 
     @property
     def scenario(self) -> Scenario:
@@ -363,12 +357,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def get_state(self) -> dict[str, Any]:
         """Copy the state of env and generator, from which `set_state` continues bit for bit."""
         arrays = {name: getattr(self._row, part).copy() for name, part in _SNAPSHOT.items()}
+        progress, rng = (self.ticks_done, self._over), copy.deepcopy(self.np_random)
         return arrays | {
-            "config": self._episode,
-            "layout": self.layout,
-            "progress": (self.ticks_done, self._over),
-            "rng": copy.deepcopy(self.np_random),
-        }
+            "config": self._episode, "layout": self.layout, "progress": progress, "rng": rng
+        }  # fmt: skip
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env, or of one like it: until the next reset car, scenario and

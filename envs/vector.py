@@ -26,8 +26,6 @@ from .vehicle.parameters import Vehicle
 Observations = npt.NDArray[np.float32]
 T = TypeVar("T")
 
-_INFO_MODES = ("all", "ends")
-
 
 def make_rows(
     num_envs: int, arguments: Mapping[str, Any], is_uniform: bool = False
@@ -61,8 +59,8 @@ def make_rows(
         key = tuple(map(id, values))
         if key not in envs:
             named = zip(columns, values, strict=True)
-            own_arguments = {name: value for name, value in named if value is not None}
-            envs[key] = StabilityEnv(**{**arguments, **own_arguments})
+            row_arguments = {name: value for name, value in named if value is not None}
+            envs[key] = StabilityEnv(**{**arguments, **row_arguments})
         rows.append(envs[key].config)
     return next(iter(envs.values())), rows * N if is_uniform else rows
 
@@ -130,6 +128,9 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         ValueError: For an argument out of place; TypeError for one of another type.
     """
 
+    dt = TICK  # s, the base tick
+    _spec: EnvSpec | None = None
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -139,10 +140,9 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
-        if info not in _INFO_MODES:
+        if info not in ("all", "ends"):
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
-        self._all_infos = info == "all"
-        self._max_steps = max_episode_steps
+        self._all_infos, self._max_steps = info == "all", max_episode_steps
         if max_episode_steps is not None:
             self._max_steps = check_int("max_episode_steps", max_episode_steps, "steps")
         _, rows = make_rows(num_envs, arguments)
@@ -171,8 +171,6 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
             spec.kwargs["autoreset_mode"] = self._mode.value  # as JSON writes it
         self._spec = spec
 
-    _spec: EnvSpec | None = None
-
     def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         self._restart_rows(chosen, *self._make_configs(options, chosen), seeds)
         self._has_over = bool(self._over.any())
@@ -183,16 +181,14 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         return self._obs.copy(), make_infos(self._reports, mask) if self._all_infos else {}
 
     def _list_over_rows(self) -> list[int]:
-        rows: list[int] = np.flatnonzero(self._over).tolist()
-        return rows
+        return np.flatnonzero(self._over).tolist()
 
     def _step_rows(self, actions: Any) -> tuple[Observations, Array, Mask, Mask, Infos]:
         N, config, over = self.num_envs, self.config, self._over
         commands = parse_actions(actions, N, config.action_width, config.on_bad_action == "fail")
         over_rows = np.flatnonzero(over) if self._has_over else None
-        results = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
-        rewards, terminated, truncated = results
-        n_ended = self.engine.step(commands, results)
+        rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
+        n_ended = self.engine.step(commands, (rewards, terminated, truncated))
         if n_ended == REFUSED:
             bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~over)
             self._refuse_actions(bad.tolist(), commands)
@@ -226,9 +222,8 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         for i in rows:
             final_obs[i] = self._obs[i].copy()
         infos: Infos = {"final_info": make_infos(self._reports, over), "final_obs": final_obs}
-        infos |= {f"_{key}": over.copy() for key in infos}
         self._start_rows(rows, {}, {})
-        return infos
+        return infos | {f"_{key}": over.copy() for key in infos}
 
     def _get_episode(self, row: int) -> Episode:
         params, states, switches, *_ = self.engine.arrays
@@ -239,11 +234,6 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
 
     def _map_episodes(self, read: Callable[[Episode], T]) -> Sequence[T]:
         return _LazyRows(self.num_envs, lambda i: read(self._get_episode(i)))
-
-    @property
-    def dt(self) -> float:
-        """The base tick in seconds."""
-        return TICK
 
     @property
     def motion(self) -> Array:

@@ -74,12 +74,8 @@ class DeviceVectorEnv(TensorVectorEnv):
         self.engine = NumbaEngine(self.config, num_envs)  # on the host, which resets
         compiler = os.environ.get("CXX", "g++")  # where torch looks for it
         if compile and self.device.type == "cpu" and shutil.which(compiler) is None:
-            warnings.warn(
-                f"compile=True needs a C++ compiler on the CPU, and there is no {compiler!r}: "
-                "ticks are not compiled",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+            text = f"compile=True needs a C++ compiler on the CPU, and there is no {compiler!r}"
+            warnings.warn(f"{text}: ticks are not compiled", RuntimeWarning, stacklevel=2)
             compile = False
         self._compile, self._grad, config = compile, grad, self.config
         self._kind = get_start_variant(config.base.start)
@@ -109,11 +105,10 @@ class DeviceVectorEnv(TensorVectorEnv):
 
     def _build(self, capacities: dict[int, PacketCapacity]) -> None:
         """Build the step with these capacities, and copy all rows to the device."""
-        dtype, obs_dtype = self.dtype, self.dtype if self._grad else torch.float32
-        tensor_args = dtype, obs_dtype, self.device, self._compile
-        self._step = TorchStep(self.config, capacities, *tensor_args)
+        kinds = self.dtype, self.dtype if self._grad else torch.float32, self.device, self._compile
+        self._step = TorchStep(self.config, capacities, *kinds)
         start = TorchReset(self._step) if self._grad else None
-        self._rows = DeviceRows(self.engine.arrays, capacities, self.device, dtype, start)
+        self._rows = DeviceRows(self.engine.arrays, capacities, self.device, self.dtype, start)
 
     def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         """Reset rows on the host, and copy them to the device."""

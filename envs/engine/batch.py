@@ -31,6 +31,7 @@ IntArray = npt.NDArray[np.int64]
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
 # How many parameters ticks read, and how many numbers of the state they change besides the driver's
 # angle: in an ideal world, and in one with errors.
+_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 _TICK_PARAMS = (P.errors[0], P.slow[0].period)
 _TICK_STATE = (Z.errors[0], Z.slow[0].frames)
 
@@ -141,9 +142,6 @@ def _step_lanes(count: int, batch: BatchArrays, actions: Matrix, buffers: _LaneB
     return True
 
 
-_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
-
-
 @jit
 def _step_rows(
     batch: BatchArrays, actions: Matrix, results: tuple[Vector, Vector, Vector],
@@ -173,15 +171,10 @@ def _step_rows(
         if n_pending and (
             n_pending == count_lanes() or m == last or _has_variant_change(m, batch, buffers)
         ):
-            is_vectorised = False
-            if n_pending > _MAX_SCALAR:
-                is_vectorised = _step_lanes(n_pending, batch, actions, buffers)
+            is_wide = n_pending > _MAX_SCALAR and _step_lanes(n_pending, batch, actions, buffers)
             for lane in range(n_pending):
-                i = buffers.members[lane]
-                if is_vectorised:
-                    batch.ticks_done[i] = batch.rows.shape[1]
-                else:
-                    batch.ticks_done[i] = _step_single(i, batch, actions, buffers)
+                i, n = buffers.members[lane], batch.rows.shape[1]
+                batch.ticks_done[i] = n if is_wide else _step_single(i, batch, actions, buffers)
             n_pending = 0
     for i in range(len(over)):
         if over[i]:
@@ -191,8 +184,7 @@ def _step_rows(
         batch.delivered[i] = int(report[REPORT.packets])
         rewards[i], terminated[i], truncated[i] = read_ends(report)
         over[i] = terminated[i] or truncated[i]
-        if over[i]:
-            n_ended += 1
+        n_ended += int(over[i])
     return n_ended
 
 
@@ -283,12 +275,9 @@ class NumbaEngine:
         self.lane_buffers = _make_lane_buffers(N, n, config.bounds)
 
     def reset(
-        self,
-        chosen: IntArray,
-        starts: Sequence[EpisodeStart],
-        index: IntArray,
+        self, chosen: IntArray, starts: Sequence[EpisodeStart], index: IntArray,
         keys: npt.NDArray[np.uint64],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Reset rows.
 
         Args:

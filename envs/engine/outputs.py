@@ -22,22 +22,14 @@ NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 @jit
 def _push_packet(
-    z: Vector,
-    sensor: int,
-    captured: Scalar,
-    due: Scalar,
-    quality: Scalar,
-    frame: Scalar,
+    z: Vector, sensor: int, captured: Scalar, due: Scalar, quality: Scalar, frame: Scalar,
     values: Vector,
-) -> None:
+) -> None:  # fmt: skip
     """Queue a captured sample; `make_link` has checked that the queue is long enough."""
     slot = int(z[Z.under_way])
     packet = z[Z.queue + slot * PACKET_WIDTH :]
-    packet[PACKET.sensor] = sensor
-    packet[PACKET.captured] = captured
-    packet[PACKET.arrived] = due
-    packet[PACKET.quality] = quality
-    packet[PACKET.sequence] = frame
+    packet[PACKET.sensor], packet[PACKET.captured], packet[PACKET.arrived] = sensor, captured, due
+    packet[PACKET.quality], packet[PACKET.sequence] = quality, frame
     for i in range(VALUES):
         packet[PACKET.value + i] = values[i]
     z[Z.under_way] = slot + 1.0
@@ -124,11 +116,10 @@ def make_measurement_context(
     Returns:
         The inputs.
     """
-    road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
-    sky, field_of_view, errors = read(p, P.sky), read(p, P.field_of_view), read(p, P.errors)
     return MeasurementContext(
-        motion, road, car, noise, sky, field_of_view, errors, small_angle, key[0], key[1], tick
-    )
+        motion, read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky),
+        read(p, P.field_of_view), read(p, P.errors), small_angle, key[0], key[1], tick,
+    )  # fmt: skip
 
 
 @jit
@@ -288,14 +279,12 @@ def sample_slow_ticks(row: EpisodeArrays, first: int, last: int, count: int, don
 @jit
 def _observe_step(row: EpisodeArrays, n: int, done: int) -> int:
     """Write the observation but for the slow sensors, whose first entry's index is returned."""
-    report, rows = row.report, row.rows
-    refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
-    n_rows = done
+    refs = (row.report[REPORT.beta_ref], row.report[REPORT.gamma_ref])
     if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
         for j in range(done, n):
-            copy_into(rows[done - 1], rows[j])
-        n_rows = n
-    return int(observe_fast(row, n_rows, refs))
+            copy_into(row.rows[done - 1], row.rows[j])
+        done = n
+    return int(observe_fast(row, done, refs))
 
 
 @jit

@@ -173,16 +173,13 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
     _write_errors(p, z, d)
-    n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
-    road = read(p, P.road)
-    steer = compute_profile_angle(p, 0.0)
+    n, steer = draw_normals(key_low, key_high, 0, CHANNELS.initial), compute_profile_angle(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
-        driver, path = read(p, P.driver), read(p, P.path)
+        driver, path, road = read(p, P.driver), read(p, P.path), read(p, P.road)
         steer = compute_target_angle(motion, path, road, target, driver, p[P.task.stop])
     elif switches[FLAGS.steering] == WANDER:
         steer = d.amplitude * draw_normals(key_low, key_high, 0, CHANNELS.steering)[0]
-    z[Z.drive.delta_f] = steer
-    z[Z.driver] = steer
+    z[Z.drive.delta_f] = z[Z.driver] = steer
     z[Z.drive.F_d] = p[P.disturbance.force] * n[0]
     z[Z.drive.N_d] = p[P.disturbance.moment] * n[1]
     z[Z.clock.key_low], z[Z.clock.key_high] = from_word(key_low), from_word(key_high)
@@ -201,6 +198,6 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     vibration = draw_normals(key_low, key_high, 0, CHANNELS.errors)[0]
     z[Z.errors.vibration] = p[P.errors.vibration] * vibration
     draws, variant = NormalDraws(fast, wheels, vibration), make_step_variant(p, switches)
-    row_0 = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
-    write(row.rows[0], row_0, FAST)
+    first = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
+    write(row.rows[0], first, FAST)
     finish_reset(row)

@@ -38,8 +38,14 @@ from .tick import (
     compute_static_load,
     integrate_tick,
 )
-from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
-from .workspace import split_workspace
+from .window import (
+    TICK_COST,
+    WINDOW,
+    compute_tick_cost,
+    precompute_window,
+    read_draws,
+    split_workspace,
+)
 
 SHARES = (0, 1)
 """Places of an action's numbers: yaw moment, added steering."""

@@ -57,17 +57,13 @@ class Episode(NamedTuple):
             return self.config.vehicle
         is_changed, vehicle = self.state[Z.clock.tick] >= change.tick, self.config.vehicle
         return vehicle.replace(
-            mass=car.m,
-            yaw_inertia=car.I,
+            mass=car.m, yaw_inertia=car.I, roll_inertia=car.I_x, front_arm=car.l_f,
+            rear_arm=car.l_r, relaxation=car.relaxation,
             sprung_mass=vehicle.sprung_mass * (car.S / vehicle.roll_moment_arm),
-            roll_inertia=car.I_x,
-            front_arm=car.l_f,
-            rear_arm=car.l_r,
-            relaxation=car.relaxation,
             front_stiffness=car.C_f * (change.front if is_changed else 1.0),
             rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
             friction=0.5 * (car.mu + car.mu_r) * (change.friction if is_changed else 1.0),
-        )
+        )  # fmt: skip
 
     @property
     def car_truth(self) -> CarTruth:

@@ -238,9 +238,8 @@ def _lower_mirror(context, builder, sig, args):
 
 
 def _infer_prefetch(array, *index):
-    if _find_kind(array, len(index)) is not FLOATS8:
-        return None
-    return signature(types.none, array, *[types.intp] * len(index))
+    is_known = _find_kind(array, len(index)) is FLOATS8
+    return signature(types.none, array, *[types.intp] * len(index)) if is_known else None
 
 
 def _lower_prefetch(context, builder, sig, args):
@@ -254,9 +253,9 @@ def _lower_prefetch(context, builder, sig, args):
 
 
 def _infer_scratch(template, *shape):
-    if not all(isinstance(size, types.IntegerLiteral) for size in shape):
-        return None
-    return signature(types.Array(types.float64, template.ndim, "C"), template, *shape)
+    is_constant = all(isinstance(size, types.IntegerLiteral) for size in shape)
+    made = types.Array(types.float64, template.ndim, "C")
+    return signature(made, template, *shape) if is_constant else None
 
 
 def _lower_scratch(context, builder, sig, args):
@@ -265,11 +264,10 @@ def _lower_scratch(context, builder, sig, args):
     with builder.goto_entry_block():  # numba's own way fills it with zeros first
         pointer = builder.alloca(ir.ArrayType(ir.DoubleType(), math.prod(shape)))
     pointer.align = 64
-    made = make_array(sig.return_type)(context, builder)
-    strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    made, axes = make_array(sig.return_type)(context, builder), len(shape)
+    strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(axes)]
     size = [context.get_constant(types.intp, item) for item in (*shape, *strides, 8)]
     data = builder.bitcast(pointer, ir.DoubleType().as_pointer())
-    axes = len(shape)
     populate_array(made, data, size[:axes], size[axes:-1], size[-1], None)
     return made._getvalue()
 
