@@ -281,13 +281,9 @@ _CONFUSED_UNITS = {  # units in which a number may be by mistake, as fractions o
 
 
 def quantity(
-    unit: str,
-    low: float,
-    high: float,
-    text: str = "",
-    default: Any = dataclasses.MISSING,
+    unit: str, low: float, high: float, text: str = "", default: Any = dataclasses.MISSING,
     per: tuple[str, ...] = (),
-) -> Any:
+) -> Any:  # fmt: skip
     """Make a dataclass's field whose numbers have a plausible range.
 
     Args:

@@ -1,7 +1,7 @@
 """StabilityVectorEnv: many cars in one compiled call a step, each with a single car's bits."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar, overload
+from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -12,16 +12,13 @@ from .engine.batch import IntArray, NumbaEngine
 from .engine.batch_env import BatchEnv, Infos
 from .engine.config import EnvConfig
 from .engine.layout import Z
-from .engine.views import CarTruth, Episode, compute_true_states
-from .record import Array, Record
+from .engine.views import Episode, compute_true_states
+from .record import Array
 from .rendering.renderer import VectorRenderMixin
-from .scenarios.scenario import Scenario
-from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task import REFUSED, WILD, make_infos
 from .ticks import TICK
 from .validation import Mask, check_int, parse_actions, warn_once
-from .vehicle.parameters import Vehicle
 
 Observations = npt.NDArray[np.float32]
 T = TypeVar("T")
@@ -85,6 +82,16 @@ class _LazyRows(Sequence[T]):
 
     def __repr__(self) -> str:
         return f"<{len(self)} rows>"
+
+
+class _EachRow(Generic[T]):
+    """An attribute of a batch: a sequence of what `read` makes of each row's `Episode`."""
+
+    def __init__(self, read: Callable[[Episode], T]) -> None:
+        self._read = read
+
+    def __get__(self, env: "StabilityVectorEnv", kind: type | None = None) -> Sequence[T]:
+        return _LazyRows(env.num_envs, lambda i: self._read(env._get_episode(i)))
 
 
 class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
@@ -232,9 +239,6 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         numbers = params[row], states[row], switches[row], self._reports[row]
         return Episode(*numbers, self.configs[row], *record)
 
-    def _map_episodes(self, read: Callable[[Episode], T]) -> Sequence[T]:
-        return _LazyRows(self.num_envs, lambda i: read(self._get_episode(i)))
-
     @property
     def motion(self) -> Array:
         """True `Motion` of each row now, in SI units, shape (N, len(Motion))."""
@@ -245,37 +249,11 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         """`TrueState` of each row now, which no sensor has, shape (N, len(TrueState))."""
         return compute_true_states(*self.engine.arrays[:3])
 
-    @property
-    def record(self) -> Sequence[Record]:
-        """Each row's `StabilityEnv.record`."""
-        return self._map_episodes(lambda episode: episode.record)
-
-    @property
-    def scenario(self) -> Sequence[Scenario]:
-        """The scenario of each row's episode."""
-        return self._map_episodes(lambda episode: episode.config.scenario)
-
-    @property
-    def vehicle(self) -> Sequence[Vehicle]:
-        """The true vehicle of each row's episode, with what its seed drew."""
-        return self._map_episodes(lambda episode: episode.vehicle)
-
-    @property
-    def car_truth(self) -> Sequence[CarTruth]:
-        """What an oracle is told of each row's episode."""
-        return self._map_episodes(lambda episode: episode.car_truth)
-
-    @property
-    def nominal(self) -> Sequence[Vehicle]:
-        """The vehicle that estimators and controllers of each row are designed from."""
-        return self._map_episodes(lambda episode: episode.config.nominal)
-
-    @property
-    def held_speed(self) -> Sequence[float | None]:
-        """Each row's speed in m/s that is held exactly (small-angle plant), or None."""
-        return self._map_episodes(lambda episode: episode.config.held_speed)
-
-    @property
-    def slow_sensors(self) -> Sequence[dict[str, SlowSensor]]:
-        """Each row's slow sensors by name, with the clock phases that its episode drew."""
-        return self._map_episodes(lambda episode: episode.slow_sensors)
+    # what `StabilityEnv` has by these names, of each row's episode
+    record = _EachRow(lambda episode: episode.record)
+    scenario = _EachRow(lambda episode: episode.config.scenario)
+    vehicle = _EachRow(lambda episode: episode.vehicle)
+    car_truth = _EachRow(lambda episode: episode.car_truth)
+    nominal = _EachRow(lambda episode: episode.config.nominal)
+    held_speed = _EachRow(lambda episode: episode.config.held_speed)
+    slow_sensors = _EachRow(lambda episode: episode.slow_sensors)

@@ -69,15 +69,11 @@ class CudaVectorEnv(TensorVectorEnv):
     _has_over = True  # for all that the host knows
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        device: str | torch.device = "cuda",
+        self, num_envs: int = 1, device: str | torch.device = "cuda",
         dtype: str | torch.dtype = "float64",
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        *,
-        record: bool = False,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, *, record: bool = False,
         **arguments: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(num_envs, device, dtype, autoreset_mode, arguments, is_uniform=True)
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"

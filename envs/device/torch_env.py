@@ -60,16 +60,11 @@ class DeviceVectorEnv(TensorVectorEnv):
     """
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        device: str | torch.device = "cpu",
+        self, num_envs: int = 1, device: str | torch.device = "cpu",
         dtype: str | torch.dtype = "float64",
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        *,
-        compile: bool = False,
-        grad: bool = False,
-        **arguments: Any,
-    ) -> None:
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, *, compile: bool = False,
+        grad: bool = False, **arguments: Any,
+    ) -> None:  # fmt: skip
         super().__init__(num_envs, device, dtype, autoreset_mode, arguments, is_uniform=False)
         self.engine = NumbaEngine(self.config, num_envs)  # on the host, which resets
         compiler = os.environ.get("CXX", "g++")  # where torch looks for it

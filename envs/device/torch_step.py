@@ -184,10 +184,8 @@ class TorchStep:
         self, p: Tensor, keys: Tensor, first: Tensor, n: int
     ) -> tuple[Numbers, Any]:
         """Compute (nine normal numbers, profile's steering) of n ticks from `first` on, (n, N)."""
-        ticks, draw = (
-            first + torch.arange(n, device=first.device)[:, None],
-            self._functions.draw_normals,
-        )
+        draw = self._functions.draw_normals
+        ticks = first + torch.arange(n, device=first.device)[:, None]
         counter = keys[0], keys[1], ticks.to(torch.int64)
         inertial, wheels = draw(*counter, CHANNELS.inertial), draw(*counter, CHANNELS.wheels)
         vibration = torch.zeros_like(inertial[0])
@@ -247,13 +245,12 @@ class TorchStep:
             select_cars(alive, next_state.nominal_motion, tick_state.nominal_motion),
             select_cars(alive, next_state.errors, tick_state.errors),
             select_cars(alive, efforts, tick_state.past_efforts),
-            tick,
-            pick(alive, failure, tick_state.failure),
+            tick, pick(alive, failure, tick_state.failure),
             tick_state.cost + pick(alive & acts, tick_cost.cost * TICK, 0.0),
             select_cars(alive, info_values, tick_state.shown),
             select_cars(alive, measured.row, tick_state.row),
             select_cars(alive, next_state.motion, tick_state.track),
-        )
+        )  # fmt: skip
 
     def _finish_step(
         self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked

@@ -1,8 +1,6 @@
-"""The window of an env-step, and the workspace of one car, a vector that holds all its arrays.
+"""The window of an env-step: noise and steering of its ticks, computed ahead, and motion and cost.
 
-A window has noise and steering of the step's ticks, computed ahead, and their motion and cost. Its
-columns are the ticks; a block of vehicles has a third axis, their lanes. A workspace is one vector,
-since numba takes 0.04 us for every array passed.
+Its columns are the ticks of the step. A block of vehicles has a third axis, their lanes.
 """
 
 from typing import Annotated, NamedTuple
@@ -10,37 +8,26 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..numerics.functions import CHANNELS, draw_normals
-from ..numerics.jit import as_python, inline, jit
+from ..numerics.jit import inline, jit
 from ..numerics.packed import (
     count_lanes,
     iota,
     load_element,
     make_offsets,
-    make_view,
     read,
     store_element,
     write,
 )
 from ..numerics.primitives import Scalar, Vector, absolute, to_float, to_int, to_word
 from ..numerics.simd import LANES
-from ..record import FAST_WIDTH, PACKET_WIDTH, Array
+from ..record import Array
 from ..scenarios.road import TrackPath, compute_path_offset
 from ..scenarios.steering import WANDER_START, compute_steering, interpolate_trace
 from ..sensors.inertial import NormalDraws
-from ..task import RATE_TICKS, REPORT, compute_cost_rate
+from ..task import RATE_TICKS, compute_cost_rate
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
-from .config import EnvConfig
-from .layout import (
-    FLAGS,
-    PARAMS_WIDTH,
-    STATE_WIDTH,
-    EpisodeArrays,
-    P,
-    StepVariant,
-    TaskParams,
-    Z,
-)
+from .layout import PARAMS_WIDTH, EpisodeArrays, P, StepVariant, TaskParams, Z
 
 
 class CostInputs(NamedTuple):
@@ -80,8 +67,15 @@ _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
 @jit
-def _count_columns(n: int) -> int:
-    """Count the columns of the window of n ticks: whole lanes."""
+def count_columns(n: int) -> int:
+    """Count the columns of a window: whole lanes.
+
+    Args:
+        n: Ticks of a step.
+
+    Returns:
+        The number of columns.
+    """
     return -(-n // LANES) * LANES
 
 
@@ -95,7 +89,7 @@ def make_window(n: int, *lanes: int) -> Array:
     Returns:
         The window, shape (WINDOW_HEIGHT, columns, *lanes).
     """
-    return np.zeros((WINDOW_HEIGHT, _count_columns(n), *lanes))
+    return np.zeros((WINDOW_HEIGHT, count_columns(n), *lanes))
 
 
 @jit
@@ -228,97 +222,3 @@ def compute_tick_cost(
         (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
         absolute(lateral_deviation) > task.half_width,
     )
-
-
-class _WorkspaceSizes(NamedTuple):
-    """Sizes at the beginning of a workspace."""
-
-    n: Scalar  # ticks a step
-    n_entries: Scalar  # of an observation
-    max_packets: Scalar  # packets of a step
-
-
-SIZES, _HEADER = make_offsets(_WorkspaceSizes)
-
-
-def _make_workspace(config: EnvConfig, trace_width: int = 0) -> Array:
-    """Make a workspace, in which `trace_width` values of a trace follow the parameters."""
-    n, k, max_packets = int(config.control_period), len(config.layout), config.max_packets
-    width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
-    width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * _count_columns(n)
-    workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
-    workspace[:_HEADER] = n, k, max_packets
-    _split_workspace(workspace).bounds[:] = config.bounds
-    return workspace
-
-
-@jit
-def split_workspace(workspace: Vector) -> EpisodeArrays:
-    """Split a workspace into its parts.
-
-    Args:
-        workspace: Vector of `_make_workspace`.
-
-    Returns:
-        The episode's arrays.
-    """
-    sizes = read(workspace, SIZES)
-    n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
-    report = _HEADER + STATE_WIDTH
-    flags = report + len(REPORT)
-    bounds = flags + len(FLAGS)
-    window = bounds + 2 * k
-    rows = window + WINDOW_HEIGHT * _count_columns(n)
-    packets = rows + n * FAST_WIDTH
-    obs = packets + max_packets * PACKET_WIDTH
-    return EpisodeArrays(
-        workspace[obs - (-k // 2) :], workspace[_HEADER:report],
-        make_view(workspace, flags, np.int64, len(FLAGS)),
-        make_view(workspace, obs, np.float32, k),
-        make_view(workspace, rows, np.float64, n, FAST_WIDTH),
-        make_view(workspace, packets, np.float64, max_packets, PACKET_WIDTH),
-        workspace[report:flags], make_view(workspace, bounds, np.float64, 2, k),
-        make_view(workspace, window, np.float64, WINDOW_HEIGHT, _count_columns(n)),
-    )  # fmt: skip
-
-
-_split_workspace = as_python(split_workspace)
-
-
-class Workspace:
-    """The arrays of one car's episode, which are parts of one `vector`.
-
-    Args:
-        config: Config of the environment.
-
-    Attributes:
-        vector: The vector; a copy of it is a copy of the episode.
-        row: Its parts.
-        read_report: Function that lists the report's numbers.
-        copy_observation: Function that copies the observation.
-    """
-
-    def __init__(self, config: EnvConfig) -> None:
-        self._config = config
-        self._bind(_make_workspace(config))
-
-    def allocate(self, width: int) -> None:
-        """Make room for parameters with a trace, and lose all numbers, if the room is another.
-
-        Args:
-            width: Number of the parameters.
-        """
-        if len(self.row.p) != width:
-            self._bind(_make_workspace(self._config, width - PARAMS_WIDTH))
-
-    def _bind(self, vector: Array) -> None:
-        """Bind the vector's parts, and the calls that read them in every step."""
-        self.vector, self.row = vector, _split_workspace(vector)
-        self.read_report, self.copy_observation = self.row.report.tolist, self.row.obs.copy
-
-    def __getstate__(self) -> tuple[EnvConfig, Array]:
-        return self._config, self.vector
-
-    def __setstate__(self, state: tuple[EnvConfig, Array]) -> None:
-        self._config, vector = state
-        self._bind(vector)

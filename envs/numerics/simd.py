@@ -90,11 +90,9 @@ def _find_common_type(*args: types.Type) -> types.Type | None:
 
 
 def register_primitive(
-    primitive: Callable[..., object],
-    infer: Callable[..., Signature | None],
-    lower: Callable[..., ir.Value],
-    prefer_literal: bool = False,
-) -> None:
+    primitive: Callable[..., object], infer: Callable[..., Signature | None],
+    lower: Callable[..., ir.Value], prefer_literal: bool = False,
+) -> None:  # fmt: skip
     """Teach the compiler a primitive.
 
     Args:
@@ -268,9 +266,7 @@ register_primitive(primitives.maximum, _infer_binary, _make_selection(">"))
 register_primitive(primitives.absolute, _infer_float, _make_intrinsic("fabs"))
 register_primitive(primitives.floor, _infer_float, _make_intrinsic("floor"))
 register_primitive(primitives.sqrt, _infer_float, _make_intrinsic("sqrt"))
-register_primitive(
-    primitives.select, _infer_select, lambda _, builder, __, args: builder.select(*args)
-)
+register_primitive(primitives.select, _infer_select, lambda _, b, __, args: b.select(*args))
 register_primitive(primitives.frexp, _infer_frexp, _lower_frexp)
 for _primitive in (primitives.to_float, primitives.from_word):
     _register_conversion(_primitive, FLOATS)
