@@ -48,8 +48,7 @@ FAST_UNITS = (
     "rad/s", "m/s2", "m/s2", "rad/s", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2",
     "1/m",
 )  # fmt: skip
-FAST_WIDTH = len(FAST)
-PACKET_WIDTH = PACKET.value + VALUES
+FAST_WIDTH, PACKET_WIDTH = len(FAST), PACKET.value + VALUES
 
 
 @dataclass

@@ -84,8 +84,7 @@ def compute_reference(
     beta = (1.0 - target.b_1 * v * v) * target.b_0 * gain  # dakf-stability (23)
     gamma = v * target.per_l * gain  # dakf-stability (23)
     if reference_kind in (LIMITED, LAGGED):
-        max_beta = 0.02 * target.mu_g
-        max_gamma = 0.85 * target.mu_g / maximum(v, 1.0)
+        max_beta, max_gamma = 0.02 * target.mu_g, 0.85 * target.mu_g / maximum(v, 1.0)
         beta = minimum(maximum(beta, 0.0 - max_beta), max_beta)
         gamma = minimum(maximum(gamma, 0.0 - max_gamma), max_gamma)
     return beta, gamma

@@ -119,12 +119,11 @@ class _DriverKernel:
         """Step `count` rows, or reset those that are asked for; arrays as in `DeviceArrays`."""
         values = (count, resets, *(array.data_ptr() for array in arrays))
         kinds = (ctypes.c_int64, ctypes.c_bool, *[ctypes.c_void_p] * len(arrays))
-        grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
+        shape = -(-count // BLOCK), 1, 1, BLOCK, 1, 1  # of the grid and of a block
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream(self._device).cuda_stream
-            launched = self._driver.cuLaunchKernel(
-                self._function, *grid, *block, 0, stream, (values, kinds), 0
-            )
+            parameters = self._function, *shape, 0, stream, (values, kinds), 0
+            launched = self._driver.cuLaunchKernel(*parameters)
         self._check_result(launched, f"a step of {count} rows on {self._device}")
 
     def _check_result(self, result: Any, label: str) -> Any:

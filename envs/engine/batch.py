@@ -238,8 +238,7 @@ def _reset_rows(
             starts.params[t], starts.low[t], starts.high[t], starts.switches[t], starts.motion[t]
         )
         reset_vehicle(start, key_low, key_high, row)
-        batch.ticks_done[i] = 1
-        batch.delivered[i] = int(batch.reports[i, REPORT.packets])
+        batch.ticks_done[i], batch.delivered[i] = 1, int(batch.reports[i, REPORT.packets])
 
 
 def _pad_params(params: Array, width: int) -> Array:

@@ -242,5 +242,4 @@ def _split_options(options: Mapping[str, object], count: int) -> list[dict[str, 
         elif len(value) != count:
             raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
         columns[name] = value
-    rows = range(count)
-    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in range(count)]

@@ -32,8 +32,7 @@ def _push_packet(
     packet[PACKET.quality], packet[PACKET.sequence] = quality, frame
     for i in range(VALUES):
         packet[PACKET.value + i] = values[i]
-    z[Z.under_way] = slot + 1.0
-    z[Z.clock.next_due] = minimum(z[Z.clock.next_due], due)
+    z[Z.under_way], z[Z.clock.next_due] = slot + 1.0, minimum(z[Z.clock.next_due], due)
 
 
 @jit
@@ -49,8 +48,7 @@ def _send_frame(
         _push_packet(z, sensor, stamp, maximum(first, stamp), quality, frame, values)
     if second != NEVER:
         _push_packet(z, sensor, stamp, maximum(second, stamp), quality, frame, values)
-    z[column.frames] = frame + 1.0
-    z[column.next_capture] = tick + link.period
+    z[column.frames], z[column.next_capture] = frame + 1.0, tick + link.period
 
 
 @jit
@@ -307,8 +305,7 @@ def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
     _observe_slow(row, k, count)
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma], report[REPORT.psi] = z[Z.motion.gamma], z[Z.motion.psi]
-    report[REPORT.failure] = z[Z.clock.failure]
-    report[REPORT.reward] = -report[REPORT.cost]
+    report[REPORT.failure], report[REPORT.reward] = z[Z.clock.failure], -report[REPORT.cost]
     report[REPORT.packets] = count
 
 
