@@ -15,7 +15,8 @@ from .camera_simulator import CameraSimulator
 from .engine.config import EnvConfig
 from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
-from .engine.views import CarTruth, Episode, Workspace, compute_true_states, step_workspace
+from .engine.step import step_workspace
+from .engine.views import CarTruth, Episode, Workspace, compute_true_states
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record

@@ -286,19 +286,6 @@ def _observe_step(row: EpisodeArrays, n: int, done: int) -> int:
 
 
 @jit
-def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int) -> None:
-    """Write observation and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        n: Ticks of a control period.
-        done: Ticks integrated in the step.
-        count: Number of packets.
-    """
-    _finish_report(row, _observe_step(row, n, done), count)
-
-
-@jit
 def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
     """Write the report, and the observation of the slow sensors from entry k on."""
     report, z = row.report, row.z

@@ -38,6 +38,7 @@ from .tick import (
     compute_static_load,
     integrate_tick,
 )
+from .views import split_workspace
 from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
 
 SHARES = (0, 1)
@@ -306,3 +307,19 @@ def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
     done = integrate_step(row, variant, shares, n, True)
     finish_step(row, n, done)
     return int(done)
+
+
+@jit
+def step_workspace(workspace: Vector, action: Vector) -> int:
+    """Step the vehicle of a workspace.
+
+    Args:
+        workspace: Arrays of an episode in one vector, as in a `Workspace`.
+        action: Fractions of full scale, shape (1,) or (2,).
+
+    Returns:
+        As `step_vehicle`, with WILD added for an action beyond its limit.
+    """
+    row = split_workspace(workspace)
+    done = int(step_vehicle(row, action, len(row.rows)))
+    return done + check_action_range(action) if done > 0 else done

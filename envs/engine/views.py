@@ -24,7 +24,6 @@ from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import MAGIC_FORMULA, fit_fiala
 from .config import EnvConfig, EpisodeConfig
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, P, Z
-from .step import check_action_range, step_vehicle
 from .window import WINDOW_HEIGHT, count_columns
 
 
@@ -167,13 +166,20 @@ def _make_workspace(config: EnvConfig, trace_width: int = 0) -> Array:
     width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * count_columns(n)
     workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
     workspace[:_HEADER] = n, k, max_packets
-    _split(workspace).bounds[:] = config.bounds
+    _split_workspace(workspace).bounds[:] = config.bounds
     return workspace
 
 
 @jit
-def _split_workspace(workspace: Vector) -> EpisodeArrays:
-    """Split a workspace of `_make_workspace` into its parts."""
+def split_workspace(workspace: Vector) -> EpisodeArrays:
+    """Split a workspace into its parts.
+
+    Args:
+        workspace: Vector of a `Workspace`.
+
+    Returns:
+        The episode's arrays.
+    """
     sizes = read(workspace, _SIZES)
     n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
     report = _HEADER + STATE_WIDTH
@@ -194,7 +200,7 @@ def _split_workspace(workspace: Vector) -> EpisodeArrays:
     )  # fmt: skip
 
 
-_split = as_python(_split_workspace)
+_split_workspace = as_python(split_workspace)
 
 
 class Workspace:
@@ -225,7 +231,7 @@ class Workspace:
 
     def _bind(self, vector: Array) -> None:
         """Bind the vector's parts, and the calls that read them in every step."""
-        self.vector, self.row = vector, _split(vector)
+        self.vector, self.row = vector, _split_workspace(vector)
         self.read_report, self.copy_observation = self.row.report.tolist, self.row.obs.copy
 
     def __getstate__(self) -> tuple[EnvConfig, Array]:
@@ -234,19 +240,3 @@ class Workspace:
     def __setstate__(self, state: tuple[EnvConfig, Array]) -> None:
         self._config, vector = state
         self._bind(vector)
-
-
-@jit
-def step_workspace(workspace: Vector, action: Vector) -> int:
-    """Step the vehicle of a workspace.
-
-    Args:
-        workspace: Arrays of an episode in one vector, as in a `Workspace`.
-        action: Fractions of full scale, shape (1,) or (2,).
-
-    Returns:
-        As `step_vehicle`, with WILD added for an action beyond its limit.
-    """
-    row = _split_workspace(workspace)
-    done = int(step_vehicle(row, action, len(row.rows)))
-    return done + check_action_range(action) if done > 0 else done

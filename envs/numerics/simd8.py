@@ -205,8 +205,9 @@ def _lower_store8(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _infer_mirror(array, *index):
-    return _find_kind(array, 2) and signature(types.none, array, *[types.intp] * len(index))
+def _infer_in_place(array, *index):
+    kind = _find_kind(array, len(index))
+    return kind and signature(types.none, array, *[types.intp] * len(index))
 
 
 def _lower_mirror(context, builder, sig, args):
@@ -235,11 +236,6 @@ def _lower_mirror(context, builder, sig, args):
         lower = shuffle(transposed[k], above[k], [m if m < k else m + 8 for m in range(8)])
         builder.store(builder.select(diagonal, lower, transposed[k]), locate_row(j, k, i), align=8)
     return context.get_dummy_value()
-
-
-def _infer_prefetch(array, *index):
-    is_known = _find_kind(array, len(index)) is FLOATS8
-    return signature(types.none, array, *[types.intp] * len(index)) if is_known else None
 
 
 def _lower_prefetch(context, builder, sig, args):
@@ -277,6 +273,6 @@ register_primitive(load8, _infer_load8, _lower_load8)
 register_primitive(load8_symmetric, _infer_load8, _lower_load8_symmetric)
 register_primitive(count_upper_rows, _infer_count_upper_rows, _lower_count_upper_rows)
 register_primitive(store8, _infer_store8, _lower_store8)
-register_primitive(mirror, _infer_mirror, _lower_mirror)
-register_primitive(prefetch, _infer_prefetch, _lower_prefetch)
+register_primitive(mirror, _infer_in_place, _lower_mirror)
+register_primitive(prefetch, _infer_in_place, _lower_prefetch)
 register_primitive(allocate_scratch, _infer_scratch, _lower_scratch, prefer_literal=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import FAILURES, StabilityEnv
-from sideslip.envs.engine import views as kernel
+from sideslip.envs.engine import step as kernel
 
 from .helpers import BAD_ACTIONS, LINEAR, bits, play
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.engine.views import _make_workspace, _split_workspace
+from sideslip.envs.engine.views import _make_workspace, split_workspace
 from sideslip.envs.numerics.jit import as_python
 
 from ..helpers import bits
@@ -24,7 +24,7 @@ SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
 def test_every_part_has_a_place_of_its_own(n: int, entries: int) -> None:
     shape: Any = {"layout": (None,) * entries, "max_packets": 3, "bounds": np.zeros((2, entries))}
     work = _make_workspace(SimpleNamespace(control_period=n, **shape), trace_width=2)  # type: ignore[arg-type]
-    parts = as_python(_split_workspace)(work)
+    parts = as_python(split_workspace)(work)
     for k, part in enumerate(parts):
         part[...] = k + 1
     assert all((part == k + 1).all() for k, part in enumerate(parts))

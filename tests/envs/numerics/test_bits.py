@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR, stability
 from sideslip.envs.engine import reset as restart
-from sideslip.envs.engine import views as kernel
+from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.numerics import functions
 from sideslip.envs.numerics import functions as noise
