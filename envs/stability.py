@@ -329,8 +329,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     @property
     def true_state(self) -> Array:
         """The `TrueState` now, shape (len(TrueState),); no sensor measures these."""
-        row = self._row
-        return np.asarray(compute_true_states(row.p[None], row.z[None], row.switches[None])[0])
+        return np.asarray(compute_true_states(*(x[None] for x in self._row[:3]))[0])
 
     @property
     def nominal(self) -> Vehicle:

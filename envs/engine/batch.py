@@ -75,18 +75,6 @@ class _LaneBuffers(NamedTuple):
     window: Array  # of a row that is stepped by itself
 
 
-def _make_lane_buffers(count: int, n: int, bounds: Array) -> _LaneBuffers:
-    """Make the working arrays of a batch step of n ticks; `order` is 0 .. count - 1."""
-    block = EpisodeArrays(
-        np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
-        np.zeros(len(FLAGS), np.int64), np.zeros((bounds.shape[1], LANES)),
-        np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
-        np.zeros((_REPORT, LANES)), bounds, make_window(n, LANES),
-    )  # fmt: skip
-    members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
-    return _LaneBuffers(np.arange(count), members, block, shares, make_window(n))
-
-
 @jit
 def _get_episode_arrays(
     batch: BatchArrays, i: int, bounds: Matrix, window: Matrix
@@ -271,7 +259,14 @@ class NumbaEngine:
             delivered=np.zeros(N, np.int64), over=np.zeros(N, np.bool_),
         )  # fmt: skip
         self.final = RecordArrays(*(array.copy() for array in self.arrays.record))
-        self.lane_buffers = _make_lane_buffers(N, n, config.bounds)
+        block = EpisodeArrays(
+            np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
+            np.zeros(len(FLAGS), np.int64), np.zeros((k, LANES)),
+            np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
+            np.zeros((_REPORT, LANES)), config.bounds, make_window(n, LANES),
+        )  # fmt: skip
+        members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
+        self.lane_buffers = _LaneBuffers(np.arange(N), members, block, shares, make_window(n))
 
     def reset(
         self, chosen: IntArray, starts: Sequence[EpisodeStart], index: IntArray,
