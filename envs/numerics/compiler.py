@@ -202,10 +202,11 @@ class _Kernel(CPUDispatcher):
     """A compiled function: a dispatcher of numba whose callees are parts."""
 
     def __init__(
-        self, py_func: _Function, targetoptions: dict[str, object], folder: Path | None = None,
+        self, py_func: _Function, locals: _Keywords | None = None,  # where numba unpickles
+        targetoptions: dict[str, object] | None = None, folder: Path | None = None,
         apart: bool = False,
     ) -> None:  # fmt: skip
-        super().__init__(py_func, None, targetoptions)
+        super().__init__(py_func, locals, targetoptions)
         self.folder, self.apart = folder, apart
         self.parts: dict[_Types, CompileResult] = {}
         pipeline = _ExternalPipeline if apart else _UnlinkedPipeline
@@ -304,7 +305,7 @@ def make_kernel(
     """
     all_options: dict[str, object] = {"nopython": True, "boundscheck": None}
     all_options |= {"error_model": "numpy", "fastmath": False, "forceinline": False} | options
-    return _Kernel(function, all_options, folder, apart)
+    return _Kernel(function, None, all_options, folder, apart)
 
 
 def _link_library(part: CompileResult) -> _Linked:
