@@ -15,22 +15,7 @@ from .vector import StabilityVectorEnv
 from .vehicle.parameters import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, make_vehicle
 
 __all__ = [
-    "COMS",
-    "FAILURES",
-    "PASSENGER_CAR",
-    "SCENARIOS",
-    "VEHICLES",
-    "Log",
-    "ObservationEntry",
-    "Record",
-    "Scenario",
-    "SlowSensor",
-    "StabilityEnv",
-    "StabilityVectorEnv",
-    "Vehicle",
-    "World",
-    "critical_speed",
-    "make_scenario",
-    "make_vehicle",
-    "make_world",
-]
+    "COMS", "FAILURES", "PASSENGER_CAR", "SCENARIOS", "VEHICLES", "Log", "ObservationEntry",
+    "Record", "Scenario", "SlowSensor", "StabilityEnv", "StabilityVectorEnv", "Vehicle", "World",
+    "critical_speed", "make_scenario", "make_vehicle", "make_world",
+]  # fmt: skip

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .engine.layout import EpisodeArrays, P, Z
-from .engine.outputs import finish_outputs, sample_slow_ticks
+from .engine.layout import FLAGS, EpisodeArrays, P, Z
+from .engine.outputs import observe, sample_slow_ticks
 from .engine.window import WINDOW
 from .numerics import require_extra
 from .numerics.functions import PI, draw_uniforms
@@ -27,6 +27,7 @@ from .sensors.camera.analytic import (
     load_detector,
 )
 from .sensors.slow import BLOCKS, CAMERA
+from .task import REPORT
 from .validation import check_mapping, describe_unknown
 from .vehicle.dynamics import Motion
 
@@ -76,7 +77,7 @@ class CameraSimulator:
             row: Arrays of the episode.
             done: Number of ticks that the step took.
         """
-        z = row.z
+        z, report, n = row.z, row.report, len(row.rows)
         z[_SLOW_STATE] = before[_SLOW_STATE]
         z[Z.under_way], z[Z.clock.next_due] = before[Z.under_way], before[Z.clock.next_due]
         first, j, count = int(z[Z.clock.tick]) - done, 0, 0
@@ -87,7 +88,9 @@ class CameraSimulator:
             if frame <= done:
                 self.capture(row.p, z, read(row.window, WINDOW.track, stop - 1), first + stop)
             j = stop
-        finish_outputs(row, len(row.rows), done, count)
+        report[REPORT.packets] = count
+        n_rows = n if row.switches[FLAGS.all_samples] else done
+        observe(row, n_rows, count, (report[REPORT.beta_ref], report[REPORT.gamma_ref]))
 
     def capture(self, p: Array, z: Array, motion: Motion, tick: int) -> None:
         """Take a picture for the packets that were captured at a tick, if there are any.

@@ -182,11 +182,8 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, object])
     kind = Path(path).suffix.lower()
     if kind not in _SUFFIXES:
         raise ValueError(f"{path}: expected a file that ends in {' or '.join(_SUFFIXES)}")
-    if kind == ".json":
-        text = json.dumps(values, indent=1)
-    else:
-        lines = [f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()]
-        text = "\n".join(lines)
+    lines = [f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()]
+    text = "\n".join(lines) if kind == ".toml" else json.dumps(values, indent=1)
     write_atomic(os.fspath(path), (text + "\n").encode())
 
 

@@ -48,8 +48,7 @@ FAST_UNITS = (
     "rad/s", "m/s2", "m/s2", "rad/s", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2",
     "1/m",
 )  # fmt: skip
-FAST_WIDTH = len(FAST)
-PACKET_WIDTH = PACKET.value + VALUES
+FAST_WIDTH, PACKET_WIDTH = len(FAST), PACKET.value + VALUES
 
 
 @dataclass
@@ -104,15 +103,11 @@ def concatenate(records: list[Record]) -> Record:
     for before, after in itertools.pairwise(records):
         end = before.first + len(before.fast)
         if after.first != end:
-            raise ValueError(
-                f"a record that ends at tick {end - 1} "
-                f"is followed by one that starts at tick {after.first}"
-            )
-    return dataclasses.replace(
-        records[0],
-        fast=np.concatenate([record.fast for record in records]),
-        packets=np.concatenate([record.packets for record in records]),
-    )
+            text = f"is followed by one that starts at tick {after.first}"
+            raise ValueError(f"a record that ends at tick {end - 1} {text}")
+    fast = np.concatenate([record.fast for record in records])
+    packets = np.concatenate([record.packets for record in records])
+    return dataclasses.replace(records[0], fast=fast, packets=packets)
 
 
 @dataclass

@@ -16,8 +16,7 @@ from .engine.config import EnvConfig
 from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
-from .engine.views import CarTruth, Episode, compute_true_states
-from .engine.workspace import Workspace
+from .engine.views import CarTruth, Episode, Workspace, compute_true_states
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record
@@ -125,6 +124,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         slow: By sensor ("camera", "gps"), fields of `SlowSensor` that replace the id's.
     """
 
+    dt = TICK  # s, the base tick
     _spec: EnvSpec | None = None
 
     def __init__(
@@ -224,8 +224,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
-        camera = self.camera
-        row = self._workspace.row
+        camera, row = self.camera, self._workspace.row
         before = row.z if camera is None else row.z.copy()
         done = self._advance(command)
         if done <= 0:
@@ -259,8 +258,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def _start_episode(self) -> None:
         """Begin an episode whose tick 0 is packed, with its picture."""
         if self.camera is not None:
-            row = self._row
-            self.camera.capture(row.p, row.z, self.motion, 0)
+            self.camera.capture(self._row.p, self._row.z, self.motion, 0)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -305,11 +303,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         return self._get_episode().record
 
     @property
-    def dt(self) -> float:
-        """The base tick in seconds."""
-        return TICK
-
-    @property
     def scenario(self) -> Scenario:
         """The scenario of this episode."""
         return self._episode.scenario
@@ -337,8 +330,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     @property
     def true_state(self) -> Array:
         """The `TrueState` now, shape (len(TrueState),); no sensor measures these."""
-        row = self._row
-        return np.asarray(compute_true_states(row.p[None], row.z[None], row.switches[None])[0])
+        return np.asarray(compute_true_states(*(x[None] for x in self._row[:3]))[0])
 
     @property
     def nominal(self) -> Vehicle:
@@ -364,12 +356,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def get_state(self) -> dict[str, Any]:
         """Copy the state of env and generator, from which `set_state` continues bit for bit."""
         arrays = {name: getattr(self._row, part).copy() for name, part in _SNAPSHOT.items()}
+        progress, rng = (self.ticks_done, self._over), copy.deepcopy(self.np_random)
         return arrays | {
-            "config": self._episode,
-            "layout": self.layout,
-            "progress": (self.ticks_done, self._over),
-            "rng": copy.deepcopy(self.np_random),
-        }
+            "config": self._episode, "layout": self.layout, "progress": progress, "rng": rng
+        }  # fmt: skip
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env, or of one like it: until the next reset car, scenario and

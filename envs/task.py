@@ -52,14 +52,9 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
     l_f, l_r = nominal.front_arm, nominal.rear_arm
     G = M / (2.0 * l * l) * (C_r * l_r - C_f * l_f) / (C_f * C_r)  # dakf-stability (24)
     return ReferenceParams(
-        l_r / l,
-        M * l_f / (2.0 * l * C_r * l_r),
-        G,
-        1.0 / l,
-        nominal.friction * GRAVITY,
-        max(G, _CHARACTERISTIC_SPEED**-2),
-        math.exp(-TICK / REFERENCE_LAG),
-    )
+        l_r / l, M * l_f / (2.0 * l * C_r * l_r), G, 1.0 / l, nominal.friction * GRAVITY,
+        max(G, _CHARACTERISTIC_SPEED**-2), math.exp(-TICK / REFERENCE_LAG),
+    )  # fmt: skip
 
 
 @jit
@@ -89,8 +84,7 @@ def compute_reference(
     beta = (1.0 - target.b_1 * v * v) * target.b_0 * gain  # dakf-stability (23)
     gamma = v * target.per_l * gain  # dakf-stability (23)
     if reference_kind in (LIMITED, LAGGED):
-        max_beta = 0.02 * target.mu_g
-        max_gamma = 0.85 * target.mu_g / maximum(v, 1.0)
+        max_beta, max_gamma = 0.02 * target.mu_g, 0.85 * target.mu_g / maximum(v, 1.0)
         beta = minimum(maximum(beta, 0.0 - max_beta), max_beta)
         gamma = minimum(maximum(gamma, 0.0 - max_gamma), max_gamma)
     return beta, gamma
@@ -112,9 +106,8 @@ def filter_reference(
         beta_ref (rad) and gamma_ref (rad/s).
     """
     if reference_kind == LAGGED:
-        return apply_lag(steady[0], before[0], target.rest), apply_lag(
-            steady[1], before[1], target.rest
-        )
+        rest = target.rest
+        return apply_lag(steady[0], before[0], rest), apply_lag(steady[1], before[1], rest)
     return steady
 
 
@@ -257,9 +250,7 @@ def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
     values = (*columns[: len(_NUMBERS)], failure, success)
     masks = np.empty((len(values), len(rows)), np.bool_)
     masks[:] = rows
-    infos: dict[str, Any] = dict(zip(_KEYS, values, strict=True))
-    infos.update(zip(_MASKS, masks, strict=True))
-    return infos
+    return dict(zip((*_KEYS, *_MASKS), (*values, *masks), strict=True))
 
 
 class ObservationEntry(NamedTuple):
@@ -325,11 +316,11 @@ def make_observation_layout(
         entries.append(ObservationEntry(name, FAST_UNITS[column], -bound, bound))
     for kind in SLOW:
         if kind.name in slow:
-            for value in kind.values:
-                name = f"{kind.name}_{value.name}"
-                entries.append(ObservationEntry(name, value.unit, -value.bound, value.bound))
-            entries.append(ObservationEntry(f"{kind.name}_age", "s", 0.0, AGE_CAP))
-            entries.append(ObservationEntry(f"{kind.name}_fresh", "-", 0.0, 1.0))
-    entries.append(ObservationEntry("beta_ref", "rad", -1.0, 1.0))
-    entries.append(ObservationEntry("gamma_ref", "rad/s", -10.0, 10.0))
-    return tuple(entries)
+            values = [(f"{kind.name}_{x.name}", x.unit, -x.bound, x.bound) for x in kind.values]
+            values += [
+                (f"{kind.name}_age", "s", 0.0, AGE_CAP),
+                (f"{kind.name}_fresh", "-", 0.0, 1.0),
+            ]
+            entries += map(ObservationEntry._make, values)
+    refs = ("beta_ref", "rad", -1.0, 1.0), ("gamma_ref", "rad/s", -10.0, 10.0)
+    return (*entries, *map(ObservationEntry._make, refs))

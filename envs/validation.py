@@ -248,14 +248,13 @@ def warn_once(env: object, actions: Actions) -> None:
         env: Environment that remembers the warning.
         actions: Actions, of any shape, one of them far outside.
     """
-    attributes = vars(env)
-    if not attributes.get("_warned"):
+    if not vars(env).get("_warned"):
         largest = np.abs(actions[np.isfinite(actions)]).max()
         logger.warn(
             f"an action of {largest:g} is clipped to 1: actions are shares of full scale, "
             "from -1 to 1, not N m or rad; the env says so once"
         )
-    attributes["_warned"] = True
+    vars(env)["_warned"] = True
 
 
 def _convert_action(action: object, width: int) -> Actions:
@@ -282,13 +281,9 @@ _CONFUSED_UNITS = {  # units in which a number may be by mistake, as fractions o
 
 
 def quantity(
-    unit: str,
-    low: float,
-    high: float,
-    text: str = "",
-    default: Any = dataclasses.MISSING,
+    unit: str, low: float, high: float, text: str = "", default: Any = dataclasses.MISSING,
     per: tuple[str, ...] = (),
-) -> Any:
+) -> Any:  # fmt: skip
     """Make a dataclass's field whose numbers have a plausible range.
 
     Args:

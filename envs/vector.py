@@ -1,7 +1,7 @@
 """StabilityVectorEnv: many cars in one compiled call a step, each with a single car's bits."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar, overload
+from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -12,21 +12,16 @@ from .engine.batch import IntArray, NumbaEngine
 from .engine.batch_env import BatchEnv, Infos
 from .engine.config import EnvConfig
 from .engine.layout import Z
-from .engine.views import CarTruth, Episode, compute_true_states
-from .record import Array, Record
+from .engine.views import Episode, compute_true_states
+from .record import Array
 from .rendering.renderer import VectorRenderMixin
-from .scenarios.scenario import Scenario
-from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task import REFUSED, WILD, make_infos
 from .ticks import TICK
 from .validation import Mask, check_int, parse_actions, warn_once
-from .vehicle.parameters import Vehicle
 
 Observations = npt.NDArray[np.float32]
 T = TypeVar("T")
-
-_INFO_MODES = ("all", "ends")
 
 
 def make_rows(
@@ -61,8 +56,8 @@ def make_rows(
         key = tuple(map(id, values))
         if key not in envs:
             named = zip(columns, values, strict=True)
-            own_arguments = {name: value for name, value in named if value is not None}
-            envs[key] = StabilityEnv(**{**arguments, **own_arguments})
+            row_arguments = {name: value for name, value in named if value is not None}
+            envs[key] = StabilityEnv(**{**arguments, **row_arguments})
         rows.append(envs[key].config)
     return next(iter(envs.values())), rows * N if is_uniform else rows
 
@@ -87,6 +82,16 @@ class _LazyRows(Sequence[T]):
 
     def __repr__(self) -> str:
         return f"<{len(self)} rows>"
+
+
+class _EachRow(Generic[T]):
+    """An attribute of a batch: a sequence of what `read` makes of each row's `Episode`."""
+
+    def __init__(self, read: Callable[[Episode], T]) -> None:
+        self._read = read
+
+    def __get__(self, env: "StabilityVectorEnv", kind: type | None = None) -> Sequence[T]:
+        return _LazyRows(env.num_envs, lambda i: self._read(env._get_episode(i)))
 
 
 class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
@@ -130,6 +135,9 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         ValueError: For an argument out of place; TypeError for one of another type.
     """
 
+    dt = TICK  # s, the base tick
+    _spec: EnvSpec | None = None
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -139,10 +147,9 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
-        if info not in _INFO_MODES:
+        if info not in ("all", "ends"):
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
-        self._all_infos = info == "all"
-        self._max_steps = max_episode_steps
+        self._all_infos, self._max_steps = info == "all", max_episode_steps
         if max_episode_steps is not None:
             self._max_steps = check_int("max_episode_steps", max_episode_steps, "steps")
         _, rows = make_rows(num_envs, arguments)
@@ -171,8 +178,6 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
             spec.kwargs["autoreset_mode"] = self._mode.value  # as JSON writes it
         self._spec = spec
 
-    _spec: EnvSpec | None = None
-
     def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         self._restart_rows(chosen, *self._make_configs(options, chosen), seeds)
         self._has_over = bool(self._over.any())
@@ -183,16 +188,14 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         return self._obs.copy(), make_infos(self._reports, mask) if self._all_infos else {}
 
     def _list_over_rows(self) -> list[int]:
-        rows: list[int] = np.flatnonzero(self._over).tolist()
-        return rows
+        return np.flatnonzero(self._over).tolist()
 
     def _step_rows(self, actions: Any) -> tuple[Observations, Array, Mask, Mask, Infos]:
         N, config, over = self.num_envs, self.config, self._over
         commands = parse_actions(actions, N, config.action_width, config.on_bad_action == "fail")
         over_rows = np.flatnonzero(over) if self._has_over else None
-        results = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
-        rewards, terminated, truncated = results
-        n_ended = self.engine.step(commands, results)
+        rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
+        n_ended = self.engine.step(commands, (rewards, terminated, truncated))
         if n_ended == REFUSED:
             bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~over)
             self._refuse_actions(bad.tolist(), commands)
@@ -226,9 +229,8 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         for i in rows:
             final_obs[i] = self._obs[i].copy()
         infos: Infos = {"final_info": make_infos(self._reports, over), "final_obs": final_obs}
-        infos |= {f"_{key}": over.copy() for key in infos}
         self._start_rows(rows, {}, {})
-        return infos
+        return infos | {f"_{key}": over.copy() for key in infos}
 
     def _get_episode(self, row: int) -> Episode:
         params, states, switches, *_ = self.engine.arrays
@@ -236,14 +238,6 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         record = rows[: self.ticks_done[row]], packets[: self.delivered[row]]
         numbers = params[row], states[row], switches[row], self._reports[row]
         return Episode(*numbers, self.configs[row], *record)
-
-    def _map_episodes(self, read: Callable[[Episode], T]) -> Sequence[T]:
-        return _LazyRows(self.num_envs, lambda i: read(self._get_episode(i)))
-
-    @property
-    def dt(self) -> float:
-        """The base tick in seconds."""
-        return TICK
 
     @property
     def motion(self) -> Array:
@@ -255,37 +249,11 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         """`TrueState` of each row now, which no sensor has, shape (N, len(TrueState))."""
         return compute_true_states(*self.engine.arrays[:3])
 
-    @property
-    def record(self) -> Sequence[Record]:
-        """Each row's `StabilityEnv.record`."""
-        return self._map_episodes(lambda episode: episode.record)
-
-    @property
-    def scenario(self) -> Sequence[Scenario]:
-        """The scenario of each row's episode."""
-        return self._map_episodes(lambda episode: episode.config.scenario)
-
-    @property
-    def vehicle(self) -> Sequence[Vehicle]:
-        """The true vehicle of each row's episode, with what its seed drew."""
-        return self._map_episodes(lambda episode: episode.vehicle)
-
-    @property
-    def car_truth(self) -> Sequence[CarTruth]:
-        """What an oracle is told of each row's episode."""
-        return self._map_episodes(lambda episode: episode.car_truth)
-
-    @property
-    def nominal(self) -> Sequence[Vehicle]:
-        """The vehicle that estimators and controllers of each row are designed from."""
-        return self._map_episodes(lambda episode: episode.config.nominal)
-
-    @property
-    def held_speed(self) -> Sequence[float | None]:
-        """Each row's speed in m/s that is held exactly (small-angle plant), or None."""
-        return self._map_episodes(lambda episode: episode.config.held_speed)
-
-    @property
-    def slow_sensors(self) -> Sequence[dict[str, SlowSensor]]:
-        """Each row's slow sensors by name, with the clock phases that its episode drew."""
-        return self._map_episodes(lambda episode: episode.slow_sensors)
+    # what `StabilityEnv` has by these names, of each row's episode
+    record = _EachRow(lambda episode: episode.record)
+    scenario = _EachRow(lambda episode: episode.config.scenario)
+    vehicle = _EachRow(lambda episode: episode.vehicle)
+    car_truth = _EachRow(lambda episode: episode.car_truth)
+    nominal = _EachRow(lambda episode: episode.config.nominal)
+    held_speed = _EachRow(lambda episode: episode.config.held_speed)
+    slow_sensors = _EachRow(lambda episode: episode.slow_sensors)

@@ -67,8 +67,7 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         return obs.clone(), _read_infos(report.clone())
 
     def _list_over_rows(self) -> list[int]:
-        rows: list[int] = self._get_outputs()[2].nonzero()[:, 0].tolist()
-        return rows
+        return self._get_outputs()[2].nonzero()[:, 0].tolist()
 
     def _step_rows(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         ends = self._advance(actions)

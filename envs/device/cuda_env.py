@@ -17,6 +17,7 @@ from .base import StepEnds, Tensor, TensorVectorEnv
 from .cuda_kernel import (
     ASKED,
     RUNS,
+    SIMULATED,
     WORDS,
     DeviceArrays,
     KernelConstants,
@@ -24,7 +25,6 @@ from .cuda_kernel import (
     make_specification,
 )
 from .cuda_launch import load_kernel
-from .cuda_text import SIMULATED
 
 _NEW_ARRAYS = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
 """Arrays that are new in every step; the others stay at their place."""
@@ -69,15 +69,11 @@ class CudaVectorEnv(TensorVectorEnv):
     _has_over = True  # for all that the host knows
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        device: str | torch.device = "cuda",
+        self, num_envs: int = 1, device: str | torch.device = "cuda",
         dtype: str | torch.dtype = "float64",
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        *,
-        record: bool = False,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, *, record: bool = False,
         **arguments: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(num_envs, device, dtype, autoreset_mode, arguments, is_uniform=True)
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"
@@ -101,14 +97,13 @@ class CudaVectorEnv(TensorVectorEnv):
     def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         """Reset rows on the device, where their generators are."""
         configs, index = self._make_configs(options, chosen)
+        own_kind, own_width = self._constants.kind, self._constants.width
         for config in configs:
             kind, width = get_start_variant(config.start), len(config.start.params)
-            if kind != self._constants.kind or width != self._constants.width:
-                raise ValueError(
-                    f"on a device all rows have one kind of plant, {self._constants.kind} with "
-                    f"{self._constants.width} parameters; scenario {config.scenario.name!r} "
-                    f"has {kind} with {width}"
-                )
+            if kind != own_kind or width != own_width:
+                rule = f"all rows have one kind of plant, {own_kind} with {own_width} parameters"
+                got = f"scenario {config.scenario.name!r} has {kind} with {width}"
+                raise ValueError(f"on a device {rule}; {got}")
         words = _read_words([seeding.np_random(seed)[0] for seed in seeds.values()])
         self._memory.generators[:, list(seeds)] = torch.as_tensor(words, device=self.device)
         start_index = np.zeros(self.num_envs, np.int64)  # 0: without options
@@ -168,8 +163,7 @@ class CudaVectorEnv(TensorVectorEnv):
         snapshot_facts, own_facts = snapshot[:3], (self.num_envs, self._constants, self.dtype)
         if snapshot_facts != own_facts:
             raise ValueError(f"the snapshot is of other rows, {snapshot_facts}, not {own_facts}")
-        copies = (array.to(self.device, copy=True) for array in snapshot.memory)
-        self._memory = DeviceArrays(*copies)
+        self._memory = DeviceArrays(*(x.to(self.device, copy=True) for x in snapshot.memory))
         self._started = snapshot.started
 
 
@@ -191,7 +185,5 @@ def _check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None
         needed += math.prod(shape) * np.dtype(kind).itemsize * copies
     if needed > free:
         row = -(-needed // count)
-        raise MemoryError(
-            f"{count} rows of {row} bytes do not fit on {device}, where {free} bytes are free: "
-            f"at most {free // row} rows"
-        )
+        text = f"{count} rows of {row} bytes do not fit on {device}, where {free} bytes are free"
+        raise MemoryError(f"{text}: at most {free // row} rows")

@@ -1,13 +1,18 @@
 # numba's own types say too little about itself:
-# mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def"
+# mypy: disable-error-code="attr-defined,call-arg,misc,no-untyped-call,no-untyped-def"
 """The fused CUDA kernel: an env-step of a row in each thread, with resets and PCG64 generators.
 
-Rows lie along the last axis of what a tick reads and writes, so that neighbouring threads touch
-neighbouring numbers. A generator is NumPy's PCG64 (M. E. O'Neill, "PCG: A Family of Simple Fast
-Space-Efficient Statistically Good Algorithms for Random Number Generation", 2014): state, then
-increment, each of four words of 32 bits, the lowest first.
+The engine's functions become device functions, rebuilt from the code of the other engines with
+CUDA's own primitives and literals of one precision. Rows lie along the last axis of what a tick
+reads and writes, so that neighbouring threads touch neighbouring numbers. A generator is NumPy's
+PCG64 (M. E. O'Neill, "PCG: A Family of Simple Fast Space-Efficient Statistically Good Algorithms
+for Random Number Generation", 2014): state, then increment, each of four words of 32 bits, the
+lowest first.
 """
 
+import functools
+from collections.abc import Callable
+from types import CodeType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,13 +26,21 @@ from ..engine.outputs import finish_step
 from ..engine.reset import reset_vehicle
 from ..engine.step import clip_action, get_start_variant, integrate_step, reject_action
 from ..engine.window import make_window, precompute_window
-from ..numerics.jit import copy_into
+from ..numerics import require_extra
+from ..numerics.jit import as_python, copy_into
+from ..numerics.packed import load_element, read, store_element, write
 from ..numerics.primitives import Matrix, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH
 from ..scenarios.draws import DRAWS_WIDTH
 from ..task import REPORT
 from ..vehicle.dynamics import Motion
-from .cuda_text import SIMULATED, to_cuda
+
+with require_extra("cuda", "the CUDA engine needs numba-cuda"):
+    import numba_cuda as numba_cuda  # makes sure of it: numba's own `cuda` is an older one
+
+_Function = Callable[..., Any]
+SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
+"""Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
 
 WORDS = 8
 _MASK = 0xFFFFFFFF
@@ -196,7 +209,15 @@ def _step_row(
             return
         copy_into(row.obs, m.final_obs[i])
         copy_into(row.report, m.final_reports[:, i])
-    _reset_row(start_index, row, m.generators[:, i], constants, m)
+    packed, low = m.starts[start_index], constants.width
+    high = low + _DRAWN[0]
+    motion = high + _DRAWN[1]
+    start = EpisodeStart(
+        packed[:low], packed[low:high], packed[high:motion], m.switches[start_index],
+        packed[motion:],
+    )  # fmt: skip
+    key_low, key_high = _draw_key(m.generators[:, i])
+    reset_vehicle(start, key_low, key_high, row)
     m.over[i] = RUNS
     _count(i, constants, m, 1, row.report)
 
@@ -215,29 +236,116 @@ def _run_row(row: EpisodeArrays, action: Vector, constants: KernelConstants) -> 
     return int(done)
 
 
-def _reset_row(
-    start_index: int,
-    row: EpisodeArrays,
-    generator: Vector,
-    constants: KernelConstants,
-    m: DeviceArrays,
-) -> None:
-    """Start a row's next episode, with the next key of its generator."""
-    packed, low = m.starts[start_index], constants.width
-    high = low + _DRAWN[0]
-    motion = high + _DRAWN[1]
-    start = EpisodeStart(
-        packed[:low], packed[low:high], packed[high:motion], m.switches[start_index],
-        packed[motion:],
-    )  # fmt: skip
-    key_low, key_high = _draw_key(generator)
-    reset_vehicle(start, key_low, key_high, row)
-
-
 def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Vector) -> None:
     """Write the numbers of ticks and packets of row i's record."""
     if constants.record:
         m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
+
+
+def _to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
+    """Rebuild a function compiled by `jit`, and its callees; plain Python in the simulator."""
+
+    def finish(rebuilt: Any) -> Any:
+        if real is not np.float64:
+            _set_precision(rebuilt, real)
+        return rebuilt if SIMULATED else _device_jit(rebuilt)
+
+    if not SIMULATED:
+        return as_python(function, _make_table(real), finish)
+    return as_python(function, _SINGLE if real is np.float32 else None, finish)
+
+
+_device_jit: Any = functools.partial(cuda.jit, device=True, forceinline=True)
+_SINGLE: dict[str, _Function] = {
+    "to_word": lambda a: int(np.float32(a).view(np.uint32)),
+    "from_word": lambda a: np.uint32(a).view(np.float32),
+}
+"""Primitives of the simulator's float32: a word's 32 bits are those of a float."""
+
+
+def _set_precision(function: Any, real: Any) -> None:
+    """Give the function's literals and global numbers a precision, so that no float64 enters."""
+    names, code = function.__globals__, function.__code__
+    function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
+    for name in code.co_names:
+        if name == "float" or isinstance(names.get(name), float | tuple):
+            names[name] = real if name == "float" else _convert_literals(names[name], real)
+
+
+def _convert_literals(value: Any, real: Any) -> Any:
+    """Convert the floats of a value and of nested tuples."""
+    if isinstance(value, float):
+        return real(value)
+    if isinstance(value, tuple) and not isinstance(value, CodeType):
+        make = getattr(value, "_make", tuple)  # of a named tuple
+        return make([_convert_literals(item, real) for item in value])
+    return value
+
+
+def _make_table(real: Any) -> dict[str, _Function]:
+    """Make CUDA's own primitives by the names that the equations use; Python's serve for others."""
+    from numba.cuda import libdevice
+
+    single = real is np.float32
+    fabs = libdevice.fabsf if single else libdevice.fabs
+    floor = libdevice.floorf if single else libdevice.floor
+    sqrt = libdevice.fsqrt_rn if single else libdevice.dsqrt_rn
+    frexp = libdevice.frexpf if single else libdevice.frexp
+    functions = {
+        "absolute": lambda a: fabs(a),
+        "floor": lambda a: floor(a),
+        "sqrt": lambda a: sqrt(a),
+        "to_float": lambda a: real(a),
+        "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
+        "from_word": lambda a: real(a),
+    }
+    if single:  # a float64 has a word's value, a float32 its bits
+        functions["to_word"] = lambda a: int(libdevice.float_as_int(a))
+        functions["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
+    return {name: _device_jit(f) for name, f in functions.items()} | _register_access()
+
+
+@functools.cache
+def _register_access() -> dict[str, _Function]:
+    """Register numba-cuda's versions of reading and writing packed arrays, once."""
+    from numba.cuda.extending import overload
+
+    typings: dict[_Function, _Function] = {
+        read: _read, write: _write, load_element: _load_element, store_element: _store_element
+    }  # fmt: skip
+    for function, typing in typings.items():
+        overload(function, jit_options={"forceinline": True})(typing)
+    return {function.__name__: function for function in typings}
+
+
+def _format_column(j: Any) -> str:
+    return "" if j is None or isinstance(j, types.Omitted | types.NoneType) else ", j"
+
+
+def _build_function(text: str, **names: Any) -> Any:
+    exec(text, names)  # the text is made here alone
+    return names["written"]
+
+
+def _read(array, where, j=None):
+    numbers = "".join(f"array[where[0] + {k}{_format_column(j)}], " for k in range(len(where)))
+    made = getattr(where, "instance_class", None)
+    body = f"made({numbers})" if made else f"({numbers})"
+    return _build_function(f"def written(array, where, j=None): return {body}", made=made)
+
+
+def _write(array, values, where, j=None):
+    lines = [f"    array[where[{k}]{_format_column(j)}] = values[{k}]\n" for k in range(len(where))]
+    return _build_function(f"def written(array, values, where, j=None):\n{''.join(lines)}")
+
+
+def _load_element(array, i, j=None):
+    return _build_function(f"def written(array, i, j=None): return array[i{_format_column(j)}]")
+
+
+def _store_element(array, value, i, j=None):
+    text = f"def written(array, value, i, j=None): array[i{_format_column(j)}] = value"
+    return _build_function(text)
 
 
 def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
@@ -250,7 +358,7 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
     Returns:
         Function of N, whether rows are reset, and pointers to `DeviceArrays`.
     """
-    step, make_array = to_cuda(_step_row, real), carray
+    step, make_array = _to_cuda(_step_row, real), carray
     if SIMULATED:
         make_array = lambda pointer, shape: pointer.numbers  # noqa: E731
     floats = types.float32 if real is np.float32 else types.float64

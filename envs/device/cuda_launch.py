@@ -21,8 +21,7 @@ from numba import cuda, types
 from ..io import replace_file
 from ..numerics import kernel_cache
 from ..numerics.torch_backend import torch
-from .cuda_kernel import NAME, KernelConstants, make_kernel, make_specification
-from .cuda_text import SIMULATED
+from .cuda_kernel import NAME, SIMULATED, KernelConstants, make_kernel, make_specification
 
 if not SIMULATED:  # the simulator has no compiler
     from numba.cuda import dispatcher
@@ -78,12 +77,9 @@ def _compile_ptx(
     pointers = [types.CPointer(from_dtype(np.dtype(dtype))) for dtype, _ in specification]
     with _set_capability(capability):
         result = compile_cuda(
-            make_kernel(constants, real),
-            types.void,
-            (types.int64, types.boolean, *pointers),
-            nvvm_options={"opt": 3, "fma": real is np.float32},
-            cc=capability,
-        )
+            make_kernel(constants, real), types.void, (types.int64, types.boolean, *pointers),
+            nvvm_options={"opt": 3, "fma": real is np.float32}, cc=capability,
+        )  # fmt: skip
         library = result.library
         kernel = library.get_function(result.fndesc.llvm_func_name)
         library._entry_name = kernel.name
@@ -105,11 +101,6 @@ def _set_capability(capability: _Capability) -> Iterator[None]:
         dispatcher.get_current_device = previous
 
 
-def _make_context_current(device: torch.device) -> None:
-    """Make torch's context on the device the current one."""
-    torch.empty(1, device=device)
-
-
 class _DriverKernel:
     """The kernel of a PTX text on a GPU; RuntimeError where that refuses it, or MemoryError."""
 
@@ -117,7 +108,7 @@ class _DriverKernel:
         self._driver, self._device = driver, device
         self._text = ptx.encode() + b"\0"  # as long as the module is there
         with torch.cuda.device(device):
-            _make_context_current(device)
+            torch.empty(1, device=device)  # makes torch's context the current one
             major, minor = torch.cuda.get_device_capability(device)
             label = f"the kernel for sm_{major}{minor} on {device}"
             self._module = self._check_result(driver.cuModuleLoadData(self._text), label)
@@ -128,12 +119,11 @@ class _DriverKernel:
         """Step `count` rows, or reset those that are asked for; arrays as in `DeviceArrays`."""
         values = (count, resets, *(array.data_ptr() for array in arrays))
         kinds = (ctypes.c_int64, ctypes.c_bool, *[ctypes.c_void_p] * len(arrays))
-        grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
+        shape = -(-count // BLOCK), 1, 1, BLOCK, 1, 1  # of the grid and of a block
         with torch.cuda.device(self._device):
             stream = torch.cuda.current_stream(self._device).cuda_stream
-            launched = self._driver.cuLaunchKernel(
-                self._function, *grid, *block, 0, stream, (values, kinds), 0
-            )
+            parameters = self._function, *shape, 0, stream, (values, kinds), 0
+            launched = self._driver.cuLaunchKernel(*parameters)
         self._check_result(launched, f"a step of {count} rows on {self._device}")
 
     def _check_result(self, result: Any, label: str) -> Any:
@@ -148,7 +138,7 @@ class _DriverKernel:
 def load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
-    """Load a kernel on a GPU or in the simulator.
+    """Load a kernel on a GPU, or in numba's simulator: plain Python, a thread after the other.
 
     Args:
         constants: Constants of the kernel.
@@ -158,22 +148,15 @@ def load_kernel(
     Returns:
         Function of the number of rows, whether they are reset, and `DeviceArrays`.
     """
-    if SIMULATED:
-        return _SimulatedKernel(constants, real)
-    from cuda.bindings import driver
+    if not SIMULATED:
+        from cuda.bindings import driver
 
-    ptx = get_ptx(constants, real, torch.cuda.get_device_capability(device))
-    return _DriverKernel(ptx, device, driver)
+        ptx = get_ptx(constants, real, torch.cuda.get_device_capability(device))
+        return _DriverKernel(ptx, device, driver)
+    kernel: Any = cuda.jit(make_kernel(constants, real))
 
-
-class _SimulatedKernel:
-    """The kernel in numba's simulator: plain Python, a thread after the other."""
-
-    def __init__(self, constants: KernelConstants, real: type[np.floating[Any]]) -> None:
-        self._kernel: Any = cuda.jit(make_kernel(constants, real))
-
-    def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
-        """Step or reset rows as `_DriverKernel` does."""
-        blocks = -(-count // _SIMULATED_BLOCK)
+    def simulate(count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
         pointers = [SimpleNamespace(numbers=array.numpy()) for array in arrays]
-        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *pointers)
+        kernel[-(-count // _SIMULATED_BLOCK), _SIMULATED_BLOCK](count, resets, *pointers)
+
+    return simulate

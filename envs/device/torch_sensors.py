@@ -66,12 +66,8 @@ class SlowSensors:
         self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
     ) -> None:
         self.capacities, self._small_angle = capacities, small_angle
-        (
-            self._sample_sensor, self._make_measurement_context, self._compute_arrivals, self._read,
-            self._select,
-        ) = to_torch(
-            dtype, sample_sensor, make_measurement_context, compute_arrivals, read, select
-        )  # fmt: skip
+        functions = sample_sensor, make_measurement_context, compute_arrivals, read, select
+        self._functions = to_torch(dtype, *functions)
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: SlowState, window: TickWindow
@@ -97,25 +93,24 @@ class SlowSensors:
         self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: TickWindow
     ) -> tuple[list[Tensor], list[Tensor]]:
         """Capture a sensor's next frame if it is in the window: (sensor's state, its packets)."""
-        pick = self._select
+        functions, pick = self._functions, self._functions.select
         frame, tick = slow[SLOW_STATE.frames], slow[SLOW_STATE.next_capture]
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
         tick_index = j.expand(1, window.track.shape[1], -1)
         motion = Motion(*window.track.gather(0, tick_index)[0].unbind(0))
-        link = self._read(p, P.slow[sensor])
-        context = self._make_measurement_context(p, motion, self._small_angle, keys, tick)
-        values, quality, drift = self._sample_sensor(sensor, context, link, slow[SLOW_STATE.drift])
+        link, before = functions.read(p, P.slow[sensor]), slow[SLOW_STATE.drift]
+        context = functions.make_measurement_context(p, motion, self._small_angle, keys, tick)
+        values, quality, drift = functions.sample_sensor(sensor, context, link, before)
         fields = [
             number if isinstance(number, Tensor) else torch.full_like(tick, number)
             for number in (quality, frame, *values)
         ]
-        packets = []
-        block = BLOCKS[sensor].link
-        arrival_ticks = self._compute_arrivals(link, frame, tick, keys[0], keys[1], block)
+        packets, block = [], BLOCKS[sensor].link
+        arrivals = functions.compute_arrivals(link, frame, tick, keys[0], keys[1], block)
         stamp = tick + link.stamp  # nothing arrives before it
-        for arrived in arrival_ticks[: self.capacities[sensor].copies]:
+        for arrived in arrivals[: self.capacities[sensor].copies]:
             arrived = pick(arrived == NEVER, NEVER, torch.maximum(arrived, stamp))
             arrival_tick = pick(active, arrived, NEVER)  # outside the window it never arrives
             head = torch.full_like(tick, sensor), stamp, arrival_tick
@@ -123,12 +118,11 @@ class SlowSensors:
         next_state = list(slow)
         next_state[SLOW_STATE.frames] = pick(active, frame + 1.0, frame)
         next_state[SLOW_STATE.next_capture] = pick(active, tick + link.period, tick)
-        next_state[SLOW_STATE.drift] = pick(active, drift, slow[SLOW_STATE.drift])
+        next_state[SLOW_STATE.drift] = pick(active, drift, before)
         return next_state, packets
 
     def _update_newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
         """Update the sensors' newest samples by the due packets; return their `SlowState.slow`."""
-        pick = self._select
         for i in range(len(queue)):
             packet = queue[i].unbind(0)
             for sensor in self.capacities:
@@ -140,7 +134,7 @@ class SlowSensors:
                 values = packet[PACKET.value : PACKET.value + VALUES]
                 newest = (packet[PACKET.captured], *values, packet[PACKET.arrived])
                 for k, value in enumerate(newest, SLOW_STATE.captured):
-                    slow[k] = pick(is_newer, value, slow[k])
+                    slow[k] = self._functions.select(is_newer, value, slow[k])
         return torch.stack([torch.stack(sensor_state) for sensor_state in sensors])
 
 

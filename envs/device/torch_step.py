@@ -140,14 +140,11 @@ class TorchStep:
         self._slow = SlowSensors(capacities, self.kind.small_angle, dtype)
         self._switches = read(start.switches, FLAGS)
         self._bounds = torch.as_tensor(config.bounds, dtype=dtype, device=device)[:, :, None]
-        (
-            self._clip, self._select, self._compute_failure_cost, self._draw_normals,
-            self._compute_steering, self._make_step_params, self._integrate_tick,
-            self._apply_tyre_change, self._select_failure, self._compute_tick_cost,
-        ) = to_torch(
+        self._functions = to_torch(
             dtype, clip, select, compute_failure_cost, draw_normals, compute_steering,
             make_step_params, integrate_tick, apply_tyre_change, select_failure, compute_tick_cost,
         )  # fmt: skip
+        self._select = self._functions.select
         parts: list[Any] = [self._finish_step, self._step_tick, self._precompute_window]
         if compile:
             parts = list(map(compile_method, parts))
@@ -163,7 +160,7 @@ class TorchStep:
         is_finite = torch.isfinite(actions).all(1)
         gate = GradientGate()  # its hooks run in the backward pass, after `open` is set below
         p, state = gate(p), TorchState(*map(gate, state))
-        shares = self._clip(torch.where(is_finite[:, None], actions, 0.0), -1.0, 1.0)
+        shares = self._functions.clip(torch.where(is_finite[:, None], actions, 0.0), -1.0, 1.0)
         yaw_share, *steer_shares = map(gate, shares.unbind(1))
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
@@ -187,51 +184,48 @@ class TorchStep:
         self, p: Tensor, keys: Tensor, first: Tensor, n: int
     ) -> tuple[Numbers, Any]:
         """Compute (nine normal numbers, profile's steering) of n ticks from `first` on, (n, N)."""
+        draw = self._functions.draw_normals
         ticks = first + torch.arange(n, device=first.device)[:, None]
-        tick_numbers = ticks.to(torch.int64)
-        inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
-        wheels = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.wheels)
+        counter = keys[0], keys[1], ticks.to(torch.int64)
+        inertial, wheels = draw(*counter, CHANNELS.inertial), draw(*counter, CHANNELS.wheels)
         vibration = torch.zeros_like(inertial[0])
         if self.kind.has_errors:
-            vibration = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.errors)[0]
+            vibration = draw(*counter, CHANNELS.errors)[0]
         draws = (*inertial, *wheels, vibration)
         if self.kind.has_driver:
             return draws, None
         profile = p[P.steering_profile[0] :]
-        return draws, self._compute_steering(ticks.to(self.dtype), profile)
+        return draws, self._functions.compute_steering(ticks.to(self.dtype), profile)
 
     def _step_tick(
         self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: _TickState,
         draws: Numbers, next_steer: Any,
     ) -> _TickState:  # fmt: skip
         """Step the cars that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
-        pick = self._select
-        params = self._make_step_params(p)
-        task = params.task
-        car = self._apply_tyre_change(
-            params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
-        )
-        motion, drive = Motion(*tick_state.motion), ActuatorState(*tick_state.drive)
-        nominal_motion = NominalMotion(*tick_state.nominal_motion)
+        functions, pick, start_tick = self._functions, self._select, tick_state.tick
+        params = functions.make_step_params(p)
+        task, change = params.task, params.tyre_change
         # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
         state = StepState(
-            motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion,
+            Motion(*tick_state.motion), ActuatorState(*tick_state.drive), None, tick_state.driver,
+            functions.apply_tyre_change(params.car, change, start_tick > change.tick),
+            tick_state.refs, NominalMotion(*tick_state.nominal_motion),
             ErrorState(*tick_state.errors),
         )  # fmt: skip
         normals = NormalDraws(draws[:4], draws[4:8], draws[8])
-        acts = tick_state.tick >= task.lead_in
+        acts = start_tick >= task.lead_in
         N_z = pick(acts, yaw_share * task.yaw_scale, 0.0)
         added = pick(acts, steer_share * task.authority, 0.0)
         inputs = TickInputs(N_z, added, normals, next_steer, tick_state.past_efforts[0])
-        next_state, measured = self._integrate_tick(
-            params, inputs, state, tick_state.tick, self.kind
+        next_state, measured = functions.integrate_tick(
+            params, inputs, state, start_tick, self.kind
         )
         alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
-        tick = tick_state.tick + alive
-        tick_cost = self._compute_tick_cost(
+        tick = start_tick + alive
+        tick_cost = functions.compute_tick_cost(
             next_state.motion, measured.cost_inputs, task, params.path, self.kind
         )
-        failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
+        failure = functions.select_failure(measured.lost, tick_cost.spun, tick_cost.off)
         refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
         beta = pick(measured.lost, 0.0, tick_cost.beta)
         info_values = (beta, *refs, measured.steer, measured.moment)
@@ -251,13 +245,12 @@ class TorchStep:
             select_cars(alive, next_state.nominal_motion, tick_state.nominal_motion),
             select_cars(alive, next_state.errors, tick_state.errors),
             select_cars(alive, efforts, tick_state.past_efforts),
-            tick,
-            pick(alive, failure, tick_state.failure),
+            tick, pick(alive, failure, tick_state.failure),
             tick_state.cost + pick(alive & acts, tick_cost.cost * TICK, 0.0),
             select_cars(alive, info_values, tick_state.shown),
             select_cars(alive, measured.row, tick_state.row),
             select_cars(alive, next_state.motion, tick_state.track),
-        )
+        )  # fmt: skip
 
     def _finish_step(
         self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked
@@ -310,8 +303,7 @@ class TorchStep:
             entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
         info_values = _InfoValues(*tick_state.shown)
         entries += [info_values.beta_ref, info_values.gamma_ref]
-        low, high = self._bounds.unbind(0)
-        clipped: Tensor = self._clip(torch.stack(entries), low, high)
+        clipped: Tensor = self._functions.clip(torch.stack(entries), *self._bounds.unbind(0))
         return clipped.T.to(self._obs_dtype).contiguous()
 
     def _read_sensor(
@@ -330,7 +322,7 @@ class TorchStep:
 
     def _report(self, tick_state: _TickState, duration: Tensor, count: Tensor) -> Tensor:
         """Compute the reports (len(StepReport), N) of cars that were stepped."""
-        failure_cost = self._compute_failure_cost(duration, tick_state.tick)
+        failure_cost = self._functions.compute_failure_cost(duration, tick_state.tick)
         cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
         info_values = _InfoValues(*tick_state.shown)
         values = {
@@ -345,7 +337,7 @@ class TorchStep:
 
     def _report_refusal(self, tick_state: _TickState, duration: Tensor, before: Tensor) -> Tensor:
         """Compute the reports of cars that fail by a non-finite action, from those before."""
-        cost = self._compute_failure_cost(duration, tick_state.tick)
+        cost = self._functions.compute_failure_cost(duration, tick_state.tick)
         values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
         values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}
         values["failure"] = torch.full_like(cost, BAD_ACTION)
@@ -363,51 +355,40 @@ class TorchReset:
 
     def __init__(self, step: TorchStep) -> None:
         self._step = step
-        self._make_step_params, self._read, self._draw_normals, self._draw_first_drift = to_torch(
-            step.dtype, make_step_params, read, draw_normals, draw_first_drift
-        )
-        (
-            self._compute_target_angle, self._compute_first_row, self._compute_reference,
-            self._compute_sideslip_angle,
-        ) = to_torch(
-            step.dtype, compute_target_angle, compute_first_row, compute_reference,
-            compute_sideslip_angle,
+        self._functions = to_torch(
+            step.dtype, make_step_params, read, draw_normals, draw_first_drift,
+            compute_target_angle, compute_first_row, compute_reference, compute_sideslip_angle,
         )  # fmt: skip
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: TorchState
     ) -> tuple[TorchState, StepOutcome]:
         """Compute (state, outcome) at tick 0 from the state that a reset left."""
-        kind, params = self._step.kind, self._make_step_params(p)
-        zero = torch.zeros_like(state.tick)
+        kind, functions = self._step.kind, self._functions
+        params, zero = functions.make_step_params(p), torch.zeros_like(state.tick)
         motion, steer = Motion(*state.motion.unbind(0)), state.driver
         if kind.has_driver:
-            road, target, stop = params.road, params.target, params.task.stop
-            steer = self._compute_target_angle(
-                motion, params.path, road, target, params.driver, stop
-            )
+            limits = params.road, params.target, params.driver, params.task.stop
+            steer = functions.compute_target_angle(motion, params.path, *limits)
         drive = torch.stack(ActuatorState(*state.drive.unbind(0))._replace(delta_f=steer))
         channels = CHANNELS.inertial, CHANNELS.wheels, CHANNELS.errors
-        n = [self._draw_normals(keys[0], keys[1], 0, channel) for channel in channels]
-        draws = NormalDraws(n[0], n[1], n[2][0])
-        errors = ErrorState(*state.errors.unbind(0))
-        row = self._compute_first_row(motion, steer, params, draws, errors, kind)
+        n = [functions.draw_normals(keys[0], keys[1], 0, channel) for channel in channels]
+        draws, errors = NormalDraws(n[0], n[1], n[2][0]), ErrorState(*state.errors.unbind(0))
+        row = functions.compute_first_row(motion, steer, params, draws, errors, kind)
         row = [zero + number for number in row]
-        v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-        command = row[FAST.steer_command]
-        refs = torch.stack(self._compute_reference(command, v, params.target, kind.reference))
+        v, command = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right]), row[FAST.steer_command]
+        refs = torch.stack(functions.compute_reference(command, v, params.target, kind.reference))
         all_cars = torch.ones_like(state.over)
-        beta = self._compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
-        info_values = _InfoValues(beta, refs[0], refs[1], steer, zero)
+        beta = functions.compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
         started = state._replace(drive=drive, driver=steer, refs=refs)
-        tick_state = _make_tick_state(started, all_cars)
+        info_values = _InfoValues(beta, refs[0], refs[1], steer, zero)
+        tick_state = _make_tick_state(started, all_cars)._replace(shown=info_values)
         empty_queue = torch.full_like(state.queue, NEVER)
         # as if a step of one tick had led here from tick -1: its window holds tick 0 alone
         previous = state._replace(
             tick=state.tick - 1.0, slow=self._rewind_sensors(p, keys, state.slow), queue=empty_queue
         )
         rows = torch.stack(row).expand(self._step.n, -1, -1)  # tick 0 stands for every sample
-        tick_state = tick_state._replace(shown=info_values)
         result: tuple[TorchState, StepOutcome] = self._step.finish_step(
             p, keys, previous, _Ticked(tick_state, rows, state.motion[None], all_cars, ~all_cars)
         )
@@ -417,15 +398,14 @@ class TorchReset:
         """Compute the slow sensors' state before tick 0 from that after it."""
         sensors = list(slow.unbind(0))
         for i in self._step.sensors:
-            after, sky = sensors[i], self._read(p, P.sky)
-            period = self._read(p, P.slow[i]).period
+            after, sky = sensors[i], self._functions.read(p, P.sky)
+            period = self._functions.read(p, P.slow[i]).period
             before = list(torch.zeros_like(after).unbind(0))
             elapsed = after[SLOW_STATE.frames] * period
             before[SLOW_STATE.next_capture] = after[SLOW_STATE.next_capture] - elapsed
             before[SLOW_STATE.captured] = before[SLOW_STATE.captured] + NEVER
-            before[SLOW_STATE.drift] = before[SLOW_STATE.drift] + self._draw_first_drift(
-                i, sky, *keys
-            )
+            drift = self._functions.draw_first_drift(i, sky, *keys)
+            before[SLOW_STATE.drift] = before[SLOW_STATE.drift] + drift
             sensors[i] = torch.stack(before)
         return torch.stack(sensors)
 

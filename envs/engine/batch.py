@@ -31,6 +31,7 @@ IntArray = npt.NDArray[np.int64]
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
 # How many parameters ticks read, and how many numbers of the state they change besides the driver's
 # angle: in an ideal world, and in one with errors.
+_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 _TICK_PARAMS = (P.errors[0], P.slow[0].period)
 _TICK_STATE = (Z.errors[0], Z.slow[0].frames)
 
@@ -72,18 +73,6 @@ class _LaneBuffers(NamedTuple):
     block: EpisodeArrays  # without packets, and without the observation's entries of slow sensors
     shares: Array
     window: Array  # of a row that is stepped by itself
-
-
-def _make_lane_buffers(count: int, n: int, bounds: Array) -> _LaneBuffers:
-    """Make the working arrays of a batch step of n ticks; `order` is 0 .. count - 1."""
-    block = EpisodeArrays(
-        np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
-        np.zeros(len(FLAGS), np.int64), np.zeros((bounds.shape[1], LANES)),
-        np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
-        np.zeros((_REPORT, LANES)), bounds, make_window(n, LANES),
-    )  # fmt: skip
-    members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
-    return _LaneBuffers(np.arange(count), members, block, shares, make_window(n))
 
 
 @jit
@@ -141,9 +130,6 @@ def _step_lanes(count: int, batch: BatchArrays, actions: Matrix, buffers: _LaneB
     return True
 
 
-_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
-
-
 @jit
 def _step_rows(
     batch: BatchArrays, actions: Matrix, results: tuple[Vector, Vector, Vector],
@@ -173,15 +159,10 @@ def _step_rows(
         if n_pending and (
             n_pending == count_lanes() or m == last or _has_variant_change(m, batch, buffers)
         ):
-            is_vectorised = False
-            if n_pending > _MAX_SCALAR:
-                is_vectorised = _step_lanes(n_pending, batch, actions, buffers)
+            is_wide = n_pending > _MAX_SCALAR and _step_lanes(n_pending, batch, actions, buffers)
             for lane in range(n_pending):
-                i = buffers.members[lane]
-                if is_vectorised:
-                    batch.ticks_done[i] = batch.rows.shape[1]
-                else:
-                    batch.ticks_done[i] = _step_single(i, batch, actions, buffers)
+                i, n = buffers.members[lane], batch.rows.shape[1]
+                batch.ticks_done[i] = n if is_wide else _step_single(i, batch, actions, buffers)
             n_pending = 0
     for i in range(len(over)):
         if over[i]:
@@ -191,8 +172,7 @@ def _step_rows(
         batch.delivered[i] = int(report[REPORT.packets])
         rewards[i], terminated[i], truncated[i] = read_ends(report)
         over[i] = terminated[i] or truncated[i]
-        if over[i]:
-            n_ended += 1
+        n_ended += int(over[i])
     return n_ended
 
 
@@ -246,8 +226,7 @@ def _reset_rows(
             starts.params[t], starts.low[t], starts.high[t], starts.switches[t], starts.motion[t]
         )
         reset_vehicle(start, key_low, key_high, row)
-        batch.ticks_done[i] = 1
-        batch.delivered[i] = int(batch.reports[i, REPORT.packets])
+        batch.ticks_done[i], batch.delivered[i] = 1, int(batch.reports[i, REPORT.packets])
 
 
 def _pad_params(params: Array, width: int) -> Array:
@@ -280,15 +259,19 @@ class NumbaEngine:
             delivered=np.zeros(N, np.int64), over=np.zeros(N, np.bool_),
         )  # fmt: skip
         self.final = RecordArrays(*(array.copy() for array in self.arrays.record))
-        self.lane_buffers = _make_lane_buffers(N, n, config.bounds)
+        block = EpisodeArrays(
+            np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
+            np.zeros(len(FLAGS), np.int64), np.zeros((k, LANES)),
+            np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
+            np.zeros((_REPORT, LANES)), config.bounds, make_window(n, LANES),
+        )  # fmt: skip
+        members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
+        self.lane_buffers = _LaneBuffers(np.arange(N), members, block, shares, make_window(n))
 
     def reset(
-        self,
-        chosen: IntArray,
-        starts: Sequence[EpisodeStart],
-        index: IntArray,
+        self, chosen: IntArray, starts: Sequence[EpisodeStart], index: IntArray,
         keys: npt.NDArray[np.uint64],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Reset rows.
 
         Args:

@@ -126,11 +126,11 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         known: dict[tuple[object, ...], int] = {}  # rows with the same objects share a config
         for m, i in enumerate(chosen.tolist()):
             config, values = self.row_configs[i], row_options[i]
-            key = (id(config), *values, *map(id, values.values()))
-            if key not in known:
-                known[key] = len(configs)
+            index[m] = place = known.setdefault(
+                (id(config), *values, *map(id, values.values())), len(configs)
+            )
+            if place == len(configs):
                 configs.append(config.apply_options(values))
-            index[m] = known[key]
         return configs, index
 
     def _restart_rows(
@@ -166,8 +166,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """The seed of each row's generator."""
-        generators = self.np_random  # a row without one gets one now
-        return tuple(self.seeds[: len(generators)])
+        return tuple(self.seeds[: len(self.np_random)])  # a row without a generator gets one now
 
     def get_state(self) -> Any:
         """Copy the state of all rows, from which `set_state` continues bit for bit."""
@@ -187,10 +186,9 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         """
         shape, own_shape = np.shape(snapshot["rows"]), self.engine.arrays.rows.shape
         if shape != own_shape:
-            sizes = f"this env {own_shape[0]} of {own_shape[1]}"
-            raise ValueError(
-                f"the snapshot has {shape[0]} rows of {shape[1]} ticks a step, {sizes}"
-            )
+            sizes = f"{shape[0]} rows of {shape[1]} ticks a step"
+            own_sizes = f"this env {own_shape[0]} of {own_shape[1]}"
+            raise ValueError(f"the snapshot has {sizes}, {own_sizes}")
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
         self.engine.restore(snapshot)
@@ -244,5 +242,4 @@ def _split_options(options: Mapping[str, object], count: int) -> list[dict[str, 
         elif len(value) != count:
             raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
         columns[name] = value
-    rows = range(count)
-    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in range(count)]

@@ -81,8 +81,7 @@ class EpisodeConfig:
     held_speed: float | None  # m/s, where it is one number and held exactly
 
 
-_SlowChanges = Mapping[str, Mapping[str, Any] | None]
-"""Changes to slow sensors by name, as `apply_changes` takes them."""
+_SlowChanges = Mapping[str, Mapping[str, Any] | None]  # by name, as `apply_changes` takes them
 
 
 def make_car(vehicle: Vehicle) -> CarParams:
@@ -173,14 +172,12 @@ def _apply_scenario_clocks(
     """
     changed = {}
     for name, sensor in sensors.items():
-        period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
-        if period is not None:
-            sensor = dataclasses.replace(sensor, period=period)
-        if delays is not None:
-            jitter = getattr(scenario, f"{name}_jitter", 0.0)
-            sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
-        if loss := getattr(scenario, f"{name}_loss", 0.0):
-            sensor = dataclasses.replace(sensor, loss=loss)
+        clock = {key: getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays")}
+        clock["loss"] = getattr(scenario, f"{name}_loss", 0.0) or None
+        if clock["delays"] is not None:
+            clock["jitter"] = getattr(scenario, f"{name}_jitter", 0.0)
+        set_fields = {key: value for key, value in clock.items() if value is not None}
+        sensor = dataclasses.replace(sensor, **set_fields)
         sensor = apply_changes({name: sensor}, {name: changes.get(name)})[name]
         low, high = map(count_ticks, get_range(getattr(scenario, f"{name}_latency", 0.0)))
         if high > 0.0:  # the worst case: the smallest latency as a delay, the rest as jitter
@@ -189,12 +186,6 @@ def _apply_scenario_clocks(
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         changed[name] = sensor
     return changed
-
-
-def _apply_stamp_range(sensor: SlowSensor, low: float, high: float) -> SlowSensor:
-    """Describe the delays that packets seem to have whose stamps are off by low to high (s)."""
-    delays = tuple(max(delay - high, 0.0) for delay in sensor.delays)
-    return dataclasses.replace(sensor, delays=delays, jitter=sensor.jitter + (high - low))
 
 
 def _replace_parameters(car: Vehicle, changes: Mapping[str, float], tier: str) -> Vehicle:
@@ -261,14 +252,13 @@ class EnvConfig:
             known = [name for name in names if name != "slow_changes"]
             raise TypeError(describe_unknown("argument", unknown, [*known, *SLOW_NAMES]))
         check_int("control_period", self.control_period, "ticks", 1, 1000)
-        if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
-            raise ValueError(f"fast is 'summary' or 'all', got {short_repr(self.fast)}")
         for name in ("steering", "yaw_first", "with_map", "strict"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} is True or False, got {short_repr(getattr(self, name))}")
-        bad = self.on_bad_action
-        if not isinstance(bad, str) or bad not in ("raise", "fail"):
-            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {short_repr(bad)}")
+        for name, choices in (("fast", ("summary", "all")), ("on_bad_action", ("raise", "fail"))):
+            value, rule = getattr(self, name), " or ".join(map(repr, choices))
+            if not isinstance(value, str) or value not in choices:
+                raise ValueError(f"{name} is {rule}, got {short_repr(value)}")
         check_choice("vision", self.vision, VISIONS)
         if self.vision == "image" and "camera" not in SENSOR_SETS[self.sensors]:
             raise ValueError(f"vision='image' needs a camera, and {self.sensors!r} has none")
@@ -287,8 +277,8 @@ class EnvConfig:
     @cached_property
     def layout(self) -> tuple[ObservationEntry, ...]:
         """The entries of an observation."""
-        n = int(self.control_period)
-        return make_observation_layout(tuple(self.slow), n, self.fast, self.with_map)
+        kinds = int(self.control_period), self.fast, self.with_map
+        return make_observation_layout(tuple(self.slow), *kinds)
 
     @cached_property
     def bounds(self) -> Array:
@@ -342,17 +332,17 @@ class EnvConfig:
         links = {
             name: _make_link(scenario, name, slow.get(name), lead_in, world) for name in SLOW_NAMES
         }
-        if "gps" in slow:
-            slow["gps"] = _apply_stamp_range(slow["gps"], *get_range(world.gps_stamp))
+        if "gps" in slow:  # the delays that packets seem to have whose stamps are off
+            gps, (low_stamp, high_stamp) = slow["gps"], get_range(world.gps_stamp)
+            delays = tuple(max(delay - high_stamp, 0.0) for delay in gps.delays)
+            jitter = gps.jitter + (high_stamp - low_stamp)
+            slow["gps"] = dataclasses.replace(gps, delays=delays, jitter=jitter)
         hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
         gains = _compute_gains(-TICK / scenario.disturbance_time)
         params = EpisodeParams(
             car=make_car(vehicle),
             road=RoadParams(  # curvature and bank are drawn
-                0.0,
-                scenario.curve_start,
-                scenario.curve_ramp,
-                0.0,
+                0.0, scenario.curve_start, scenario.curve_ramp, 0.0,
                 GRAVITY * math.sin(scenario.grade),
             ),
             motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
@@ -368,16 +358,12 @@ class EnvConfig:
             task=make_task_params(vehicle, scenario, self.yaw_first, lead_in, world),
             steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
             sky=SatelliteGeometry(
-                math.log(scenario.hdop),
-                scenario.hdop_spread,
-                *hdop_gains,
+                math.log(scenario.hdop), scenario.hdop_spread, *hdop_gains,
                 HDOP_LAWS[scenario.hdop_law],
             ),
             driver=DriverParams(
-                preview=scenario.driver_preview,
-                gain=scenario.driver_gain,
-                rest=make_lag(scenario.driver_lag, TICK).end,
-                slew=scenario.driver_rate * TICK,
+                preview=scenario.driver_preview, gain=scenario.driver_gain,
+                rest=make_lag(scenario.driver_lag, TICK).end, slew=scenario.driver_rate * TICK,
             ),
             path=make_path(scenario.path, vehicle.width),
             tyre_change=TyreChange(FOREVER, 1.0, 1.0, 1.0),  # drawn
@@ -385,7 +371,7 @@ class EnvConfig:
             nominal_car=Bicycle(*nominal.lateral),
             errors=IDEAL_SENSORS,
             friction_wave=FrictionWave(0.0, 0.0, 0.0),  # drawn
-        )
+        )  # fmt: skip
         switches = Switches(
             small_angle=int(scenario.small_angle),
             law=TYRE_LAWS.index(world.tyres or scenario.tyres),
@@ -419,10 +405,9 @@ class EnvConfig:
         """
         if not options:
             return self.base
-        unknown = sorted(map(str, set(options) - set(_RESET_OPTIONS)))
-        if unknown:
+        if unknown := ", ".join(sorted(map(str, set(options) - set(_RESET_OPTIONS)))):
             known = ", ".join(_RESET_OPTIONS)
-            raise ValueError(f"unknown reset option {', '.join(unknown)}; known: {known}")
+            raise ValueError(f"unknown reset option {unknown}; known: {known}")
         scenario = make_scenario(options.get("scenario", self.scenario))
         vehicle = make_vehicle(options.get("vehicle", self.vehicle), self.strict)
         for name in ("friction", "duration"):
@@ -441,19 +426,18 @@ def _parse_initial_motion(
     start = np.full(len(Motion._fields), np.nan)
     relaxation = scenario.vehicle.get("relaxation", vehicle.relaxation)
     is_relaxing = (world.tyres or scenario.tyres) == "magic-formula" and relaxation > 0.0
+    lacks = {"phi": "" if scenario.roll else "no roll"}
+    lacks["slip"] = "" if is_relaxing else "no tyres that relax"
     for i, name in enumerate(Motion._fields):
         value = remaining.pop(name, None)
         if value is not None and not (is_finite(value) and abs(value) <= 1e6):
             got = short_repr(value)
             raise ValueError(f"reset option state: {name} is {got}, not a number up to 1e6")
         start[i] = np.nan if value is None else value
-        for prefix, holds, lack in (
-            ("phi", scenario.roll, "no roll"), ("slip", is_relaxing, "no tyres that relax"),
-        ):  # fmt: skip
-            if name.startswith(prefix) and value and not holds:
-                reason = f"but scenario {scenario.name!r} has {lack}"
-                raise ValueError(f"reset option state: {name} is {value!r}, {reason}")
+        if value and (lack := lacks.get(name.partition("_")[0])):
+            reason = f"but scenario {scenario.name!r} has {lack}"
+            raise ValueError(f"reset option state: {name} is {value!r}, {reason}")
     if remaining:
-        known = ", ".join(Motion._fields)
-        raise ValueError(f"unknown state {join_names(map(str, remaining))}; known: {known}")
+        unknown, known = join_names(map(str, remaining)), ", ".join(Motion._fields)
+        raise ValueError(f"unknown state {unknown}; known: {known}")
     return start

@@ -22,26 +22,17 @@ NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 @jit
 def _push_packet(
-    z: Vector,
-    sensor: int,
-    captured: Scalar,
-    due: Scalar,
-    quality: Scalar,
-    frame: Scalar,
+    z: Vector, sensor: int, captured: Scalar, due: Scalar, quality: Scalar, frame: Scalar,
     values: Vector,
-) -> None:
+) -> None:  # fmt: skip
     """Queue a captured sample; `make_link` has checked that the queue is long enough."""
     slot = int(z[Z.under_way])
     packet = z[Z.queue + slot * PACKET_WIDTH :]
-    packet[PACKET.sensor] = sensor
-    packet[PACKET.captured] = captured
-    packet[PACKET.arrived] = due
-    packet[PACKET.quality] = quality
-    packet[PACKET.sequence] = frame
+    packet[PACKET.sensor], packet[PACKET.captured], packet[PACKET.arrived] = sensor, captured, due
+    packet[PACKET.quality], packet[PACKET.sequence] = quality, frame
     for i in range(VALUES):
         packet[PACKET.value + i] = values[i]
-    z[Z.under_way] = slot + 1.0
-    z[Z.clock.next_due] = minimum(z[Z.clock.next_due], due)
+    z[Z.under_way], z[Z.clock.next_due] = slot + 1.0, minimum(z[Z.clock.next_due], due)
 
 
 @jit
@@ -57,8 +48,7 @@ def _send_frame(
         _push_packet(z, sensor, stamp, maximum(first, stamp), quality, frame, values)
     if second != NEVER:
         _push_packet(z, sensor, stamp, maximum(second, stamp), quality, frame, values)
-    z[column.frames] = frame + 1.0
-    z[column.next_capture] = tick + link.period
+    z[column.frames], z[column.next_capture] = frame + 1.0, tick + link.period
 
 
 @jit
@@ -124,11 +114,10 @@ def make_measurement_context(
     Returns:
         The inputs.
     """
-    road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
-    sky, field_of_view, errors = read(p, P.sky), read(p, P.field_of_view), read(p, P.errors)
     return MeasurementContext(
-        motion, road, car, noise, sky, field_of_view, errors, small_angle, key[0], key[1], tick
-    )
+        motion, read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky),
+        read(p, P.field_of_view), read(p, P.errors), small_angle, key[0], key[1], tick,
+    )  # fmt: skip
 
 
 @jit
@@ -288,27 +277,12 @@ def sample_slow_ticks(row: EpisodeArrays, first: int, last: int, count: int, don
 @jit
 def _observe_step(row: EpisodeArrays, n: int, done: int) -> int:
     """Write the observation but for the slow sensors, whose first entry's index is returned."""
-    report, rows = row.report, row.rows
-    refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
-    n_rows = done
+    refs = (row.report[REPORT.beta_ref], row.report[REPORT.gamma_ref])
     if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
         for j in range(done, n):
-            copy_into(rows[done - 1], rows[j])
-        n_rows = n
-    return int(observe_fast(row, n_rows, refs))
-
-
-@jit
-def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int) -> None:
-    """Write observation and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        n: Ticks of a control period.
-        done: Ticks integrated in the step.
-        count: Number of packets.
-    """
-    _finish_report(row, _observe_step(row, n, done), count)
+            copy_into(row.rows[done - 1], row.rows[j])
+        done = n
+    return int(observe_fast(row, done, refs))
 
 
 @jit
@@ -318,8 +292,7 @@ def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
     _observe_slow(row, k, count)
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma], report[REPORT.psi] = z[Z.motion.gamma], z[Z.motion.psi]
-    report[REPORT.failure] = z[Z.clock.failure]
-    report[REPORT.reward] = -report[REPORT.cost]
+    report[REPORT.failure], report[REPORT.reward] = z[Z.clock.failure], -report[REPORT.cost]
     report[REPORT.packets] = count
 
 

@@ -32,8 +32,7 @@ def _write_surroundings(p: Vector, d: Draws, s: Scalar, v_x: Scalar) -> None:
     p[P.car.mu] = select(mirrored, right, d.friction)
     p[P.car.mu_r] = select(mirrored, d.friction, right)
     p[P.wind.force] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
-    p[P.wind.arm] = d.wind_arm
-    p[P.wind.start] = round_to_ticks(d.wind_start)
+    p[P.wind.arm], p[P.wind.start] = d.wind_arm, round_to_ticks(d.wind_start)
     p[P.wind.end] = p[P.wind.start] + round_to_ticks(d.wind_length)
     p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
     bank_gravity = GRAVITY * sincos(d.bank)[0]
@@ -76,8 +75,7 @@ def _write_errors(p: Vector, z: Vector, d: Draws) -> None:
     write(p, (d.friction_wave, 2.0 * PI / d.friction_length, 3.0 * turn), P.friction_wave)
     p[P.road.wave], rate = GRAVITY * sincos(d.bank_wave)[0], 2.0 * PI / d.bank_length
     # tensors compute a wave of zero amplitude too: far away its sine overflows
-    p[P.road.wave_rate] = select(d.bank_wave != 0.0, rate, 0.0)
-    p[P.road.wave_phase] = 5.0 * turn
+    p[P.road.wave_rate], p[P.road.wave_phase] = select(d.bank_wave != 0.0, rate, 0.0), 5.0 * turn
     p[P.task.torque_slew] = d.torque_rate * p[P.car.T_max] * TICK
     relaxation = p[P.car.relaxation] * d.relaxation
     p[P.car.relaxation] = select(relaxation > 0.0, maximum(relaxation, MIN_RELAXATION), 0.0)
@@ -150,8 +148,7 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     d, redraws = draw_stable(start.low, start.high, key_low, key_high, read(p, P.car), scratch)
     lead_in = p[P.task.lead_in] * TICK
     if lead_in > 0.0:  # what has a time comes later
-        scratch[DRAWS.onset] = d.onset + lead_in
-        scratch[DRAWS.wind_start] = d.wind_start + lead_in
+        scratch[DRAWS.onset], scratch[DRAWS.wind_start] = d.onset + lead_in, d.wind_start + lead_in
         changes = d.tyre_change_time > 0.0
         scratch[DRAWS.tyre_change_time] = d.tyre_change_time + select(changes, lead_in, 0.0)
         d = read(scratch, DRAWS)
@@ -173,18 +170,14 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
     _write_errors(p, z, d)
-    n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
-    road = read(p, P.road)
-    steer = compute_profile_angle(p, 0.0)
+    n, steer = draw_normals(key_low, key_high, 0, CHANNELS.initial), compute_profile_angle(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
-        driver, path = read(p, P.driver), read(p, P.path)
+        driver, path, road = read(p, P.driver), read(p, P.path), read(p, P.road)
         steer = compute_target_angle(motion, path, road, target, driver, p[P.task.stop])
     elif switches[FLAGS.steering] == WANDER:
         steer = d.amplitude * draw_normals(key_low, key_high, 0, CHANNELS.steering)[0]
-    z[Z.drive.delta_f] = steer
-    z[Z.driver] = steer
-    z[Z.drive.F_d] = p[P.disturbance.force] * n[0]
-    z[Z.drive.N_d] = p[P.disturbance.moment] * n[1]
+    z[Z.drive.delta_f] = z[Z.driver] = steer
+    z[Z.drive.F_d], z[Z.drive.N_d] = p[P.disturbance.force] * n[0], p[P.disturbance.moment] * n[1]
     z[Z.clock.key_low], z[Z.clock.key_high] = from_word(key_low), from_word(key_high)
     z[Z.clock.redraws], z[Z.clock.next_due] = redraws, NEVER_DUE
     for sensor in range(len(Z.slow)):
@@ -193,14 +186,13 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
         phase = select(link.phase < 0.0, floor(share * link.period), link.phase)
         early = floor((phase + link.stamp) / maximum(link.period, 1.0))  # periods before tick 0
         phase = phase - minimum(early, 0.0) * link.period  # no stamp lies there
-        z[column.next_capture] = select(link.period > 0.0, phase, NEVER)
-        z[column.captured] = NEVER
+        z[column.next_capture], z[column.captured] = select(link.period > 0.0, phase, NEVER), NEVER
         z[column.drift] = draw_first_drift(sensor, read(p, P.sky), key_low, key_high)
     fast = draw_normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = draw_normals(key_low, key_high, 0, CHANNELS.wheels)
     vibration = draw_normals(key_low, key_high, 0, CHANNELS.errors)[0]
     z[Z.errors.vibration] = p[P.errors.vibration] * vibration
     draws, variant = NormalDraws(fast, wheels, vibration), make_step_variant(p, switches)
-    row_0 = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
-    write(row.rows[0], row_0, FAST)
+    first = compute_first_row(motion, steer, make_step_params(p), draws, read(z, Z.errors), variant)
+    write(row.rows[0], first, FAST)
     finish_reset(row)

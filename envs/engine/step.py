@@ -38,8 +38,8 @@ from .tick import (
     compute_static_load,
     integrate_tick,
 )
+from .views import split_workspace
 from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
-from .workspace import split_workspace
 
 SHARES = (0, 1)
 """Places of an action's numbers: yaw moment, added steering."""
@@ -222,8 +222,7 @@ def write_final_state(
     write(z, state.errors, Z.errors)
     store_element(z, tick, Z.clock.tick)
     store_element(z, end.failure, Z.clock.failure)
-    remaining_cost = compute_failure_cost(duration, tick)
-    failure_cost = select(end.failure != RUNNING, remaining_cost, 0.0)
+    failure_cost = select(end.failure != RUNNING, compute_failure_cost(duration, tick), 0.0)
     store_element(report, end.cost + failure_cost, REPORT.cost)
     store_element(report, end.beta, REPORT.beta)
     store_element(report, end.refs[0], REPORT.beta_ref)
@@ -284,8 +283,7 @@ def reject_action(row: EpisodeArrays) -> int:
     z[Z.clock.failure] = BAD_ACTION
     report[REPORT.failure] = BAD_ACTION
     report[REPORT.cost] = compute_failure_cost(row.p[P.task.duration], z[Z.clock.tick])
-    report[REPORT.reward] = -report[REPORT.cost]
-    report[REPORT.packets] = 0.0
+    report[REPORT.reward], report[REPORT.packets] = -report[REPORT.cost], 0.0
     return 0
 
 
@@ -316,7 +314,7 @@ def step_workspace(workspace: Vector, action: Vector) -> int:
     """Step the vehicle of a workspace.
 
     Args:
-        workspace: Arrays of an episode in one vector, as `split_workspace` reads it.
+        workspace: Arrays of an episode in one vector, as in a `Workspace`.
         action: Fractions of full scale, shape (1,) or (2,).
 
     Returns:

@@ -20,12 +20,7 @@ from ..scenarios.driver import (
     compute_wind,
 )
 from ..scenarios.road import NOMINAL_PATH, NominalMotion, TrackPath, step_nominal_car
-from ..sensors.errors import (
-    ErrorState,
-    SensorErrors,
-    advance_errors,
-    apply_sensor_errors,
-)
+from ..sensors.errors import ErrorState, SensorErrors, advance_errors, apply_sensor_errors
 from ..sensors.inertial import Noise, NormalDraws, compute_fast_row, compute_specific_force
 from ..task import ReferenceParams, compute_reference, filter_reference
 from ..ticks import TICK
@@ -258,9 +253,8 @@ def _follow_nominal_path(
 ) -> tuple[StepParams, NominalMotion]:
     """Compute (parameters with the road's turning rate, nominal car at the tick's end)."""
     speed, _ = compute_speed_reference(tick, params.speed_profile)
-    turn_rate, nominal_motion = step_nominal_car(
-        state.nominal_motion, state.driver, speed, params.nominal_car
-    )
+    car, driver = params.nominal_car, state.driver
+    turn_rate, nominal_motion = step_nominal_car(state.nominal_motion, driver, speed, car)
     road, turn_part = params.road, (turn_rate,)  # `turn` is the road's field 5, `road` field 1
     road_part = (RoadParams(*(road[:5] + turn_part + road[6:])),)
     return StepParams(*(params[:1] + road_part + params[2:])), nominal_motion
@@ -287,9 +281,9 @@ def compute_inputs(
     slewing = limit_rate(drive.slewing, inputs.added, task.slew)
     limited_steer = limit_angle(slewing, driver, task.stop)
     steer = driver + limited_steer
-    profile = params.speed_profile
+    v_x, profile = state.motion.v_x, params.speed_profile
     T_l, T_r, a_x, integral = compute_motor_torques(
-        inputs.N_z, tick, state.motion.v_x, drive.integral, profile, car, task.yaw_first
+        inputs.N_z, tick, v_x, drive.integral, profile, car, task.yaw_first
     )
     curvature, errors = compute_car_curvature(state.motion, params.road), state.errors
     if variant.has_errors:
@@ -312,10 +306,8 @@ def compute_inputs(
         ou.decay * drive.N_d + ou.noise_gain * ou.moment * draws.wheels[3], slewing,
         apply_lag(limited_steer, drive.added, steering.end), T_l, T_r,
     )  # fmt: skip
-    return _PlantInputs(
-        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x), applied,
-        next_drive,
-    )  # fmt: skip
+    disturbance = DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x)
+    return _PlantInputs(steer, T_l, T_r, disturbance, applied, next_drive)
 
 
 @inline
@@ -327,19 +319,17 @@ def _compute_loads(
     drive, car, start = state.drive, state.car, state.start
     steer, T_l, T_r = inputs.steer, inputs.T_l, inputs.T_r
     if variant.lag == _NO_LAG:
-        start = compute_tyre_load(
-            TyreInputs(steer, T_l, T_r), car, variant.small_angle, variant.has_load_shift
-        )
-        middle, end = start, start
-    else:  # actuators that lag move continuously: a tick starts where the last one ended
-        if variant.lag == _ONE_LAG:  # the one without lag jumps: its `Lag` is all 0
-            angle = apply_lag(steer, drive.delta_f, steering.start)
-            start = compute_lagged_load(angle, T_l, T_r, drive, motor.start, car, variant)
-        angle = apply_lag(steer, drive.delta_f, steering.middle)
-        middle = compute_lagged_load(angle, T_l, T_r, drive, motor.middle, car, variant)
-        angle = apply_lag(steer, drive.delta_f, steering.end)
-        end = compute_lagged_load(angle, T_l, T_r, drive, motor.end, car, variant)
-    return start, middle, end
+        tyre_inputs = TyreInputs(steer, T_l, T_r)
+        load = compute_tyre_load(tyre_inputs, car, variant.small_angle, variant.has_load_shift)
+        return load, load, load
+    # actuators that lag move continuously: a tick starts where the last one ended
+    if variant.lag == _ONE_LAG:  # the one without lag jumps: its `Lag` is all 0
+        angle = apply_lag(steer, drive.delta_f, steering.start)
+        start = compute_lagged_load(angle, T_l, T_r, drive, motor.start, car, variant)
+    angle = apply_lag(steer, drive.delta_f, steering.middle)
+    middle = compute_lagged_load(angle, T_l, T_r, drive, motor.middle, car, variant)
+    angle = apply_lag(steer, drive.delta_f, steering.end)
+    return start, middle, compute_lagged_load(angle, T_l, T_r, drive, motor.end, car, variant)
 
 
 @inline
@@ -380,13 +370,10 @@ def measure_tick(
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     # squares: the references take them too, so what overflows there is lost as well
     finite = size + motion.psi + motion.Y + motion.phi
-    measured = Measurements(
-        row, refs, applied.steer, applied.moment, finite - finite != 0.0,
-        CostInputs(
-            refs[0], refs[1], applied.effort - inputs.effort_before, applied.added, applied.effort
-        ),
-    )  # fmt: skip
-    return driver, measured
+    effort_change = applied.effort - inputs.effort_before
+    cost_inputs = CostInputs(refs[0], refs[1], effort_change, applied.added, applied.effort)
+    lost = finite - finite != 0.0
+    return driver, Measurements(row, refs, applied.steer, applied.moment, lost, cost_inputs)
 
 
 @inline
@@ -425,10 +412,8 @@ def integrate_tick(
         gamma_dot = (motion.gamma - before.gamma) * (1.0 / TICK)
         a_x, a_y = accel[0] + g_x, accel[1] + g_y
         accel = (a_x - ahead * turning * turning, a_y + ahead * gamma_dot)
-    driver, measured = measure_tick(
-        params, motion, accel, plant.applied, state.refs, inputs, variant
-    )
-    return StepState(
-        motion, plant.drive, loads[2], driver, car, measured.refs, nominal_motion,
-        plant.applied.errors,
-    ), measured  # fmt: skip
+    applied, drive = plant.applied, plant.drive
+    driver, measured = measure_tick(params, motion, accel, applied, state.refs, inputs, variant)
+    refs, errors = measured.refs, applied.errors
+    end = StepState(motion, drive, loads[2], driver, car, refs, nominal_motion, errors)
+    return end, measured

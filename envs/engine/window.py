@@ -18,14 +18,7 @@ from ..numerics.packed import (
     store_element,
     write,
 )
-from ..numerics.primitives import (
-    Scalar,
-    Vector,
-    absolute,
-    to_float,
-    to_int,
-    to_word,
-)
+from ..numerics.primitives import Scalar, Vector, absolute, to_float, to_int, to_word
 from ..numerics.simd import LANES
 from ..record import Array
 from ..scenarios.road import TrackPath, compute_path_offset
@@ -173,10 +166,8 @@ def _write_ticks(row: EpisodeArrays, j: int, ticks: Scalar, variant: StepVariant
     """Write noise and steering of a tick, or of as many as lanes, into the window from j on."""
     clock, window = read(row.z, Z.clock), row.window
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
-    inertial = draw_normals(key_low, key_high, ticks, CHANNELS.inertial)
-    wheels = draw_normals(key_low, key_high, ticks, CHANNELS.wheels)
-    write(window, inertial, WINDOW.inertial, j)
-    write(window, wheels, WINDOW.wheels, j)
+    write(window, draw_normals(key_low, key_high, ticks, CHANNELS.inertial), WINDOW.inertial, j)
+    write(window, draw_normals(key_low, key_high, ticks, CHANNELS.wheels), WINDOW.wheels, j)
     if variant.has_errors:
         vibration = draw_normals(key_low, key_high, ticks, CHANNELS.errors)[0]
         store_element(window, vibration, WINDOW.vibration, j)
@@ -196,11 +187,8 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
     Returns:
         The random numbers.
     """
-    return NormalDraws(
-        read(window, WINDOW.inertial, j),
-        read(window, WINDOW.wheels, j),
-        load_element(window, WINDOW.vibration, j),
-    )
+    inertial, wheels = read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j)
+    return NormalDraws(inertial, wheels, load_element(window, WINDOW.vibration, j))
 
 
 @inline

@@ -12,20 +12,13 @@ with require_extra("mpc", "the plant on symbols needs CasADi"):
 F = TypeVar("F", bound=Callable[..., Any])
 
 SYMBOLS: dict[str, Callable[..., Any]] = {
-    "minimum": ca.fmin,
-    "maximum": ca.fmax,
-    "absolute": ca.fabs,
-    "floor": ca.floor,
-    "sqrt": ca.sqrt,
-    "select": ca.if_else,
-    "to_float": lambda a: a * 1.0,
+    "minimum": ca.fmin, "maximum": ca.fmax, "absolute": ca.fabs, "floor": ca.floor,
+    "sqrt": ca.sqrt, "select": ca.if_else, "to_float": lambda a: a * 1.0,
     "any_lane": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
     # its own functions agree with our polynomials to 1e-15 and have shorter derivatives
     "sincos": lambda x: (ca.sin(x), ca.cos(x)),
-    "atan": ca.atan,
-    "atan2": ca.atan2,
-    "compute_sine": ca.sin,
-}
+    "atan": ca.atan, "atan2": ca.atan2, "compute_sine": ca.sin,
+}  # fmt: skip
 """The primitives for CasADi's SX and MX, by the names that the equations use."""
 
 

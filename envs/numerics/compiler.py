@@ -202,13 +202,10 @@ class _Kernel(CPUDispatcher):
     """A compiled function: a dispatcher of numba whose callees are parts."""
 
     def __init__(
-        self,
-        py_func: _Function,
-        locals: _Keywords | None = None,
-        targetoptions: dict[str, object] | None = None,
-        folder: Path | None = None,
+        self, py_func: _Function, locals: _Keywords | None = None,  # where numba unpickles
+        targetoptions: dict[str, object] | None = None, folder: Path | None = None,
         apart: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(py_func, locals, targetoptions)
         self.folder, self.apart = folder, apart
         self.parts: dict[_Types, CompileResult] = {}
@@ -308,7 +305,7 @@ def make_kernel(
     """
     all_options: dict[str, object] = {"nopython": True, "boundscheck": None}
     all_options |= {"error_model": "numpy", "fastmath": False, "forceinline": False} | options
-    return _Kernel(function, targetoptions=all_options, folder=folder, apart=apart)
+    return _Kernel(function, None, all_options, folder, apart)
 
 
 def _link_library(part: CompileResult) -> _Linked:
@@ -401,17 +398,11 @@ def _load(
         True, *names, "", None, returns, None, parameters, (), mangler, args, env_name=environment
     )
     return compile_result(
-        typing_context=target.typing_context,
-        target_context=target,
-        entry_point=target.get_executable(library, descriptor, _ENVIRONMENT),
-        signature=signature(returns, *args),
-        objectmode=False,
-        lifted=(),
-        fndesc=descriptor,
-        library=library,
-        environment=_ENVIRONMENT,
+        typing_context=target.typing_context, target_context=target, fndesc=descriptor,
+        entry_point=target.get_executable(library, descriptor, _ENVIRONMENT), library=library,
+        signature=signature(returns, *args), environment=_ENVIRONMENT, objectmode=False, lifted=(),
         reload_init=[],
-    )
+    )  # fmt: skip
 
 
 def _load_library(

@@ -23,12 +23,9 @@ PI = 3.141592653589793
 def _sin_kernel(r: Scalar) -> Scalar:
     """Compute sin r for |r| <= pi/4, error below 1e-16."""
     z = r * r
-    p = 1.58969099521155010221e-10
-    p = p * z - 2.50507602534068634195e-08
-    p = p * z + 2.75573137070700676789e-06
-    p = p * z - 1.98412698298579493134e-04
-    p = p * z + 8.33333333332248946124e-03
-    p = p * z - 1.66666666666666324348e-01
+    p = 1.58969099521155010221e-10 * z - 2.50507602534068634195e-08
+    p = (p * z + 2.75573137070700676789e-06) * z - 1.98412698298579493134e-04
+    p = (p * z + 8.33333333332248946124e-03) * z - 1.66666666666666324348e-01
     return r + r * (z * p)
 
 
@@ -36,12 +33,9 @@ def _sin_kernel(r: Scalar) -> Scalar:
 def _cos_kernel(r: Scalar) -> Scalar:
     """Compute cos r for |r| <= pi/4, error below 2e-16."""
     z = r * r
-    p = -1.13596475577881948265e-11
-    p = p * z + 2.08757232129817482790e-09
-    p = p * z - 2.75573143513906633035e-07
-    p = p * z + 2.48015872894767294178e-05
-    p = p * z - 1.38888888888741095749e-03
-    p = p * z + 4.16666666666666019037e-02
+    p = -1.13596475577881948265e-11 * z + 2.08757232129817482790e-09
+    p = (p * z - 2.75573143513906633035e-07) * z + 2.48015872894767294178e-05
+    p = (p * z - 1.38888888888741095749e-03) * z + 4.16666666666666019037e-02
     return 1.0 - 0.5 * z + z * (z * p)
 
 
@@ -73,17 +67,11 @@ def _quadrant(q: Scalar, s: Scalar, c: Scalar) -> tuple[Scalar, Scalar]:
 def _atan_kernel(t: Scalar) -> Scalar:
     """arctan t for |t| < 0.1990, error below 1e-16: the series."""
     z = t * t
-    p = 1.0 / 23.0
-    p = 1.0 / 21.0 - z * p
-    p = 1.0 / 19.0 - z * p
-    p = 1.0 / 17.0 - z * p
-    p = 1.0 / 15.0 - z * p
-    p = 1.0 / 13.0 - z * p
-    p = 1.0 / 11.0 - z * p
-    p = 1.0 / 9.0 - z * p
-    p = 1.0 / 7.0 - z * p
-    p = 1.0 / 5.0 - z * p
-    p = 1.0 / 3.0 - z * p
+    p = 1.0 / 19.0 - z * (1.0 / 21.0 - z * (1.0 / 23.0))
+    p = 1.0 / 15.0 - z * (1.0 / 17.0 - z * p)
+    p = 1.0 / 11.0 - z * (1.0 / 13.0 - z * p)
+    p = 1.0 / 7.0 - z * (1.0 / 9.0 - z * p)
+    p = 1.0 / 3.0 - z * (1.0 / 5.0 - z * p)
     return t - t * (z * p)
 
 
@@ -137,12 +125,9 @@ def compute_sine(x: Scalar) -> Scalar:
     k = floor(x * (0.5 * _TWO_OVER_PI) + 0.5)
     r = (x - k * (2.0 * _PI_2_HIGH)) - k * (2.0 * _PI_2_LOW)
     z = r * r
-    p = 1.5409520412048905e-10
-    p = p * z - 2.5030196307617753e-8
-    p = p * z + 2.7556953094702609e-6
-    p = p * z - 1.9841266729487837e-4
-    p = p * z + 8.3333333210858298e-3
-    p = p * z - 1.6666666666504574e-1
+    p = 1.5409520412048905e-10 * z - 2.5030196307617753e-8
+    p = (p * z + 2.7556953094702609e-6) * z - 1.9841266729487837e-4
+    p = (p * z + 8.3333333210858298e-3) * z - 1.6666666666504574e-1
     s = r + r * (z * p)
     return s - 2.0 * s * (k - 2.0 * floor(0.5 * k))
 
@@ -209,16 +194,10 @@ def exp(x: Scalar) -> Scalar:
         The power.
     """
     z = x * (1.0 / 64.0)
-    p = 1.0 / 362880.0
-    p = p * z + 1.0 / 40320.0
-    p = p * z + 1.0 / 5040.0
-    p = p * z + 1.0 / 720.0
-    p = p * z + 1.0 / 120.0
-    p = p * z + 1.0 / 24.0
-    p = p * z + 1.0 / 6.0
-    p = p * z + 0.5
-    p = p * z + 1.0
-    p = p * z + 1.0
+    p = (1.0 / 362880.0 * z + 1.0 / 40320.0) * z + 1.0 / 5040.0
+    p = (p * z + 1.0 / 720.0) * z + 1.0 / 120.0
+    p = (p * z + 1.0 / 24.0) * z + 1.0 / 6.0
+    p = ((p * z + 0.5) * z + 1.0) * z + 1.0
     for _ in range(6):
         p = p * p
     return p
@@ -272,16 +251,10 @@ def _philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0)
     k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
     a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
     for _ in range(10):
-        p0 = _M0 * a
-        p1 = _M1 * c
-        a, b, c, d = (
-            ((p1 >> 32) & _MASK) ^ b ^ k0,
-            p1 & _MASK,
-            ((p0 >> 32) & _MASK) ^ d ^ k1,
-            p0 & _MASK,
-        )
-        k0 = (k0 + _W0) & _MASK
-        k1 = (k1 + _W1) & _MASK
+        p0, p1 = _M0 * a, _M1 * c
+        a, c = ((p1 >> 32) & _MASK) ^ b ^ k0, ((p0 >> 32) & _MASK) ^ d ^ k1
+        b, d = p1 & _MASK, p0 & _MASK
+        k0, k1 = (k0 + _W0) & _MASK, (k1 + _W1) & _MASK
     return a, b, c, d
 
 
@@ -297,13 +270,9 @@ def _log_uniform(word: int) -> Scalar:
     m, exponent = frexp(to_float(2 * word + 1))  # of 2^33
     z = (m - _SQRT_HALF) / (m + _SQRT_HALF)  # |z| < 0.1716
     q = z * z
-    p = 1.0 / 15.0
-    p = p * q + 1.0 / 13.0
-    p = p * q + 1.0 / 11.0
-    p = p * q + 1.0 / 9.0
-    p = p * q + 1.0 / 7.0
-    p = p * q + 1.0 / 5.0
-    p = p * q + 1.0 / 3.0
+    p = (1.0 / 15.0 * q + 1.0 / 13.0) * q + 1.0 / 11.0
+    p = (p * q + 1.0 / 9.0) * q + 1.0 / 7.0
+    p = (p * q + 1.0 / 5.0) * q + 1.0 / 3.0
     return 2.0 * (z + z * (q * p)) - (33.0 - exponent + 0.5) * _LN2
 
 

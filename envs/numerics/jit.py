@@ -132,11 +132,9 @@ def as_python(
 
 
 def _rebuild(
-    function: Any,
-    table: dict[str, Callable[..., Any]],
-    finish: Callable[[FunctionType], Any],
+    function: Any, table: dict[str, Callable[..., Any]], finish: Callable[[FunctionType], Any],
     rebuilt_functions: dict[Any, Any],
-) -> Any:
+) -> Any:  # fmt: skip
     """Rebuild a function and its callees, of which some are rebuilt already."""
     source = function.py_func if is_jitted(function) else function
     if source.__name__ in table and source.__module__.startswith(_NUMERICS):

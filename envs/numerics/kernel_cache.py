@@ -104,8 +104,11 @@ def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
         return None
     with contextlib.suppress(OSError):
         os.utime(folder)
-    if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
-        _prune(folder.parent)
+    with contextlib.suppress(OSError):  # another process may prune as well
+        if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
+            versions = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+            for old in versions[:-_MAX_VERSIONS]:
+                shutil.rmtree(old, ignore_errors=True)
     return folder
 
 
@@ -139,13 +142,6 @@ def _make_folder(folder: Path, sticky: bool = False) -> None:
         if not folder.exists():
             raise
     os.close(_open_if_trusted(folder, stat.S_ISDIR, sticky=sticky))
-
-
-def _prune(base: Path) -> None:
-    with contextlib.suppress(OSError):  # another process may prune as well
-        newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-        for old in newest[_MAX_VERSIONS:]:
-            shutil.rmtree(old, ignore_errors=True)
 
 
 def read_trusted(path: Path) -> bytes | None:

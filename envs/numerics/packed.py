@@ -7,6 +7,7 @@ more, the last, and the same functions read and write lanes there. Lanes that ar
 C-contiguous matrix of single numbers go along its row.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -106,47 +107,21 @@ def store_element(array: Vector, value: Scalar, *index: int) -> None:
     array[index] = value
 
 
-def as_matrix(array: Vector, first: int, rows: int, columns: int) -> Matrix:
-    """View numbers of a vector as a matrix.
+def make_view(array: Vector, first: int, kind: type[np.generic], *shape: int) -> Matrix:
+    """View the bytes of a vector's numbers as an array of another type or shape.
 
     Args:
         array: Vector that holds the numbers.
         first: Index of the first number.
-        rows: Number of rows.
-        columns: Number of columns.
+        kind: Type of the view's numbers; of np.float32 two lie in one number.
+        shape: Shape of the view.
 
     Returns:
-        The view, shape (rows, columns).
+        The view.
     """
-    return array[first : first + rows * columns].reshape(rows, columns)
-
-
-def as_int64(array: Vector, first: int, count: int) -> Vector:
-    """View the bytes of a vector's numbers as integers.
-
-    Args:
-        array: Vector that holds the numbers.
-        first: Index of the first number.
-        count: Number of integers.
-
-    Returns:
-        The view, int64 of shape (count,).
-    """
-    return array[first : first + count].view(np.int64)
-
-
-def as_float32(array: Vector, first: int, count: int) -> Vector:
-    """View the bytes of a vector's numbers as float32, two to a number.
-
-    Args:
-        array: Vector that holds the numbers.
-        first: Index of the first number.
-        count: Number of float32.
-
-    Returns:
-        The view, float32 of shape (count,).
-    """
-    return array[first : first - (-count // 2)].view(np.float32)[:count]
+    count = math.prod(shape)
+    end = first - (-count * np.dtype(kind).itemsize // array.itemsize)
+    return array[first:end].view(kind)[:count].reshape(shape)
 
 
 def lane_width(array: Matrix) -> int:
@@ -193,12 +168,9 @@ def iota(first: int) -> Scalar:
 
 
 def locate_element(
-    context: BaseContext,
-    builder: ir.IRBuilder,
-    kind: types.Array,
-    array: ir.Value,
+    context: BaseContext, builder: ir.IRBuilder, kind: types.Array, array: ir.Value,
     index: Sequence[ir.Value],
-) -> ir.Value:
+) -> ir.Value:  # fmt: skip
     """Compute the pointer to the number, or the lanes, at an index of an array.
 
     Args:
@@ -215,12 +187,9 @@ def locate_element(
     shape = cgutils.unpack_tuple(builder, made.shape)
     strides = cgutils.unpack_tuple(builder, made.strides)
     zeros = [context.get_constant(types.intp, 0)] * (kind.ndim - len(index))
-    pointer = cgutils.get_item_pointer2(
-        context, builder, made.data, shape, strides, kind.layout, [*index, *zeros]
-    )
-    if zeros:
-        pointer = builder.bitcast(pointer, FLOATS.value.as_pointer())
-    return pointer
+    axes = shape, strides, kind.layout, [*index, *zeros]
+    pointer = cgutils.get_item_pointer2(context, builder, made.data, *axes)
+    return builder.bitcast(pointer, FLOATS.value.as_pointer()) if zeros else pointer
 
 
 def _read(context, builder, kind, array, index):
@@ -276,9 +245,8 @@ def _lower_load_element(context, builder, sig, args):
 
 
 def _infer_store_element(array, value, *index):
-    if _find_kind(array, len(index)) is None:
-        return None
-    return signature(types.none, array, value, *[types.intp] * len(index))
+    kind = _find_kind(array, len(index))
+    return kind and signature(types.none, array, value, *[types.intp] * len(index))
 
 
 def _lower_store_element(context, builder, sig, args):
@@ -301,26 +269,20 @@ def _lower_write(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _register_view(primitive: Any, dtype: Any) -> None:
-    """Teach the compiler a view of a vector's numbers as numbers of a type and a shape."""
-    kind = types.Array(dtype, primitive.__code__.co_argcount - 2, "C")
+def _infer_make_view(vector, first, kind, *shape):
+    if vector != types.Array(types.float64, 1, "C"):
+        return None
+    made = types.Array(kind.dtype, len(shape), "C")
+    return signature(made, vector, types.intp, kind, *[types.intp] * len(shape))
 
-    def infer(vector, *sizes):
-        vector_type = types.Array(types.float64, 1, "C")
-        if vector != vector_type:
-            return None
-        return signature(kind, vector_type, *[types.intp] * len(sizes))
 
-    def lower(context, builder, sig, args):
-        size = context.get_constant(types.intp, dtype.bitwidth // 8)
-        made = make_array(kind)(context, builder)
-        first = locate_element(context, builder, sig.args[0], args[0], [args[1]])
-        pointer = builder.bitcast(first, made.data.type)
-        strides = [builder.mul(size, size_of_axis) for size_of_axis in args[3:]] + [size]
-        populate_array(made, pointer, args[2:], strides, size, None)
-        return made._getvalue()
-
-    register_primitive(primitive, infer, lower)
+def _lower_make_view(context, builder, sig, args):
+    made, shape = make_array(sig.return_type)(context, builder), args[3:]
+    size = context.get_constant(types.intp, sig.return_type.dtype.bitwidth // 8)
+    first = locate_element(context, builder, sig.args[0], args[0], [args[1]])
+    strides = [builder.mul(size, size_of_axis) for size_of_axis in shape[1:]] + [size]
+    populate_array(made, builder.bitcast(first, made.data.type), shape, strides, size, None)
+    return made._getvalue()
 
 
 def _lower_lane_width(context, builder, sig, args):
@@ -333,10 +295,10 @@ def _infer_load_lanes(array, where, first):
 
 
 def _lower_load_lanes(context, builder, sig, args):
-    places = [[i, args[2]] for i in cgutils.unpack_tuple(builder, args[1])]
-    firsts = [locate_element(context, builder, sig.args[0], args[0], index) for index in places]
-    lanes = [builder.bitcast(first, FLOATS.value.as_pointer()) for first in firsts]
-    entries = [builder.load(pointer, align=8) for pointer in lanes]
+    entries = []
+    for i in cgutils.unpack_tuple(builder, args[1]):
+        first = locate_element(context, builder, sig.args[0], args[0], [i, args[2]])
+        entries.append(builder.load(builder.bitcast(first, FLOATS.value.as_pointer()), align=8))
     return context.make_tuple(builder, sig.return_type, entries)
 
 
@@ -345,19 +307,15 @@ def _lower_count_lanes(context, builder, sig, args):
 
 
 def _lower_iota(context, builder, sig, args):
-    return builder.add(
-        context.cast(builder, args[0], types.int64, INTS),
-        ir.Constant(INTS.value, list(range(LANES))),
-    )
+    first = context.cast(builder, args[0], types.int64, INTS)
+    return builder.add(first, ir.Constant(INTS.value, list(range(LANES))))
 
 
 register_primitive(read, _infer_read, _lower_read)
 register_primitive(write, _infer_write, _lower_write)
 register_primitive(load_element, _infer_load_element, _lower_load_element)
 register_primitive(store_element, _infer_store_element, _lower_store_element)
-_register_view(as_matrix, types.float64)
-_register_view(as_int64, types.int64)
-_register_view(as_float32, types.float32)
+register_primitive(make_view, _infer_make_view, _lower_make_view)
 register_primitive(lane_width, lambda array: signature(types.intp, array), _lower_lane_width)
 register_primitive(load_lanes, _infer_load_lanes, _lower_load_lanes)
 register_primitive(count_lanes, lambda: signature(types.intp), _lower_count_lanes)

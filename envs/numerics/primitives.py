@@ -168,15 +168,10 @@ def any_lane(condition: Scalar) -> Scalar:
 
 
 ARRAYS: dict[str, Callable[..., Scalar]] = {
-    "minimum": np.minimum,
-    "maximum": np.maximum,
-    "absolute": np.absolute,
-    "floor": np.floor,
-    "sqrt": np.sqrt,
-    "select": np.where,
+    "minimum": np.minimum, "maximum": np.maximum, "absolute": np.absolute, "floor": np.floor,
+    "sqrt": np.sqrt, "select": np.where, "any_lane": np.any,
     "to_float": lambda a: np.multiply(a, 1.0),
     "frexp": lambda a: np.multiply(np.frexp(a), 1.0),
     "to_int": lambda a: np.asarray(a).astype(np.int64),
-    "any_lane": np.any,
-}
+}  # fmt: skip
 """The primitives for NumPy arrays, by the names the equations use."""

@@ -36,8 +36,7 @@ class _LaneType(types.Type):
     def __init__(
         self, kind: str, one: ir.Type, single: types.Type, *taken: type, count: int = LANES
     ) -> None:
-        self.value = ir.VectorType(one, count)
-        self.single, self._taken = single, taken
+        self.value, self.single, self._taken = ir.VectorType(one, count), single, taken
         super().__init__(name=f"lanes({kind})")
 
     def can_convert_from(self, typingctx, other):
@@ -91,11 +90,9 @@ def _find_common_type(*args: types.Type) -> types.Type | None:
 
 
 def register_primitive(
-    primitive: Callable[..., object],
-    infer: Callable[..., Signature | None],
-    lower: Callable[..., ir.Value],
-    prefer_literal: bool = False,
-) -> None:
+    primitive: Callable[..., object], infer: Callable[..., Signature | None],
+    lower: Callable[..., ir.Value], prefer_literal: bool = False,
+) -> None:  # fmt: skip
     """Teach the compiler a primitive.
 
     Args:
@@ -127,9 +124,8 @@ def _register_operator(
     class _OperatorTyping(AbstractTemplate):
         def generic(self, args, kws):
             kind = _find_common_type(*args)
-            if len(args) != 2 or kind not in codes:
-                return None
-            return signature(result or kind, kind, kind)
+            is_known = len(args) == 2 and kind in codes
+            return signature(result or kind, kind, kind) if is_known else None
 
     for kind, code in codes.items():
 
@@ -183,10 +179,8 @@ def _infer_binary(a, b):
 
 def _infer_float(a):
     kind = _find_common_type(a)
-    if kind is None:
-        return None
-    kind = FLOATS if isinstance(kind, _LaneType) else types.float64
-    return signature(kind, kind)
+    floats = FLOATS if isinstance(kind, _LaneType) else types.float64
+    return kind and signature(floats, floats)
 
 
 def _infer_frexp(a):
@@ -272,17 +266,12 @@ register_primitive(primitives.maximum, _infer_binary, _make_selection(">"))
 register_primitive(primitives.absolute, _infer_float, _make_intrinsic("fabs"))
 register_primitive(primitives.floor, _infer_float, _make_intrinsic("floor"))
 register_primitive(primitives.sqrt, _infer_float, _make_intrinsic("sqrt"))
-register_primitive(
-    primitives.select, _infer_select, lambda context, builder, sig, args: builder.select(*args)
-)
+register_primitive(primitives.select, _infer_select, lambda _, b, __, args: b.select(*args))
 register_primitive(primitives.frexp, _infer_frexp, _lower_frexp)
-for _primitive, _lanes in (
-    (primitives.to_float, FLOATS),
-    (primitives.to_int, INTS),
-    (primitives.to_word, INTS),
-    (primitives.from_word, FLOATS),
-):
-    _register_conversion(_primitive, _lanes)
+for _primitive in (primitives.to_float, primitives.from_word):
+    _register_conversion(_primitive, FLOATS)
+for _primitive in (primitives.to_int, primitives.to_word):
+    _register_conversion(_primitive, INTS)
 register_primitive(
     primitives.any_lane,
     lambda a: signature(types.boolean, _BOOLS if a is _BOOLS else types.boolean),

@@ -205,8 +205,9 @@ def _lower_store8(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _infer_mirror(array, *index):
-    return _find_kind(array, 2) and signature(types.none, array, *[types.intp] * len(index))
+def _infer_in_place(array, *index):
+    kind = _find_kind(array, len(index))
+    return kind and signature(types.none, array, *[types.intp] * len(index))
 
 
 def _lower_mirror(context, builder, sig, args):
@@ -237,12 +238,6 @@ def _lower_mirror(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _infer_prefetch(array, *index):
-    if _find_kind(array, len(index)) is not FLOATS8:
-        return None
-    return signature(types.none, array, *[types.intp] * len(index))
-
-
 def _lower_prefetch(context, builder, sig, args):
     byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
     kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
@@ -254,9 +249,9 @@ def _lower_prefetch(context, builder, sig, args):
 
 
 def _infer_scratch(template, *shape):
-    if not all(isinstance(size, types.IntegerLiteral) for size in shape):
-        return None
-    return signature(types.Array(types.float64, template.ndim, "C"), template, *shape)
+    is_constant = all(isinstance(size, types.IntegerLiteral) for size in shape)
+    made = types.Array(types.float64, template.ndim, "C")
+    return signature(made, template, *shape) if is_constant else None
 
 
 def _lower_scratch(context, builder, sig, args):
@@ -265,11 +260,10 @@ def _lower_scratch(context, builder, sig, args):
     with builder.goto_entry_block():  # numba's own way fills it with zeros first
         pointer = builder.alloca(ir.ArrayType(ir.DoubleType(), math.prod(shape)))
     pointer.align = 64
-    made = make_array(sig.return_type)(context, builder)
-    strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    made, axes = make_array(sig.return_type)(context, builder), len(shape)
+    strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(axes)]
     size = [context.get_constant(types.intp, item) for item in (*shape, *strides, 8)]
     data = builder.bitcast(pointer, ir.DoubleType().as_pointer())
-    axes = len(shape)
     populate_array(made, data, size[:axes], size[axes:-1], size[-1], None)
     return made._getvalue()
 
@@ -279,6 +273,6 @@ register_primitive(load8, _infer_load8, _lower_load8)
 register_primitive(load8_symmetric, _infer_load8, _lower_load8_symmetric)
 register_primitive(count_upper_rows, _infer_count_upper_rows, _lower_count_upper_rows)
 register_primitive(store8, _infer_store8, _lower_store8)
-register_primitive(mirror, _infer_mirror, _lower_mirror)
-register_primitive(prefetch, _infer_prefetch, _lower_prefetch)
+register_primitive(mirror, _infer_in_place, _lower_mirror)
+register_primitive(prefetch, _infer_in_place, _lower_prefetch)
 register_primitive(allocate_scratch, _infer_scratch, _lower_scratch, prefer_literal=True)

@@ -5,7 +5,7 @@ Both sides of a condition are computed, so nothing waits for the device.
 
 import math
 from collections.abc import Callable
-from types import FunctionType, MethodType
+from types import FunctionType, MethodType, SimpleNamespace
 from typing import Any
 
 from . import require_extra
@@ -67,7 +67,7 @@ def _make_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
     }
 
 
-def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
+def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> SimpleNamespace:
     """Rebuild functions for tensors.
 
     Args:
@@ -75,10 +75,10 @@ def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
         functions: Functions compiled by `jit`.
 
     Returns:
-        The rebuilt functions, in the same order.
+        The rebuilt functions, by name.
     """
     table = _make_primitives(dtype)
-    return [as_python(function, table) for function in functions]
+    return SimpleNamespace(**{f.__name__: as_python(f, table) for f in functions})
 
 
 def compile_method(function: Any) -> Any:

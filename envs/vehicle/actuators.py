@@ -89,8 +89,7 @@ def allocate_torques(
     """
     turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - max_torque), max_torque)
     drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - max_torque), max_torque)
-    drive_margin = max_torque - absolute(turn)
-    turn_margin = max_torque - absolute(drive)
+    drive_margin, turn_margin = max_torque - absolute(turn), max_torque - absolute(drive)
     limited_drive = minimum(maximum(drive, 0.0 - drive_margin), drive_margin)
     limited_turn = minimum(maximum(turn, 0.0 - turn_margin), turn_margin)
     drive = yaw_first * limited_drive + (1.0 - yaw_first) * drive

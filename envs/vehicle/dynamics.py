@@ -228,8 +228,7 @@ def _compute_course_rates(
     ds = v_along
     if any_lane(road.curvature != 0.0):
         ds = v_along / maximum(1.0 - kappa * motion.y, 0.1)
-    dX = v_along * cos_t - v_across * sin_t
-    dY = v_along * sin_t + v_across * cos_t
+    dX, dY = v_along * cos_t - v_across * sin_t, v_along * sin_t + v_across * cos_t
     return dX, dY, ds, v_across, ds * kappa + road.turn
 
 

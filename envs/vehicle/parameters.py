@@ -141,19 +141,17 @@ class Vehicle:
         Raises:
             ValueError: If the body would roll over, or its inertia is too small for its mass.
         """
-        lower_limit = self.roll_moment_arm * GRAVITY
-        if self.roll_stiffness <= lower_limit:
-            raise ValueError(
-                f"Vehicle.roll_stiffness: {self.roll_stiffness!r} N m/rad does not hold the body "
-                f"upright; its weight takes M_s g h_s = {lower_limit:.6g}"
-            )
-        lower_limit = self.roll_moment_arm**2 / self.mass
-        if self.roll_inertia <= lower_limit:
-            raise ValueError(
-                f"Vehicle.roll_inertia: {self.roll_inertia!r} kg m2 about the roll axis; a sprung "
-                f"mass of {self.sprung_mass!r} kg at {self.roll_arm!r} m on a car of "
-                f"{self.mass!r} kg has more than {lower_limit:.6g}"
-            )
+        low = self.roll_moment_arm * GRAVITY
+        if self.roll_stiffness <= low:
+            got = f"{self.roll_stiffness!r} N m/rad does not hold the body upright"
+            rule = f"its weight takes M_s g h_s = {low:.6g}"
+            raise ValueError(f"Vehicle.roll_stiffness: {got}; {rule}")
+        low = self.roll_moment_arm**2 / self.mass
+        if self.roll_inertia <= low:
+            got = f"{self.roll_inertia!r} kg m2 about the roll axis"
+            body = f"a sprung mass of {self.sprung_mass!r} kg at {self.roll_arm!r} m"
+            rule = f"{body} on a car of {self.mass!r} kg has more than {low:.6g}"
+            raise ValueError(f"Vehicle.roll_inertia: {got}; {rule}")
 
     @property
     def yaw_moment_limit(self) -> float:
@@ -228,10 +226,8 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     if is_document(source):
         return _read_vehicle(Path(source), strict)
     if not isinstance(source, str):
-        raise TypeError(
-            "a vehicle is a name, the path of a TOML or JSON file or a mapping of parameters, "
-            f"got {short_repr(source)}"
-        )
+        rule = "a name, the path of a TOML or JSON file or a mapping of parameters"
+        raise TypeError(f"a vehicle is {rule}, got {short_repr(source)}")
     check_choice("vehicle", source, VEHICLES)
     return VEHICLES[source]
 
@@ -268,10 +264,9 @@ def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = Fal
         suffixed = [name + suffix for name in _STIFFNESS for suffix in _CONVENTIONS]
         known = [*_FIELDS, "base", *suffixed]
         raise TypeError(describe_unknown("vehicle parameter", unknown, known))
-    missing = [name for name in LATERAL_FIELDS if name not in values]
+    missing = ", ".join(_format_key(name) for name in LATERAL_FIELDS if name not in values)
     if missing and not has_base:
-        names = ", ".join(map(_format_key, missing))
-        raise ValueError(f"missing {names} (or name a vehicle under 'base')")
+        raise ValueError(f"missing {missing} (or name a vehicle under 'base')")
     vehicle = base.replace(**values)
     if strict:
         check_plausible(vehicle)

@@ -229,8 +229,7 @@ def _split_slip_tangents(
     motion: State, load: TyreLoad, car: Car, small_angle: int
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Split the tangents of both slip angles into numerator and denominator (m/s)."""
-    front = motion.v_y + car.l_f * motion.gamma
-    rear = motion.v_y - car.l_r * motion.gamma
+    front, rear = motion.v_y + car.l_f * motion.gamma, motion.v_y - car.l_r * motion.gamma
     if small_angle:
         v = maximum(motion.v_x, MIN_SPEED)
         # delta_f - beta - l_f gamma / V_x and l_r gamma / V_x - beta of tie-vision (1)
@@ -297,8 +296,7 @@ def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar
     direct = (car.m * car.h - car.S) * (motion.v_x * motion.gamma + g_y)
     moment = car.K_x * motion.phi + car.C_x * motion.phi_dot + direct
     half_weight = 0.5 * car.m * GRAVITY
-    front = moment * (1.0 / (half_weight * car.d_f))
-    rear = moment * (1.0 / (half_weight * car.d_r))
+    front, rear = moment * (1.0 / (half_weight * car.d_f)), moment * (1.0 / (half_weight * car.d_r))
     return minimum(maximum(front, -0.9), 0.9), minimum(maximum(rear, -0.9), 0.9)
 
 

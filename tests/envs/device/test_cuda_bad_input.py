@@ -15,8 +15,11 @@ pytest.importorskip("numba_cuda")
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
 from sideslip.envs.device import cuda_env, cuda_launch  # noqa: E402
 from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
-from sideslip.envs.device.cuda_kernel import make_constants, make_specification  # noqa: E402
-from sideslip.envs.device.cuda_text import SIMULATED  # noqa: E402
+from sideslip.envs.device.cuda_kernel import (  # noqa: E402
+    SIMULATED,
+    make_constants,
+    make_specification,
+)
 
 pytestmark = pytest.mark.skipif(SIMULATED, reason="of real devices")
 
@@ -78,7 +81,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     stream = SimpleNamespace(cuda_stream=77)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    monkeypatch.setattr(cuda_launch, "_make_context_current", lambda device: None)
+    monkeypatch.setattr(torch, "empty", lambda *size, device: None)
     return fake
 
 

@@ -14,7 +14,7 @@ pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
 from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
-from sideslip.envs.device.cuda_text import SIMULATED  # noqa: E402
+from sideslip.envs.device.cuda_kernel import SIMULATED  # noqa: E402
 
 from ..helpers import bits  # noqa: E402
 

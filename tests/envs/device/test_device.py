@@ -40,8 +40,9 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
     rng = np.random.default_rng(3)
     keys, ticks = rng.integers(0, 2**32, (2, 500)), rng.integers(0, 10**7, 500)
     told = [torch.as_tensor(each, device=device) for each in (*keys, ticks)]
-    exact, normals = to_torch(torch.float64, noise._philox, noise.draw_normals)
-    (rough,) = to_torch(torch.float32, noise.draw_normals)
+    double = to_torch(torch.float64, noise._philox, noise.draw_normals)
+    exact, normals = double._philox, double.draw_normals
+    rough = to_torch(torch.float32, noise.draw_normals).draw_normals
     words = torch.stack(exact(*told, 5)).cpu().numpy()
     found = torch.stack(normals(*told, 5)).cpu().numpy()
     single = torch.stack(rough(*told, 5)).cpu().numpy()
@@ -55,7 +56,7 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
 @pytest.mark.plain
 def test_the_largest_word_has_a_normal_number_in_float32() -> None:
     """Its logarithm is rounded to above zero there."""
-    (pair,) = to_torch(torch.float32, noise._draw_normal_pair)
+    pair = to_torch(torch.float32, noise._draw_normal_pair)._draw_normal_pair
     words = torch.full((4,), 2**32 - 1), torch.arange(4) << 30
     assert torch.isfinite(torch.stack(pair(*words))).all()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.engine.workspace import _make_workspace, split_workspace
+from sideslip.envs.engine.views import _make_workspace, split_workspace
 from sideslip.envs.numerics.jit import as_python
 
 from ..helpers import bits
