@@ -13,26 +13,17 @@ from ...estimators.make import make_estimator
 from ...estimators.wires import NOISES, SignalCalibration, apply_wires
 from ..harness.results import ResultTable, Suite
 from ..harness.verdict import format_verdict
+from . import quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fit, make_windows
 from .emulate import (
     BLOCKS,
     COURSE,
     SPEED,
+    LoggedMotion,
     collect_fixes,
-    compute_ground_speed,
-    compute_heading,
     compute_remainder,
     find_latency,
-    find_minimum,
-    find_moving,
     jackknife,
-)
-from .quality import (
-    MIN_CORRELATION,
-    MIN_TURNING,
-    estimate_steering_gain,
-    find_saturated,
-    find_swapped,
 )
 from .suite import GYRO_ONLY
 
@@ -59,7 +50,6 @@ _NOTE = (
     "and acceleration are applied only where they lower the error on stretches that the fit has "
     "not seen: the lag of tyres looks like one."
 )
-
 
 _NO_WIRES = SignalCalibration()
 
@@ -115,7 +105,7 @@ def identify(
     """
     if tyres not in (None, *TYRES):
         raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")
-    if what := find_swapped(logs):
+    if what := quality.find_swapped(logs):
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
     stated = wires or SignalCalibration()
@@ -123,8 +113,8 @@ def identify(
     if "gps" in stated.at:
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
     result = IdentificationResult(car, stated)
-    w = make_windows(logs, [find_saturated(log) for log in logs])
-    gain, related = estimate_steering_gain(logs, car)
+    w = make_windows(logs, [quality.find_saturated(log) for log in logs])
+    gain, related = quality.estimate_steering_gain(logs, car)
     if reason := _find_reason(w, related):
         result.reason = reason
         result.findings = [
@@ -151,9 +141,9 @@ def _find_reason(w: Windows, related: float) -> str:
     if len(w.starts) < _MIN_WINDOWS:
         return f"{len(w.starts)} of {_MIN_WINDOWS} windows of 5 s are fast enough and whole"
     turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
-    if np.std(turns) < MIN_TURNING:
+    if np.std(turns) < quality.MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
-    if abs(related) < MIN_CORRELATION:
+    if abs(related) < quality.MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
     return ""
 
@@ -308,7 +298,7 @@ def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     errors = [np.zeros(0)]
     for log, slip in zip(logs, slips, strict=True):
         if "beta" in log.truth:
-            errors.append((slip - log.truth["beta"])[find_moving(log)])
+            errors.append((slip - log.truth["beta"])[LoggedMotion(log).is_moving])
     combined = np.concatenate(errors)
     combined = combined[np.isfinite(combined)]
     return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
@@ -350,13 +340,12 @@ def _make_sensor_findings(
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
     courses, speeds = list[Array](), list[Array]()
     for log, slip in pairs:
-        courses += collect_fixes(log, COURSE, compute_heading(log), slip, times)
-        speed, none = compute_ground_speed(log), 0.0 * log.time
-        speeds += collect_fixes(log, SPEED, speed, none, times)
+        courses += collect_fixes(log, COURSE, LoggedMotion(log).heading, slip, times)
+        speeds += collect_fixes(log, SPEED, LoggedMotion(log).speed, 0.0 * log.time, times)
     if not courses:
         return findings, noise, {}
     late, half = find_latency(courses, times)
-    with_slip = find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
+    with_slip, _ = find_latency(courses, times, 1.0)  # had the slip its size
     half = math.hypot(half, late - with_slip)
     is_determined = half < _LATE_WITHIN
     pays = is_determined and late > half
@@ -406,23 +395,10 @@ def make_suite(result: IdentificationResult, name: str) -> Suite:
         f"Not told by this log: {', '.join(missing) or 'nothing'}.",
         "Not covered: the mass, which scales all; drives beside the part that was used.",
     )
-    suite.tables = [make_findings_table(result.findings, _NOTE)]
-    return suite
-
-
-def make_findings_table(findings: Sequence[Finding], note: str) -> ResultTable:
-    """Make the table of findings.
-
-    Args:
-        findings: What a log shows.
-        note: Note below the table.
-
-    Returns:
-        The table.
-    """
     header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, findings))
-    return ResultTable("What the log shows", header, cells, note, keyed=False)
+    cells = list(map(_format_cells, result.findings))
+    suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
+    return suite
 
 
 def _format_cells(row: Finding) -> list[str]:

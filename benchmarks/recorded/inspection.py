@@ -22,7 +22,7 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
 from .checks import InspectedDrive, check_drive
-from .emulate import find_moving
+from .emulate import LoggedMotion
 from .honesty import LOST, describe_innovations
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
 
@@ -110,10 +110,7 @@ def inspect_file(
 
 
 def read_drive(
-    source: "LogSource",
-    names: dict[str, str],
-    car: Vehicle,
-    wires: SignalCalibration | None = None,
+    source: "LogSource", names: dict[str, str], car: Vehicle, wires: SignalCalibration | None = None
 ) -> tuple[dict[str, Array], InspectedDrive | None, list[str], list[LogFinding]]:
     """Read a drive as it stands and as estimators get it; a file that is refused is a finding.
 
@@ -150,7 +147,7 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
     estimates = filter_.run(log)
     place = estimates.names.index("beta")
     deviation = estimates.std[:, place]
-    moving = find_moving(log) & (log.time >= log.time[0] + SETTLED)
+    moving = LoggedMotion(log).is_moving & (log.time >= log.time[0] + SETTLED)
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
     has_nis = np.isfinite(estimates.nis).any()
     learnt = {

@@ -1,18 +1,20 @@
 """A file with a recorded drive, replayed or identified: its parts, signals' calibration, car."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ...envs.record import FAST, Log
 from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
-from ...envs.vehicle.parameters import VehicleSource, make_vehicle
+from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED
 from ..harness.results import Suite
 from .identify import IdentificationResult, identify, make_suite
-from .quality import TRUTH, make_remarks, make_warnings
+from .quality import TRUTH, estimate_resolution, find_contradictions
 from .suite import corners, replay
 from .validate import make_validation_table
 
@@ -21,11 +23,16 @@ _FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
 TRUTH_WARNING = "The truth of this log is in doubt, and with it all errors: see the warnings."
 
 
-def _split_urgent(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split a reader's remarks into warnings, without their mark, and all others."""
-    urgent = [text for text in remarks if text.startswith(WARNING_PREFIX)]
-    others = [text for text in remarks if not text.startswith(WARNING_PREFIX)]
-    return [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in urgent], others
+def _sort_remarks(
+    remarks: Sequence[str], logs: Sequence[Log], car: Vehicle
+) -> tuple[list[str], list[str]]:
+    """Sort a reader's remarks into warnings and all others, with those on the drives themselves."""
+    marked = [text for text in remarks if text.startswith(WARNING_PREFIX)]
+    urgent = [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in marked]
+    others = [text for text in remarks if text not in marked]
+    step = math.degrees(max(estimate_resolution(log.record.fast[:, FAST.gyro]) for log in logs))
+    others += [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
+    return urgent + [finding.text for finding in find_contradictions(logs, car)], others
 
 
 def identify_file(
@@ -54,10 +61,10 @@ def identify_file(
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = make_vehicle(vehicle)
     result = identify(logs, car, wires, tyres)
-    urgent, remarks = _split_urgent(remarks)
-    result.remarks = [*remarks, *make_remarks(logs), *result.remarks]
+    warnings, remarks = _sort_remarks(remarks, logs, car)
+    result.remarks = remarks + result.remarks
     suite = make_suite(result, logs[0].name)
-    suite.warnings = urgent + make_warnings(logs, car)
+    suite.warnings = warnings
     if validate:
         suite.tables.append(make_validation_table(logs, car, wires, tyres))
     return result, suite
@@ -117,7 +124,6 @@ def replay_file(
         )
     else:
         car = design = make_vehicle(vehicle)
-    remarks += make_remarks(logs)
     settings = {"noise": wires.noise} | settings
     settings["emulated"] = not any(part.slow for part in logs)
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
@@ -129,9 +135,8 @@ def replay_file(
         suite.tables += other.tables
         suite.figures += other.figures
     suite.tables += tables
-    urgent, remarks = _split_urgent(remarks)
+    suite.warnings, remarks = _sort_remarks(remarks, logs, design)
     suite.text = "\n\n".join([suite.text, *remarks])
-    suite.warnings = urgent + make_warnings(logs, design)
     if unknown:
         suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
     if any(text.startswith(TRUTH) for text in suite.warnings):

@@ -20,7 +20,7 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
-from .emulate import Emulation, compute_path, find_backward
+from .emulate import Emulation, LoggedMotion
 from .honesty import (
     HONESTY,
     SHARES,
@@ -51,36 +51,19 @@ _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(Emulation):
-    """How a drive is replayed, on top of `Emulation`; its course noise is what estimators assume.
+    """How a drive is replayed; estimators assume the course noise of its `Emulation`."""
 
-    Attributes:
-        estimators: Names in `ESTIMATORS`, None for all. The gyro-only one always runs along.
-        q_beta: Process noise of sideslip (rad2/s).
-        q_gamma: Process noise of the yaw rate ((rad/s)2/s).
-        q_psi: Process noise of the heading (rad2/s).
-        seeds: Number of noises of the emulated course.
-        seed: The first of their seeds.
-        stiffness_factor: Factor of both tyre stiffnesses of the estimators.
-        figures: Whether to draw.
-        emulated: Whether a log with truth and no slow sensor gets a course.
-        options: More options of estimators by name.
-        noise: Standard deviations that estimators assume by option.
-
-    Raises:
-        ValueError: A value out of range, or an unknown estimator.
-    """
-
-    estimators: Sequence[str] | None = None
-    q_beta: float = 1e-3
-    q_gamma: float = 0.1
-    q_psi: float = 0.0
-    seeds: int = 5
-    seed: int = 0
-    stiffness_factor: float = 1.0
+    estimators: Sequence[str] | None = None  # in `ESTIMATORS`, None: all; gyro-only always runs
+    q_beta: float = 1e-3  # process noise of sideslip (rad2/s)
+    q_gamma: float = 0.1  # process noise of the yaw rate ((rad/s)2/s)
+    q_psi: float = 0.0  # process noise of the heading (rad2/s)
+    seeds: int = 5  # number of noises of the emulated course
+    seed: int = 0  # the first of their seeds
+    stiffness_factor: float = 1.0  # of both tyre stiffnesses of the estimators
     figures: bool = True
-    emulated: bool = True
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    noise: Mapping[str, float] = field(default_factory=dict)
+    emulated: bool = True  # whether a log with truth and no slow sensor gets a course
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by estimator
+    noise: Mapping[str, float] = field(default_factory=dict)  # deviations assumed, by option
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,8 +76,7 @@ class Settings(Emulation):
         if self.seeds < 1 or self.seed < 0:
             raise ValueError(f"expected seeds >= 1 and seed >= 0, got {self.seeds}, {self.seed}")
         for name in ("q_beta", "q_gamma", "q_psi"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
+            if not 0.0 <= (value := getattr(self, name)) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
 
 
@@ -145,7 +127,7 @@ def _make_drives(log: Log, settings: Settings) -> list[Log]:
 def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
     """Run every wanted estimator that the drives' slow sensors serve over every drive."""
     log, result = drives[0], ReplayResult()
-    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log)
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~LoggedMotion(log).is_backward
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
         raise ValueError(
@@ -208,14 +190,14 @@ def _make_estimator(
         options |= {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
         options |= {} if slow is None else {"q_psi": settings.q_psi}
     if slow == "gps":
-        options["course_noise"] = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
-        options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
+        emulated = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
+        options["course_noise"] = settings.noise.get("course_noise", emulated)
     if "gyro_noise" in settings.noise and name != _OWN_NOISE:
         options["gyro_noise"] = max(settings.noise["gyro_noise"], _MIN_GYRO_NOISE)
     options |= settings.options.get(name, {})
-    facts = {"vehicle": vehicle, "sensors": sensors}
-    facts |= {"dt": log.record.dt, "present": log.record.present}
-    return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
+    facts = {"sensors": sensors, "dt": log.record.dt, "present": log.record.present}
+    # quietly: the result names what is unseen
+    return call_quietly(make_estimator, name, vehicle=vehicle, **facts, **options)
 
 
 _CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
@@ -302,7 +284,7 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
         Suite of one table and the rows of every corner, without figures.
 
     Raises:
-        ValueError: For a log without truth, and for all that `replay` refuses.
+        ValueError: The log has no truth, or `replay` refuses it.
     """
     how = Settings(**settings)
     if "beta" not in log.truth:
@@ -349,7 +331,7 @@ def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings
         text.append(f"{settings.gyro_bias_degps:g} deg/s are added to the gyro.")
     if "beta" in log.truth:
         text.append(f"Errors count from {SETTLED:g} s on.")
-        if count := int(find_backward(log).sum()):
+        if count := int(LoggedMotion(log).is_backward.sum()):
             text.append(f"{count} rows are driven backward, and not scored.")
     else:
         text.append("The log has no sideslip truth, so nothing is scored.")
@@ -409,8 +391,8 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
     near = np.abs(log.time - peak_time) <= _WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
-    paths = {name: compute_path(log, beta) for name, beta in traces.items()}
     overview = _select_traces(draw_time_series(log.time, slips, label), result)
+    paths = {name: _compute_path(log, beta) for name, beta in traces.items()}
     shown = [
         ("the sideslip angle and its estimates", overview, _HIDDEN),
         ("where the car slips most", draw_time_series(log.time[near], close, label),
@@ -435,6 +417,15 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
         shown.insert(0, ("error of each estimator", bars, text))
     return [(f"{log.name}: {title}", *more) for title, *more in shown]
+
+
+def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
+    """Compute a drive's path, x and y (m), by dead reckoning from a sideslip angle (rad)."""
+    psi, v_x = LoggedMotion(log).heading, LoggedMotion(log).speed
+    v_y = v_x * np.tan(np.nan_to_num(beta))
+    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
+    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
+    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
 
 
 def _select_traces(figure: Any, result: ReplayResult) -> Any:

@@ -18,7 +18,7 @@ from ...estimators.wires import apply_wires, read_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
-from ..recorded.emulate import find_backward, find_moving
+from ..recorded.emulate import LoggedMotion
 from ..recorded.honesty import HONESTY, compute_honesty
 from ..report.study import Request, Study
 
@@ -66,10 +66,9 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
 
 def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
     """Mark the rows that count: moving forward, settled, with a truth."""
-    truth = log.truth.get("beta", np.full(len(log.time), np.nan))
+    truth, motion = log.truth.get("beta", np.full(len(log.time), np.nan)), LoggedMotion(log)
     is_settled = log.time >= log.time[0] + SETTLED - 1e-9
-    is_scored = is_settled & find_moving(log) & ~find_backward(log) & np.isfinite(truth)
-    return np.asarray(is_scored, np.bool_)
+    return np.asarray(is_settled & motion.is_moving & ~motion.is_backward & np.isfinite(truth))
 
 
 def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading, compute_path
+from sideslip.benchmarks.recorded.emulate import Emulation, LoggedMotion
+from sideslip.benchmarks.recorded.suite import _compute_path
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from tests.envs.recordings.drives import read_log
 
@@ -48,7 +49,7 @@ def test_the_noise_has_its_seed_and_size(log: Log) -> None:
     how = Emulation(course_rate=100.0, course_noise_deg=0.5)
     one, same, other = (how.add_course(log, seed).record.packets for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
-    noise = one[:, PACKET.value] - (log.truth["beta"] + compute_heading(log))
+    noise = one[:, PACKET.value] - (log.truth["beta"] + LoggedMotion(log).heading)
     assert np.std(noise) == pytest.approx(0.5 * DEG, rel=0.1)
     assert not np.array_equal(one, other)
 
@@ -78,6 +79,6 @@ def test_a_path_of_a_circle() -> None:
     fast[:, FAST.gyro] = 0.1
     fast[:, [FAST.wheel_left, FAST.wheel_right]] = 10.0
     drive = Log(Record(fast, np.zeros((0, PACKET_WIDTH))), {})
-    x, y = compute_path(drive, np.zeros(20_001))
+    x, y = _compute_path(drive, np.zeros(20_001))
     radius = np.hypot(x, y - 100.0)
     np.testing.assert_allclose(radius, 100.0, atol=0.01)
