@@ -63,8 +63,7 @@ CLAIMS = (
             for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
                 ("double layer", PROPOSED, 0.95))
         ),
-        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name,
-          text in _SLALOMS),
+        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name, text in _SLALOMS),
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
     claim("Fig. 9 (b)", "the smallest error between courses",

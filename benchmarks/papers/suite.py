@@ -1,7 +1,4 @@
-"""Which claims of the five papers hold? Each claim, what was measured and its verdict; the figures.
-
-Each paper has one to three modules with its simulations, claims and figures, which are data.
-"""
+"""Which claims of the five papers hold? Each with what was measured, its verdict and figures."""
 
 from collections import Counter
 from types import ModuleType
@@ -139,9 +136,8 @@ def _format_number(value: float) -> str:
 def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
     """Format whether a claim's thresholds are met, or how many are not."""
     checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
-    if not checked:
-        return ""
-    return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
+    missed = f"{checked.count(False)} of {len(checked)} MISSED"
+    return missed if False in checked else "met" if checked else ""
 
 
 def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:

@@ -1,7 +1,4 @@
-"""A drive: from a scenario's fields to the time series of what the car did.
-
-Cars and controllers under test are drives too: of an environment of ours or of an outside plant.
-"""
+"""A drive: from a scenario's fields to what the car did over time; the cars and the controllers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -44,11 +41,6 @@ class Series:
     moment: Array  # N m, the yaw moment delivered
     failed: bool = False  # the episode ended by a failure
 
-    def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            if name != "failed" and values.shape != self.t.shape:
-                raise ValueError(f"{name} has shape {values.shape}, the times {self.t.shape}")
-
     @property
     def beta(self) -> Array:
         """The sideslip angle (rad)."""
@@ -58,19 +50,6 @@ class Series:
     def a_y(self) -> Array:
         """The lateral acceleration (m/s2), v_y' + v_x gamma."""
         return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
-
-    def interpolate(self, name: str, time: float) -> float:
-        """Interpolate a signal between two samples.
-
-        Args:
-            name: Name of the signal.
-            time: Time (s).
-
-        Returns:
-            Value; NaN after the end.
-        """
-        values = np.asarray(getattr(self, name))
-        return float(np.interp(time, self.t, values, right=np.nan))
 
 
 POSE = 6  # numbers of a `Motion` in a series, from v_x to Y

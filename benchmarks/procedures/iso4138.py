@@ -1,8 +1,7 @@
 """ISO 4138: steady-state circular driving, constant steering angle with slowly rising speed.
 
-The handling diagram is l gamma / v_x - delta_f over the lateral acceleration; its slope is minus
-the understeer gradient K: delta_f = l / R + K a_y. Of the linear model it is l times the stability
-factor G of dakf-stability (24).
+The handling diagram is l gamma / v_x - delta_f over a_y; its slope is minus the understeer gradient
+K: delta_f = l / R + K a_y. The linear model's is l times G of dakf-stability (24).
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,8 @@
 """ISO 7401: lateral transient response, by a step of the steering angle and by a swept sine.
 
-Step: times count from where the steering angle passes half its end value; the response time is
-that to 90 % of the steady state, the peak response time that to the peak, the overshoot the peak
-over the steady state less one.
-
-Swept sine: the frequency response is S_xy / S_xx of Welch's averaged periodograms (H1), with the
-coherence and from it the standard deviation of the estimate, |H| sqrt((1 - c) / (2 c n)) over n
-segments (Bendat and Piersol, Random Data, 9.2). It is held against the linear model's
-C (j w I - A)^-1 B + D, where a_y = V (beta' + gamma).
+A step's times count from where the steering angle passes half its end value. The sweep's frequency
+response is S_xy / S_xx of Welch's averaged periodograms, whose standard deviation follows from the
+coherence (Bendat and Piersol, Random Data, 9.2), beside the linear model's C (j w I - A)^-1 B + D.
 """
 
 import math
@@ -37,8 +32,8 @@ class StepResponse:
     """The numbers of a step of the steering angle."""
 
     gain: float  # steady state per rad of steering
-    response_time: float  # s
-    peak_time: float  # s
+    response_time: float  # s, to 90 % of the steady state
+    peak_time: float  # s, to the peak
     overshoot: float  # fraction of the steady state
 
 

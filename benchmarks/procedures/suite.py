@@ -55,7 +55,8 @@ def _measure_case(case: ProcedureCase) -> Any:
     drive = entry.drive(case.car, 0 if case.procedure in iso3888.TRACKS else None)
     if case.procedure in iso3888.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
-        return iso3888.run(drive, car, case.procedure, (car.speed * shares).tolist())
+        speeds = (car.speed * shares).tolist()
+        return [iso3888.run(drive, car, case.procedure, speed) for speed in speeds]
     return (iso4138 if case.procedure == "iso-4138" else iso7401).run(drive, car)
 
 

@@ -349,16 +349,3 @@ CHECKS: dict[str, Callable[[InspectedDrive], Iterable[LogFinding]]] = {
     "excitation": _check_excitation,
 }
 """What is asked of a log; another check is another line."""
-
-
-def check_drive(drive: InspectedDrive) -> list[LogFinding]:
-    """Run all checks on a drive.
-
-    Args:
-        drive: The drive.
-
-    Returns:
-        Findings, the worst level first.
-    """
-    findings = [finding for check in CHECKS.values() for finding in check(drive)]
-    return sorted(findings, key=lambda finding: (BLOCKER, WARNING, OK).index(finding.level))

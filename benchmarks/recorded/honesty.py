@@ -66,17 +66,3 @@ def describe_innovations(nis: Mapping[str, float]) -> str:
         return ""
     judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"
     return f"By squared innovations over their variance, which should be 1: {judged}."
-
-
-def rank_by_score(honesty: Mapping[str, Array]) -> list[tuple[str, float]]:
-    """Rank filters by their median log score.
-
-    Args:
-        honesty: Rows of `compute_honesty` by filter, shape (seeds, 3).
-
-    Returns:
-        Names, the best first, with the median share that their 95 % intervals hold.
-    """
-    medians = {name: np.median(rows, axis=0) for name, rows in honesty.items()}
-    ranked = sorted(medians.items(), key=lambda item: -float(item[1][2]))
-    return [(name, float(row[1])) for name, row in ranked]

@@ -1,8 +1,7 @@
 """Receivers' logs (NMEA): does noise that follows HDOP filter fixes better than one for all?
 
-The filter has a constant rate between fixes, disturbed by white noise of density q, on each axis:
-of position (east and north) and, where the car moves, of course. A log without a gyro bears no more
-at 0.5 to 1 Hz.
+The filter's rate is constant but for white noise of density q, on each axis of position and, where
+the car moves, of course: a log without a gyro bears no more at 0.5 to 1 Hz.
 """
 
 import itertools
@@ -80,8 +79,8 @@ def _make_track(epochs: Sequence[Epoch]) -> _Track:
 class _Signal(NamedTuple):
     """A filtered quantity of a receiver's fixes."""
 
-    name: str  # name of the signal
-    unit: str  # unit of the values
+    name: str
+    unit: str  # of the values
     axes: int  # number of axes; two are real and imaginary part
     z: npt.NDArray[np.complex128]  # values, shape (n,)
     base_size: Array  # size of the noise beside HDOP, shape (n,)

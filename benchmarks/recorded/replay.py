@@ -7,7 +7,6 @@ from typing import Any
 
 from ...envs.record import FAST, Log
 from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
-from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.wires import SignalCalibration, apply_wires
@@ -83,8 +82,7 @@ def replay_file(
     """Read a drive and replay it, each part of a log with holes by itself; with truth, corners too.
 
     Args:
-        log: File of the drive. `replay_nmea` replays a receiver's log (NMEA), for which `wires`,
-            `nominal`, `until` and `settings` are ignored.
+        log: File of the drive.
         vehicle: Vehicle as for `make_vehicle`. "identify": the log identifies the car, or its
             first `until` s do and the rest is replayed. None: the Ferrari 250 LM of the Stanford
             log, for estimates with fitted tyres x 0.7, for corners with nominal tyres.
@@ -100,10 +98,6 @@ def replay_file(
     Raises:
         ValueError: A drive has `until` without "identify", or the readers or `replay` refuse it.
     """
-    if is_nmea(log):
-        from .receiver import make_receiver_suite, replay_nmea
-
-        return make_receiver_suite(replay_nmea(log, vehicle, mapping))
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
     wires, tables, unknown = wires or SignalCalibration(), [], ""

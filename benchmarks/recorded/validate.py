@@ -34,17 +34,8 @@ _NOTE = (
 )
 
 
-def cut(log: Log, start: int, end: int) -> Log:
-    """Cut rows out of a log.
-
-    Args:
-        log: Recorded drive.
-        start: First row.
-        end: Row behind the last.
-
-    Returns:
-        The part, with the packets that were captured and arrived in it.
-    """
+def _cut(log: Log, start: int, end: int) -> Log:
+    """Cut rows out of a log, with the packets that were captured and arrived in them."""
     record, packets = log.record, log.record.packets
     first, behind = record.first + start, record.first + end
     within = (packets[:, PACKET.captured] >= first) & (packets[:, PACKET.arrived] < behind)
@@ -54,20 +45,13 @@ def cut(log: Log, start: int, end: int) -> Log:
     return dataclasses.replace(log, record=record, truth=truth)
 
 
-def split_blocks(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
-    """Split logs into alternate blocks.
-
-    Args:
-        logs: Parts of a log.
-
-    Returns:
-        Odd blocks, to identify from, and even ones, which are held out.
-    """
+def _split_blocks(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
+    """Split logs into odd blocks, to identify from, and even ones, which are held out."""
     blocks = []
     for log in logs:
         count = int(np.clip(len(log.time) * log.record.dt / _BLOCK, 1, _MOST_BLOCKS))
         ends = np.linspace(0, len(log.time), count + 1).astype(int).tolist()
-        blocks += [cut(log, *pair) for pair in itertools.pairwise(ends)]
+        blocks += [_cut(log, *pair) for pair in itertools.pairwise(ends)]
     return blocks[::2], blocks[1::2]
 
 
@@ -86,7 +70,7 @@ def make_validation_table(
         A row for each channel; none, with the reason in the note, where nothing is identified.
     """
     moved = [apply_wires(log, SignalCalibration(at=wires.at if wires else {})) for log in logs]
-    odd, even = split_blocks(moved)
+    odd, even = _split_blocks(moved)
     wires = wires and wires._replace(at={})
     result = identify(odd, car, wires, tyres)
     w = make_windows(even, [find_saturated(log) for log in even]) if even else None

@@ -50,8 +50,6 @@ def test_a_car_that_fails_is_no_estimation() -> None:
         EstimationSimulation("narrow", VISION, scenario, (PaperFilter("a", "bicycle-kf"),)).measure(
             (0,)
         )
-    with pytest.raises(ValueError, match="soft: no bound is known where the tyres change on the"):
-        EstimationSimulation("soft", VISION, "stiffness-step", (), bound=True)
 
 
 def test_options_of_a_contestant_reach_its_agent() -> None:

@@ -97,7 +97,7 @@ def test_the_highest_speed_is_that_of_a_clean_run_of_any_driver(track: str) -> N
         skilled = fields["speed"] < 11.5 or (fields["speed"] < 12.5 and fields["driver_gain"] > 0.9)
         return series(X, Y if skilled else 0.0 * Y, 0.0 * X)
 
-    runs = iso3888.run(drive, CAR, track, [11.0, 12.0, 13.0])
+    runs = [iso3888.run(drive, CAR, track, speed) for speed in (11.0, 12.0, 13.0)]
     assert [speed for speed, _ in driven] == [11.0] + 3 * [12.0] + len(iso3888.DRIVERS) * [13.0]
     assert [run.passed for run in runs] == [True, True, False]
     assert suite._find_highest_speed(runs) == 12.0
