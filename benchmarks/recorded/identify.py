@@ -11,8 +11,6 @@ from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ...estimators.wires import NOISES, SignalCalibration, apply_wires
-from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict
 from . import quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fit, make_windows
 from .emulate import (
@@ -44,12 +42,6 @@ _WIDE = "its interval is too wide"
 _LATE = (-0.2, 1.2)  # s, of the GPS
 _LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
-_NOTE = (
-    "Intervals by a jackknife over 40 stretches of the log (20 for sensors), and by priors around "
-    "what is stated, to which numbers that this log does not tell are drawn. Latencies of steering "
-    "and acceleration are applied only where they lower the error on stretches that the fit has "
-    "not seen: the lag of tyres looks like one."
-)
 
 _NO_WIRES = SignalCalibration()
 
@@ -362,50 +354,3 @@ def _make_sensor_findings(
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
             findings, noise = [*findings, row], noise | {NOISES[name]: sd}
     return findings, noise, {"gps": late} if pays else {}
-
-
-def make_suite(result: IdentificationResult, name: str) -> Suite:
-    """Make a suite of the findings: a table with a verdict.
-
-    Args:
-        result: What the log shows.
-        name: Name of the log.
-
-    Returns:
-        The suite.
-    """
-    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
-    missing = [finding.name for finding in result.findings if not finding.is_determined]
-    if result.reason:
-        answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
-        answer += "It stays as stated."
-    else:
-        rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
-            *map(math.degrees, result.rates)
-        )
-        answer = f"The stated car leaves {rates}."
-    slip = ""
-    if not any(map(math.isnan, result.slips)):
-        slip = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg.".format(
-            *map(math.degrees, result.slips)
-        )
-    suite.verdict = format_verdict(
-        answer,
-        slip,
-        f"Not told by this log: {', '.join(missing) or 'nothing'}.",
-        "Not covered: the mass, which scales all; drives beside the part that was used.",
-    )
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, result.findings))
-    suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
-    return suite
-
-
-def _format_cells(row: Finding) -> list[str]:
-    """Texts of a finding's cells."""
-    stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
-    ends = "-"
-    if math.isfinite(row.half):
-        ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
-    remark = ": ".join(filter(None, ["yes" if row.is_determined else "no", row.remark]))
-    return [row.name, stated, value, ends, row.unit or "-", remark]

@@ -15,9 +15,9 @@ from sideslip.benchmarks.recorded.identify import (
     IdentificationResult,
     _estimate_white_noise,
     identify,
-    make_suite,
 )
 from sideslip.benchmarks.recorded.quality import find_contradictions, find_saturated, find_swapped
+from sideslip.benchmarks.recorded.replay import _make_suite
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR
 from sideslip.estimators.wires import SignalCalibration
@@ -126,7 +126,7 @@ def test_what_is_not_there_is_not_told(spoil: Callable[[Log], Log], reason: str)
     found = identify([spoil(drive(1)[0])], PASSENGER_CAR)
     assert reason in found.reason and found.car == PASSENGER_CAR and found.wires.gain == 1.0
     assert not any(each.is_determined for each in found.findings[:8])
-    assert "shows nothing of the car" in make_suite(found, "x").verdict
+    assert "shows nothing of the car" in _make_suite(found, "x").verdict
 
 
 def test_a_stated_ratio_stays_where_hard_turns_hide_it() -> None:
