@@ -148,12 +148,6 @@ def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:
 
 
 STUDY = Study(
-    NAME,
-    "Which claims of the papers hold",
-    _TEXT,
-    (20, 4),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-    _add_figures,
-)
+    NAME, "Which claims of the papers hold", _TEXT, (20, 4),
+    _measure, _add_tables, _compose_verdict, _add_figures,
+)  # fmt: skip

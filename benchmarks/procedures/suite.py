@@ -248,7 +248,8 @@ _PER_G = float(np.degrees(GRAVITY))
 _CLAIM = "no control fails at 5 A, a yaw moment of 500 N m passes at 6.5 A"
 _OF = Column("passed", "median car passes up to / A", form="{:.3g} of {:.3g}; {:.0f} fail")
 _CIRCLE = {"understeer_gradient": "measured / (deg/g)", "theory": "linear model / (deg/g)"}
-_STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s", "peak_time": "peak after / s"}
+_STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s",
+         "peak_time": "peak after / s", "overshoot": "overshoot"}  # fmt: skip
 _SHARES = {"ratio": "at 1.00 s / %", "later": "at 1.75 s / %"}
 _TABLES = {
     "fmvss-126": _Table(
@@ -266,42 +267,30 @@ _TABLES = {
     ),
     "iso-7401": _Table(
         "ISO 7401, step response",
-        (
-            *_KEYS,
-            "output",
-            *(Column(f"both {key}", text, form=_PAIR) for key, text in _STEP.items()),
-            Column("both overshoot", "overshoot", form=_PAIR),
-        ),
+        (*_KEYS, "output",
+            *(Column(f"both {key}", text, form=_PAIR) for key, text in _STEP.items())),
         _make_step_records,
         "In brackets the linear model's under the same steering. No control.",
     ),
     "outside": _Table(
         "CommonRoad's models of a BMW 320i",
-        (
-            "controller",
-            Column("car", "model"),
-            Column("cost", form=".3g"),
+        ("controller", Column("car", "model"), Column("cost", form=".3g"),
             Column("ratio", f"of {RIVAL}'s / %", 100.0, ".0f"),
             Column("share", "failed / %", 100.0, ".0f"),
-            Column("peak", "peak slip / mrad", 1e3, ".0f"),
-        ),
+            Column("peak", "peak slip / mrad", 1e3, ".0f")),
         _make_outside_records,
         "{n} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are drawn by seed. "
         f"of {RIVAL}'s: geometric mean, paired. peak slip: median.",
     ),
     "check": _Table(
         f"Sine with dwell on the drift model at 80 km/h: {_CLAIM}: {{verdict}}",
-        (
-            Column("controller", "control"),
-            Column("multiple", "amplitude / A", form=".3g"),
+        (Column("controller", "control"), Column("multiple", "amplitude / A", form=".3g"),
             *(Column(key, text, 100.0, ".0f") for key, text in _SHARES.items()),
-            Column("sideways", "sideways / m", form=".2f"),
-            Column("text", " "),
-        ),
+            Column("sideways", "sideways / m", form=".2f"), Column("text", " ")),
         _make_check_records,
         "Worst of both sides.",
     ),
-}
+}  # fmt: skip
 
 
 def _add_figures(suite: Suite, done: CaseResults, _: ModuleType) -> None:
@@ -311,12 +300,6 @@ def _add_figures(suite: Suite, done: CaseResults, _: ModuleType) -> None:
 
 
 STUDY = Study(
-    NAME,
-    "Standard test procedures",
-    _TEXT,
-    (EPISODES, QUICK_EPISODES),
-    _measure,
-    _add_tables,
-    _make_verdict,
-    _add_figures,
-)
+    NAME, "Standard test procedures", _TEXT, (EPISODES, QUICK_EPISODES),
+    _measure, _add_tables, _make_verdict, _add_figures,
+)  # fmt: skip

@@ -30,16 +30,11 @@ from .honesty import (
 )
 
 GYRO_ONLY = "bicycle-kf"
+_BOTH, _GPS = ("gps", "camera"), ("gps",)
 ESTIMATORS: dict[str, tuple[str, ...]] = {
-    GYRO_ONLY: (),
-    "single-rate-kf": ("gps", "camera"),
-    "multirate-kf": ("gps", "camera"),
-    "multirate-residual-kf": ("gps", "camera"),
-    "course-kf": ("gps",),
-    "dakf": ("gps",),
-    "exact-kf": ("gps", "camera"),
-    "joint": ("gps", "camera"),
-}
+    GYRO_ONLY: (), "single-rate-kf": _BOTH, "multirate-kf": _BOTH, "multirate-residual-kf": _BOTH,
+    "course-kf": _GPS, "dakf": _GPS, "exact-kf": _BOTH, "joint": _BOTH,
+}  # fmt: skip
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
 _OWN_NOISE = "joint"  # brings its levels along and finds the accelerometer's as it drives

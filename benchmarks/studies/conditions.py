@@ -349,15 +349,11 @@ def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
 
 
 STUDY = Study(
-    "conditions",
-    "How far is a filter without options from one that is told everything?",
+    "conditions", "How far is a filter without options from one that is told everything?",
     f"RMSE of the sideslip angle from 2 s on, of {NAME} over the same filter that is told: the "
     "true car, tyres and friction to a tenth, sensors' errors, and in an ideal world the "
     "levels of noise and disturbances. No level was found in these drives. NEES: the mean square "
     "of the error over its deviation, 1 where that is honest. Intervals are 95 % over seeds.",
     (64, 4),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-    _add_figures,
-)
+    _measure, _add_tables, _compose_verdict, _add_figures,
+)  # fmt: skip

@@ -118,11 +118,8 @@ def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
 
 
 STUDY = Study(
-    "logs",
-    "How far off is one setting on recorded drives?",
+    "logs", "How far off is one setting on recorded drives?",
     "`joint` without options, its car from the preset or from vehicle.toml beside the drive.",
     (1, 1),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-)
+    _measure, _add_tables, _compose_verdict,
+)  # fmt: skip
