@@ -18,7 +18,6 @@ from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ..harness.drives import call_quietly, make_filter_arguments
-from ..harness.parallel import split_seeds
 from ..harness.stats import Estimate
 
 if TYPE_CHECKING:
@@ -89,7 +88,6 @@ class ClaimPart:
     is_pooled: bool = False  # RMS values over all seeds together are divided
 
     def _measure(self, results: Results) -> Array:
-        """Measure the number of each seed, shape (seeds,)."""
         numbers = results[self.scenario].numbers
         one = numbers[self.subject, self.quantity]
         others = [numbers[rival, self.quantity] for rival in self.rivals]
@@ -220,17 +218,6 @@ class Simulation:
     name: str
     _: KW_ONLY
     share: float = 1.0  # of the seeds; 0: once; above 1 where a ratio is close to its threshold
-
-    def split(self, seeds: int) -> list[tuple[int, ...]]:
-        """Split the share of some seeds into cases.
-
-        Args:
-            seeds: Number of seeds of the suite.
-
-        Returns:
-            Seeds of each case.
-        """
-        return split_seeds(max(1, round(self.share * seeds)), self.size)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """Measure the numbers of a case, and keep the signals of seed 0.

@@ -4,6 +4,7 @@ from collections import Counter
 from types import ModuleType
 from typing import NamedTuple
 
+from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
@@ -46,6 +47,11 @@ class LedgerResults(NamedTuple):
     examples: dict[str, Example | None]
 
 
+def _split_seeds(simulation: Simulation, seeds: int) -> list[tuple[int, ...]]:
+    """Split a simulation's share of some seeds into cases."""
+    return split_seeds(max(1, round(simulation.share * seeds)), simulation.size)
+
+
 def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
     """Measure one simulation on a few of its seeds; case: its name and the seeds."""
     name, seeds = case
@@ -53,9 +59,8 @@ def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
 
 
 def _measure(request: Request) -> LedgerResults:
-    """Run every simulation once, then measure every claim."""
     seeds = request.episodes or 0
-    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
+    cases = [(name, part) for name, x in SIMULATIONS.items() for part in _split_seeds(x, seeds)]
     results: dict[str, SimulationResult] = {}
     for (name, _), result in zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True):
         results[name] = results[name] + result if name in results else result
@@ -64,7 +69,6 @@ def _measure(request: Request) -> LedgerResults:
 
 
 def _compose_verdict(results: LedgerResults) -> str:
-    """Compose the verdict: how many claims hold, which do not."""
     ledger = results.ledger
     counted = Counter(entry.verdict for entry in ledger)
     papers = dict.fromkeys(entry.claim.paper for entry in ledger)
@@ -93,7 +97,6 @@ _RANGE_NOTE = (
 
 
 def _add_tables(suite: Suite, results: LedgerResults) -> None:
-    """Add a row of each part, and the tables of verdicts, remarks, and each paper's numbers."""
     verdicts, remarks, numbers = [], [], dict[str, list[list[str]]]()
     for entry in results.ledger:
         claim = entry.claim
@@ -118,7 +121,6 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
 
 
 def _format_part(source: str, item: MeasuredPart) -> list[str]:
-    """Format a part's number, what the paper states of it, and its threshold."""
     part, number = item.part, item.number
     median, low, high = map(_format_number, number)
     shown = median if number.low == number.high else f"{median} [{low}, {high}]"
@@ -134,7 +136,6 @@ def _format_number(value: float) -> str:
 
 
 def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
-    """Format whether a claim's thresholds are met, or how many are not."""
     checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
     missed = f"{checked.count(False)} of {len(checked)} MISSED"
     return missed if False in checked else "met" if checked else ""

@@ -86,8 +86,12 @@ def _make_filter(
 _pi = lru_cache(maxsize=256)(design_pi)
 
 
-def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Parts]:
-    """Make (A, B, C, D) of the plant and, with negative feedback, of filter and PI."""
+def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
+    # The filter's input is the moment that the PI commands: opened behind both, a filter with the
+    # right model would not show in the loop at all.
+    import control
+
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
     covariances = design.q_ratio, design.noise
     G, H, C, K = _make_filter(vehicle, design.speed, design.sensors, *covariances, dt)
@@ -97,26 +101,8 @@ def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts,
     one = np.ones((1, 1))
     A = np.block([[G @ F - direct * H @ beta_x, H], [-pi.k_i * dt * beta_x, one]])
     B = np.vstack([G @ K - direct * H @ beta_y, -pi.k_i * dt * beta_y])
-    plant = (G, H, C, np.zeros((len(C), 1)))
-    return plant, (A, B, np.hstack([direct * beta_x, -one]), direct * beta_y)
-
-
-def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
-    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
-    # The filter's input is the moment that the PI commands: opened behind both, a filter with the
-    # right model would not show in the loop at all.
-    import control
-
-    plant, asks = _split_loop(vehicle, design, dt)
-    return control.StateSpace(*asks, dt) * control.StateSpace(*plant, dt)
-
-
-def _evaluate_nyquist(parts: tuple[Parts, Parts]) -> float:
-    """Evaluate the loop at z = -1, where it is real."""
-    value = np.eye(1)
-    for A, B, C, D in parts:
-        value = (D - C @ np.linalg.solve(np.eye(len(A)) + A, B)) @ value
-    return float(value[0, 0])
+    asks = control.StateSpace(A, B, np.hstack([direct * beta_x, -one]), direct * beta_y, dt)
+    return asks * control.StateSpace(G, H, C, np.zeros((len(C), 1)), dt)
 
 
 _GRID: dict[str, tuple[float | str, ...]] = {
@@ -144,11 +130,10 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
         design, differences = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
-            # a screen, before all crossings
-            end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
+            loop = _make_estimator_loop(vehicle, design, dt)
+            end = _compute_response(loop, np.array([-1.0 + 0.0j]))[0].real  # before all crossings
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
                 break
-            loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = _compute_gain_margin(loop)
             is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
             if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper

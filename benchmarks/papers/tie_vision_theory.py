@@ -120,7 +120,6 @@ def _check_compensated(d: _RandomSystem) -> dict[str, float]:
 
 
 def _compute_residuals(seed: int) -> tuple[Numbers, None]:
-    """Compute every formula's residual on the random system of a seed."""
     d = _draw_system(seed)
     by_case = _check_ideal(d) | _check_predicted(d) | _check_compensated(d)
     return {(label, "residual"): value for label, value in by_case.items()}, None

@@ -77,11 +77,10 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
     starts = {case: run.speed * iso3888.ONSET for case, run in done.items()}
     paths = {x.agent: (run.series.X - starts[x], run.series.Y) for x, run in done.items()}
     case, run = list(done.items())[-1]
-    lanes = iso3888.make_lanes(CARS[case.car], case.procedure, run.speed)
     figure = draw_track(paths)
     places = [
         (x - starts[case], lane.offset + side * 0.5 * lane.width)
-        for lane in lanes
+        for lane in run.lanes
         for x in np.linspace(lane.start, lane.start + lane.length, 5)
         for side in (-1.0, 1.0)
     ]
@@ -94,7 +93,6 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
 
 
 def _draw_bode(result: iso7401.Transient) -> go.Figure:
-    """Draw magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
         measured, linear = result.sweep[name], result.linear_sweep[name]

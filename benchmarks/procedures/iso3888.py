@@ -29,6 +29,7 @@ class TrackRun:
     """One run through a track."""
 
     speed: float  # m/s
+    lanes: tuple[Section, ...]  # where the car drives them
     margins: tuple[float, ...]  # m, by lane, to its edge; below 0 a cone falls, NaN: not driven
     series: Series
 
@@ -80,17 +81,8 @@ def _compute_margin(body: Array, lane: Section) -> float:
     return 0.5 * lane.width - max_offset
 
 
-def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
-    """Make the lanes where the car drives them.
-
-    Args:
-        car: Car under test, with speed and steering ratio.
-        track: One of `TRACKS`.
-        speed: Speed (m/s).
-
-    Returns:
-        Lanes in the order in which they are driven.
-    """
+def _make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
+    """Make the lanes where the car drives them, in their order."""
     return make_sections(track, car.vehicle.width, speed * ONSET, _compute_length_share(car))
 
 
@@ -111,9 +103,8 @@ def _make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
 
 
 def _evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
-    """Evaluate a run's margins."""
-    body, lanes = _compute_corners(series, car), make_lanes(car, track, speed)
-    return TrackRun(speed, tuple(_compute_margin(body, lane) for lane in lanes), series)
+    body, lanes = _compute_corners(series, car), _make_lanes(car, track, speed)
+    return TrackRun(speed, lanes, tuple(_compute_margin(body, lane) for lane in lanes), series)
 
 
 def run(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:

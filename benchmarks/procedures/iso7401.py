@@ -121,7 +121,6 @@ def _compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict
 
 
 def _compute_responses(series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of yaw rate and lateral acceleration after a step."""
     t, steer = series.t, series.steer
     return {name: _compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
 

@@ -43,7 +43,6 @@ _SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
 
 
 def _compute_limited_moment(motion: Motion, steer: float) -> float:
-    """Compute the check's yaw moment (N m)."""
     car = make_outside_vehicle()
     max_yaw_rate = 0.85 * GRAVITY * car.friction / motion.v_x
     goal = min(max(motion.v_x * steer / car.wheelbase, -max_yaw_rate), max_yaw_rate)

@@ -40,7 +40,6 @@ _TEXT = (
 
 
 def _measure_case(case: ProcedureCase) -> Any:
-    """Drive a case; the result is one of its procedure's module."""
     if case.procedure == "outside":
         return outside.run_episodes(case.car, ENTRIES[case.entry_index], case.seeds)
     if case.procedure == "check":
@@ -80,7 +79,6 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
 
 
 def _group_results(done: CaseResults) -> dict[str, CaseResults]:
-    """Group results by procedure."""
     names = dict.fromkeys(case.procedure for case in done)
     return {name: {x: y for x, y in done.items() if x.procedure == name} for name in names}
 
@@ -116,7 +114,6 @@ def _find_highest_speed(runs: Sequence[iso3888.TrackRun]) -> float:
 
 
 def _measure(request: Request) -> CaseResults:
-    """Drive every procedure with both cars and every controller, and the outside plants."""
     cases = _make_cases(request.quick)
     return dict(zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True))
 
@@ -139,7 +136,6 @@ def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
 
 
 def _add_tables(suite: Suite, done: CaseResults) -> None:
-    """Add rows and a table of each procedure."""
     results = _group_results(done)
     for name, table in _TABLES.items():
         if name in results:
@@ -179,7 +175,6 @@ def _describe_failure(run: fmvss126.SineDwellRun) -> str:
 
 
 def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
-    """Add ISO 3888: the highest clean speed of each controller."""
     lines: dict[tuple[str, str], dict[str, object]] = {}
     for track, results in done.items():
         for case, runs in results.items():
@@ -195,7 +190,6 @@ def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
 
 
 def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
-    """ISO 4138: the understeer gradient against the linear model's."""
     return [
         _make_record(case, understeer_gradient=handling.K, theory=handling.theory)
         for case, handling in done.items()
@@ -203,7 +197,6 @@ def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
 
 
 def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
-    """ISO 7401: the step's numbers beside the linear model's."""
     records = []
     for case, transient in done.items():
         for name in iso7401.OUTPUTS:
@@ -215,7 +208,6 @@ def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
 
 
 def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
-    """Outside plants: cost and spins of each controller."""
     records = []
     rivals = {case.car: episodes[:, 0] for case, episodes in done.items() if case.agent == RIVAL}
     for case, episodes in done.items():
@@ -229,7 +221,6 @@ def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
 
 
 def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
-    """The claim on the drift model."""
     (check,) = done.values()
     case = ProcedureCase("fmvss-126", f"outside {outside.MODEL}")
     claim = {"verdict": "reproduced" if check.reproduced else "not reproduced", "paper": _CLAIM}

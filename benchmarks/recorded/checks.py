@@ -88,22 +88,18 @@ class InspectedDrive:
 
     def _compose_cure(self, finding: LogFinding) -> LogFinding:
         """Put what is stated already into a cure of the steering: an option replaces it."""
-        if finding.channel == "steering" and finding.check == "sign":
-            cure = f"--steering-sign {-self.wires.sign}"
-        elif finding.channel == "steering" and finding.check == "ratio":
+        if finding.channel != "steering" or finding.check not in ("sign", "ratio"):
+            return finding
+        cure = f"--steering-sign {-self.wires.sign}"
+        if finding.check == "ratio":
             ratio = float(finding.cure.split()[1]) * self.wires.ratio
             cure = f"--steering-ratio {ratio:.3g}"
-        else:
-            return finding
         text = finding.text.replace(finding.cure, cure)
         return dataclasses.replace(finding, text=text, cure=cure)
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
-        blocks = list[Array]()
-        for log in (log for log in logs if "gps" in log.slow):
-            heading = LoggedMotion(log).heading
-            blocks += collect_fixes(log, COURSE, heading, 0.0 * heading, _TIMES)
+        blocks = collect_fixes(logs, COURSE, None, _TIMES)
         late = find_latency(blocks, _TIMES, 0.0)[0] if blocks else 0.0
         return late if 0.0 < late < _TIMES[-2] else 0.0
 
@@ -292,9 +288,8 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
-    blocks = []
-    for log in (log for log in drive.judged if "gps" in log.slow):
-        blocks += collect_fixes(log, COURSE, LoggedMotion(log).heading, log.truth["beta"], _TIMES)
+    slips = [log.truth["beta"] for log in drive.judged]
+    blocks = collect_fixes(drive.judged, COURSE, slips, _TIMES)
     if not blocks:
         return
     half = len(blocks) // 2

@@ -140,20 +140,31 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+def collect_fixes(
+    logs: Sequence[Log], value: int, slips: Sequence[Array] | None, times: Array
+) -> list[Array]:
     """Collect the differences of successive fixes, for a latency.
 
     Args:
-        log: Recorded drive with a GPS.
-        value: Place in the fix's values, 0 for the course, 1 for the speed.
-        signal: Signal that the values follow, shape (rows,).
-        part: Signal of which they have a share too, shape (rows,).
+        logs: Recorded drives; those without a GPS have no fixes.
+        value: Place in a fix's values, `COURSE` or `SPEED`.
+        slips: Sideslip angle (rad), shape (rows,), of which the value has a share; None: of none.
         times: Latencies (s), shape (times,).
 
     Returns:
-        Blocks of the log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
-        less the signal's so much earlier, p of those of `part`; none for too few fixes.
+        Blocks of each log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
+        less the logged motion's so much earlier, p of the slip's; none for too few fixes.
     """
+    blocks = []
+    for i, log in enumerate(logs):
+        if "gps" in log.slow:
+            part = np.zeros(len(log.time)) if slips is None else slips[i]
+            blocks += _collect_blocks(log, value, part, times)
+    return blocks
+
+
+def _collect_blocks(log: Log, value: int, part: Array, times: Array) -> list[Array]:
+    signal = LoggedMotion(log).heading if value == COURSE else LoggedMotion(log).speed
     packets = log.record.select_packets("gps")
     packets = packets[packets[:, PACKET.quality] > 0.0]
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))

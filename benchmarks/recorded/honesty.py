@@ -16,9 +16,6 @@ HONESTY = (
     Column("log_score", "log score", form=".2f", interval=False),
 )
 """What `compute_honesty` computes."""
-_WIDTHS = np.array([0.126, 0.253, 0.385, 0.524, 0.674, 0.842, 1.036, 1.282, 1.645, 1.96])
-"""Half-widths of intervals in deviations, which should hold `SHARES` of the errors."""
-SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 
 
 def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float]:
@@ -36,20 +33,6 @@ def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float
     squares = (error / deviation) ** 2
     score = -0.5 * squares - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
     return float(np.mean(squares)), float(np.mean(squares < _Z95**2)), float(np.mean(score))
-
-
-def compute_held_shares(error: Array, deviation: Array) -> Array:
-    """Compute which share of the errors intervals hold.
-
-    Args:
-        error: Errors of an estimate, shape (n,).
-        deviation: Its standard deviations in the same unit, shape (n,).
-
-    Returns:
-        Shares of intervals that should hold `SHARES`, shape (10,).
-    """
-    ratios = np.sort(np.abs(error / deviation))
-    return np.asarray(np.searchsorted(ratios, _WIDTHS) / len(ratios))
 
 
 def describe_innovations(nis: Mapping[str, float]) -> str:

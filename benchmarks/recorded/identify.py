@@ -329,11 +329,8 @@ def _make_sensor_findings(
             findings.append(row)
             noise |= {NOISES[channel]: sd} if is_determined else {}
     times = np.arange(*_LATE, max(logs[0].record.dt, 0.01))
-    pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses, speeds = list[Array](), list[Array]()
-    for log, slip in pairs:
-        courses += collect_fixes(log, COURSE, LoggedMotion(log).heading, slip, times)
-        speeds += collect_fixes(log, SPEED, LoggedMotion(log).speed, 0.0 * log.time, times)
+    courses = collect_fixes(logs, COURSE, slips, times)
+    speeds = collect_fixes(logs, SPEED, None, times)
     if not courses:
         return findings, noise, {}
     late, half = find_latency(courses, times)

@@ -129,7 +129,6 @@ def _read_drive(
 
 
 def _predict(log: Log, car: Vehicle) -> Prediction:
-    """Run the filter over a part and take its own deviation."""
     facts = {"sensors": log.slow, "dt": log.record.dt, "present": log.record.present}
     filter_ = call_quietly(make_estimator, FILTER, vehicle=car, **facts)
     estimates = filter_.run(log)
@@ -155,7 +154,6 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
 def _compose_verdict(
     findings: Sequence[LogFinding], prediction: Prediction | None, car: Vehicle
 ) -> str:
-    """Compose the verdict: what can be estimated, how well, and what stands against it."""
     counts = Counter(finding.level for finding in findings)
     blockers = [finding for finding in findings if finding.level == BLOCKER]
     tally = f"{counts[BLOCKER]} BLOCKER, {counts[WARNING]} WARNING, {counts[OK]} OK."
@@ -189,7 +187,6 @@ def _compose_verdict(
 
 
 def _make_channels(values: dict[str, Array]) -> ResultTable:
-    """Make the table of channels: unit, rate, longest step, resolution, range."""
     rows, time = [], values.get("time", np.zeros(0))
     for name, column in values.items():
         known = np.isfinite(column)
@@ -232,7 +229,6 @@ def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
 
 
 def _make_learnt(prediction: Prediction) -> ResultTable:
-    """Make the table of constants and of how much the log tells of them."""
     rows = []
     for name, (first, last) in prediction.learnt.items():
         scale = 1.0 if name in _RELATIVE or name == "accel_bias" else _DEGREES

@@ -76,7 +76,6 @@ _GUESSES = {  # a ratio of steering angles, and what it looks like from there on
 
 
 def _get_columns(log: Log) -> dict[str, Array]:
-    """Columns of a log by name, shape (rows,) each."""
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
     columns = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
     columns |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
@@ -334,7 +333,6 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
 
 
 def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
-    """Findings on the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0

@@ -277,7 +277,6 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
 
 
 def _compose_verdict(replay: ReceiverReplay) -> str:
-    """Compose the verdict."""
     tuned, fixed = (replay.outcomes[0][1][law] for law in (_TUNED, _FIXED))
     rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
     pairs = [(np.median(x.error), np.percentile(x.error, 95)) for x in (tuned, fixed)]
@@ -292,7 +291,6 @@ def _compose_verdict(replay: ReceiverReplay) -> str:
 
 
 def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
-    """Sentence on whether noise that follows HDOP predicts a signal better."""
     number = _compute_gain(results[_TUNED], results[_FIXED])
     what, (value, low, high) = f"Tuning the noise of {name} by HDOP", number
     if max(abs(low), abs(high)) < _NEGLIGIBLE:
@@ -304,7 +302,6 @@ def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
 def _add_table(
     suite: Suite, replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
 ) -> None:
-    """Add rows and a table of the laws of a signal's noise."""
     scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
     records = []
     for law, result in results.items():

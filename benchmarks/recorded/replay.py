@@ -200,7 +200,6 @@ def _make_suite(result: IdentificationResult, name: str) -> Suite:
 
 
 def _format_cells(row: Finding) -> list[str]:
-    """Texts of a finding's cells."""
     stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
     ends = "-"
     if math.isfinite(row.half):

@@ -21,13 +21,7 @@ from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
 from .emulate import Emulation, LoggedMotion
-from .honesty import (
-    HONESTY,
-    SHARES,
-    compute_held_shares,
-    compute_honesty,
-    describe_innovations,
-)
+from .honesty import HONESTY, compute_honesty, describe_innovations
 
 GYRO_ONLY = "bicycle-kf"
 _BOTH, _GPS = ("gps", "camera"), ("gps",)
@@ -37,6 +31,9 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
+_WIDTHS = np.array([0.126, 0.253, 0.385, 0.524, 0.674, 0.842, 1.036, 1.282, 1.645, 1.96])
+"""Half-widths of intervals in deviations, which should hold `SHARES` of the errors."""
+SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 _OWN_NOISE = "joint"  # brings its levels along and finds the accelerometer's as it drives
 _MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
 _MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
@@ -103,13 +100,18 @@ class ReplayResult:
 
 
 def _compute_range(values: Array) -> Estimate:
-    """Compute the median, smallest and largest number."""
     return Estimate(*(float(function(values)) for function in (np.median, np.min, np.max)))
 
 
 def _compute_ratio(result: ReplayResult, name: str, other: str = GYRO_ONLY) -> Estimate:
     """Compute the RMS error over another's, seed by seed."""
     return _compute_range(np.sqrt(result.squares[name] / result.squares[other]))
+
+
+def _compute_held_shares(error: Array, deviation: Array) -> Array:
+    """Compute the shares of errors that intervals hold which should hold `SHARES`."""
+    ratios = np.sort(np.abs(error / deviation))
+    return np.asarray(np.searchsorted(ratios, _WIDTHS) / len(ratios))
 
 
 def _make_drives(log: Log, settings: Settings) -> list[Log]:
@@ -174,7 +176,7 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
                 squares.append(np.mean(wrong**2))
                 deviation = estimates.std[counts, estimates.names.index("beta")]
                 honesty.append(compute_honesty(wrong, deviation))
-                result.held.setdefault(name, compute_held_shares(wrong, deviation))
+                result.held.setdefault(name, _compute_held_shares(wrong, deviation))
         if truth is not None:
             result.squares[name] = np.array(squares[1:])
             result.honesty[name] = np.array(honesty[1:])
@@ -305,7 +307,6 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 
 def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings) -> str:
-    """Text of the report: the drive, the design of the estimators, and what was emulated."""
     duration, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
     text = [f"{duration:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
     if settings.stiffness_factor != 1.0:
@@ -362,7 +363,6 @@ def _add_rows(
 def _make_table(
     result: ReplayResult, records: Sequence[Any], name: str, car: Vehicle, noises: int
 ) -> ResultTable:
-    """Make the table of the estimators; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     cost = Column("us_per_tick", "us per tick", form=".3f")
     surprise = Column("nis", "NIS of a value", form=".2f")

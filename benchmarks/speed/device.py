@@ -80,7 +80,6 @@ def _measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
 
 
 def _format_table(timings: Sequence[_DeviceTiming]) -> str:
-    """Format the measurements as a Markdown table."""
     lines = [
         "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
         "| of a copy's bandwidth |",

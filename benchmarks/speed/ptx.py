@@ -25,13 +25,11 @@ _ARITHMETIC = "add|sub|mul|fma|div|rcp|sqrt"
 
 
 def _count_opcodes(text: str) -> Counter[str]:
-    """Count the instructions of a PTX text by name."""
     opcode = r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]"
     return Counter(re.findall(opcode, text, re.M))
 
 
 def _count_by_kind(text: str) -> dict[str, Any]:
-    """Count the instructions of a PTX text by kind."""
     totals = _count_opcodes(text)
 
     def count_matching(pattern: str) -> int:

@@ -100,7 +100,6 @@ def _add_tables(suite: Suite, results: _SpeedResults) -> None:
 
 
 def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    """Make the verdict of the CPU times a unit (us) and the table of targets."""
     us = {name: times.range.value for name, times in taken.items()}
     step_time, batch_time = us[env_steps.FUSION_V1], us[env_steps.V1_AT_ONCE]
     over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in _RIVALS if x in us]

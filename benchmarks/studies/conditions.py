@@ -271,7 +271,6 @@ def _measure(request: Request) -> Results:
 
 
 def _summarise_outcomes(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Cells of a condition's line by column."""
     square, informed, gyro, nees, coverage, after, alarms, spins = np.array(outcomes, float).T
     lost = nees > _LOST
     return {

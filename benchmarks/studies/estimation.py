@@ -111,7 +111,6 @@ def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
-    """Add rows and a table of each experiment, the best estimator first."""
     for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
         *records, bound = _make_records(numbers)
         spec, n = _make_env(experiment).spec.to_json(), len(numbers[BOUND])
@@ -145,7 +144,6 @@ def _compose_verdict(results: Results) -> str:
 
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
-    """Add the errors of every experiment's estimators, and one drive of each."""
     groups, angle = {}, "sideslip angle / mrad"
     for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
         records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)

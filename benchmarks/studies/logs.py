@@ -34,7 +34,6 @@ _COLUMNS = (
 
 
 def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
-    """Records of all drives in the folder, and a line for what is not there or not scored."""
     records, absent = list[dict[str, Any]](), list[str]()
     if request.data is not None and not request.data.is_dir():
         raise FileNotFoundError(f"{request.data}: there is no such folder")
@@ -65,7 +64,6 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows that count: moving forward, settled, with a truth."""
     truth, motion = log.truth.get("beta", np.full(len(log.time), np.nan)), LoggedMotion(log)
     is_settled = log.time >= log.time[0] + SETTLED - 1e-9
     return np.asarray(is_settled & motion.is_moving & ~motion.is_backward & np.isfinite(truth))
@@ -92,7 +90,6 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
 
 
 def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -> None:
-    """Add rows and the table, and the instructions above the verdict."""
     records, absent = results
     for record in records:
         numbers = {key: value for key, value in record.items() if key != "drive"}
@@ -104,7 +101,6 @@ def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -
 
 
 def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
-    """Say the medians over the drives, or that there is none."""
     records, absent = results
     if not records:
         return format_verdict("No drive was read: the lines above say where to get each.")

@@ -111,7 +111,6 @@ def _compose_verdict(results: Results) -> str:
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
-    """Add rows and tables of the swerves, and of the lane keeping."""
     records, (swerves, lanes) = list[Line](), results
     free = swerves["none"]
     for controller, numbers in swerves.items():

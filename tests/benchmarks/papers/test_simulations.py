@@ -15,6 +15,7 @@ from sideslip.benchmarks.papers.manoeuvres import (
     FollowingSimulation,
     SlipSimulation,
 )
+from sideslip.benchmarks.papers.suite import _split_seeds
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
@@ -77,8 +78,9 @@ def test_following_has_the_reference_beside_the_car() -> None:
 
 def test_seeds_are_split_and_shared() -> None:
     assert split_seeds(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
-    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).split(8) == [(0, 1)]
-    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).split(1) == [(0,)]
+    following = FollowingSimulation("f", "dakf-fig7", {}, share=0.25)
+    assert _split_seeds(following, 8) == [(0, 1)]
+    assert _split_seeds(following, 1) == [(0,)]
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:
