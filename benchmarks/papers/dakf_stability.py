@@ -47,7 +47,6 @@ def _make_tracking_parts(
 
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",

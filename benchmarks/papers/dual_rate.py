@@ -37,7 +37,6 @@ def _make_order_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart
 
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 4",

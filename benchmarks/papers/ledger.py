@@ -212,7 +212,7 @@ SeedFunction = Callable[[int], tuple[Numbers, Example | None]]
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation with a unique name, whose seeds are split into cases; `prepare` is its own."""
+    """A simulation with a unique name, whose seeds are split into cases."""
 
     size: ClassVar[int] = 5  # seeds of a case
     name: str
@@ -228,7 +228,7 @@ class Simulation:
         Returns:
             Numbers by subject and quantity, shape (seeds,) each, and the example.
         """
-        measure_seed, lines, example = self.prepare(), list[Numbers](), None
+        measure_seed, lines, example = self._prepare(), list[Numbers](), None
         for seed in seeds:
             line, signals = measure_seed(seed)
             lines.append(line)
@@ -236,7 +236,7 @@ class Simulation:
         numbers = {x: np.concatenate([np.atleast_1d(at[x]) for at in lines]) for x in lines[0]}
         return SimulationResult(numbers, example)
 
-    def prepare(self) -> SeedFunction:
+    def _prepare(self) -> SeedFunction:
         """Prepare a case: make the function that measures one of its seeds."""
         raise NotImplementedError
 
@@ -247,8 +247,7 @@ class Analysis(Simulation):
 
     function: SeedFunction
 
-    def prepare(self) -> SeedFunction:
-        """Return the function of a seed."""
+    def _prepare(self) -> SeedFunction:
         return self.function
 
 

@@ -39,8 +39,7 @@ class EstimationSimulation(Simulation):
     bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
     control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
-    def prepare(self) -> SeedFunction:
-        """Make the function that drives a seed and runs every filter over its record."""
+    def _prepare(self) -> SeedFunction:
         options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
         env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
         base: Any = env.unwrapped
@@ -58,7 +57,7 @@ class EstimationSimulation(Simulation):
             for label, estimator in estimators.items():
                 estimates = estimator.run(log)
                 curves[label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _compute_errors(label, curves[label], truth, log, base.scenario)
+                numbers |= _compute_errors(label, curves[label], log, base.scenario)
             if self.bound:
                 facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
                 std = compute_error_bound(record=log.record, **facts)
@@ -78,12 +77,9 @@ def _compute_settled_rms(values: Array, log: Log) -> float:
 
 
 def _compute_errors(
-    label: str,
-    estimates: Mapping[str, Array],
-    truth: Mapping[str, Array],
-    log: Log,
-    scenario: Scenario,
+    label: str, estimates: Mapping[str, Array], log: Log, scenario: Scenario
 ) -> Numbers:
+    truth = log.truth
     errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
     numbers: Numbers = {
         (label, name): _compute_settled_rms(error, log) for name, error in errors.items()
@@ -121,8 +117,7 @@ class _AgentSimulation(Simulation):
     scenario: str | Mapping[str, Any]
     entries: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
 
-    def prepare(self) -> SeedFunction:
-        """Return the function that drives every entry."""
+    def _prepare(self) -> SeedFunction:
         return self._measure_seed
 
     def _measure_seed(self, seed: int) -> tuple[Numbers, Example]:

@@ -25,7 +25,6 @@ SIMULATIONS: dict[str, Simulation] = {
 CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
 FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
 
-
 NAME = "papers"
 
 _TEXT = (

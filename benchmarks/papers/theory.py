@@ -200,7 +200,6 @@ SIMULATIONS = (
 )
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(33)", "the error dynamics are those of fast measurements",

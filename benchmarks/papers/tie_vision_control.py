@@ -259,7 +259,6 @@ SIMULATIONS = (
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(24)", "the feedforward brings the static slip to zero",

@@ -212,7 +212,6 @@ SIMULATIONS = (
 
 _zero = Bound("<=", 1e-12)
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Appendix",

@@ -10,6 +10,7 @@ from ...agents import Agent, make_agent
 from ...agents.learned.policy import load_policy
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
+from ...envs.task import make_reference_params
 from ...envs.vehicle.parameters import COMS, PASSENGER_CAR, Vehicle
 from ..control.entries import ControlCase, Entry
 from ..control.tasks import STEERING, ControlTask
@@ -68,6 +69,11 @@ class TestCar:
     front_overhang: float  # m, of its body, from the front axle forward
 
     __test__ = False  # pytest would take it for tests
+
+    @property
+    def understeer_gradient(self) -> float:
+        """The understeer gradient K of the linear model (rad s2/m)."""
+        return float(make_reference_params(self.vehicle).G) * self.vehicle.wheelbase
 
 
 ENV_ID = STEERING.replace("-v0", "-v1")  # of every drive

@@ -15,7 +15,6 @@ from ...envs.record import Array
 from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
-from .iso4138 import compute_understeer_gradient
 
 _Complex = npt.NDArray[np.complex128]
 
@@ -158,7 +157,7 @@ def run(drive: DriveFunction, car: TestCar) -> Transient:
         The responses.
     """
     vehicle, speed = car.vehicle, car.speed
-    per = vehicle.wheelbase / speed**2 + compute_understeer_gradient(vehicle)  # rad s2/m
+    per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m
     stepped = drive(_make_step(car, per * _STEP_AT))
     sweep = _run_sweep(drive, car, per * _SWEEP_AT)
     linear_step = _compute_linear_step(vehicle, speed, stepped)

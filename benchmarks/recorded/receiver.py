@@ -52,10 +52,6 @@ class _Track(NamedTuple):
     hdop: Array
     satellites: Array
 
-    def select(self, shown: Mask) -> "_Track":
-        """Select some of the fixes."""
-        return _Track(self.origin, *(column[shown] for column in self[1:]))
-
 
 def _make_track(epochs: Sequence[Epoch]) -> _Track:
     """Make the track of fixes around the first one, without those that lack HDOP or are late.
@@ -106,7 +102,8 @@ def _make_signals(track: _Track) -> list[_Signal]:
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     positions = np.asarray(track.east + 1j * track.north, np.complex128)
     position = _Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
-    part = track.select((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
+    has_course = (track.speed >= COURSE_SPEED) & np.isfinite(track.course)
+    part = _Track(track.origin, *(column[has_course] for column in track[1:]))
     all_fixes: Mask = np.ones(len(part.t), bool)
     angle = np.asarray(part.course, np.complex128)
     course = _Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)

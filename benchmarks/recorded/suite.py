@@ -156,7 +156,7 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             continue
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
-        squares, honesty = [], []
+        numbers = []
         for drive in (log, *drives):  # the first run designs the gains
             start = time.process_time()
             estimates = estimator.run(drive)
@@ -173,13 +173,12 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             ]
             if truth is not None:
                 wrong = (beta - truth)[counts]
-                squares.append(np.mean(wrong**2))
                 deviation = estimates.std[counts, estimates.names.index("beta")]
-                honesty.append(compute_honesty(wrong, deviation))
+                numbers.append((np.mean(wrong**2), *compute_honesty(wrong, deviation)))
                 result.held.setdefault(name, _compute_held_shares(wrong, deviation))
         if truth is not None:
-            result.squares[name] = np.array(squares[1:])
-            result.honesty[name] = np.array(honesty[1:])
+            result.squares[name] = np.array(numbers[1:])[:, 0]
+            result.honesty[name] = np.array(numbers[1:])[:, 1:]
     return result
 
 

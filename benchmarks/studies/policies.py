@@ -57,13 +57,13 @@ _COLUMNS = (
 class PolicyEvaluation:
     """Episodes on the same seeds by entry, the policy's first."""
 
-    policy: Policy  # the policy
-    salt: str  # salt of the seeds, "" where the caller chose them
-    seeds: list[int]  # seeds of the episodes
-    reference: str  # reference of the env
-    task: ControlTask  # task that they drive
-    entries: dict[str, Entry]  # entries by name
-    drives: dict[str, DriveResult]  # episodes by name
+    policy: Policy
+    salt: str  # of the seeds, "" where the caller chose them
+    seeds: list[int]
+    reference: str  # of the env
+    task: ControlTask  # that they drive
+    entries: dict[str, Entry]
+    drives: dict[str, DriveResult]
     left_out: dict[str, str]  # why an entry is not among them, by name
 
     def make_suite(self) -> Suite:
@@ -100,18 +100,15 @@ class PolicyEvaluation:
             f"better: on how many of the seeds {name} costs less. step: the largest between two "
             "decisions."
         )
-        left_out = [f"{x} was not driven: {error}." for x, error in self.left_out.items()]
-        note = " ".join([note, *left_out])
+        note += "".join(f" {x} was not driven: {error}." for x, error in self.left_out.items())
         suite.tables.append(ResultTable("What it costs", _COLUMNS, lines, note))
         driven = {(label,): drive.series for label, drive in self.drives.items()}
         series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
         explorer = make_time_explorer("The first seed, side by side", (), series, name)
         suite.explorers.append(explorer)
-        fails = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes."
-        suite.verdict = format_verdict(
-            *verdict,
-            f"{fails} Not said: other cars, scenarios and seeds than these {len(self.seeds)}.",
-        )
+        last = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes. Not said: other "
+        last += f"cars, scenarios and seeds than these {len(self.seeds)}."
+        suite.verdict = format_verdict(*verdict, last)
         return suite
 
 

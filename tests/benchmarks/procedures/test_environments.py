@@ -31,7 +31,7 @@ def linear(name: str) -> DriveFunction:
 def slow(name: str) -> float:
     """The steering angle in rad of 0.1 g, slowly."""
     car = CARS[name]
-    per = car.vehicle.wheelbase / car.speed**2 + iso4138.compute_understeer_gradient(car.vehicle)
+    per = car.vehicle.wheelbase / car.speed**2 + car.understeer_gradient
     return 0.1 * GRAVITY * per
 
 
