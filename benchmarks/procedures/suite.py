@@ -221,11 +221,12 @@ def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
 
 
 def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
-    (check,) = done.values()
+    ((none, law),) = done.values()
     case = ProcedureCase("fmvss-126", f"outside {outside.MODEL}")
-    claim = {"verdict": "reproduced" if check.reproduced else "not reproduced", "paper": _CLAIM}
+    is_reproduced = law.passed and not any(run.passed for run in none.runs)
+    claim = {"verdict": "reproduced" if is_reproduced else "not reproduced", "paper": _CLAIM}
     records = []
-    for control, result in (("none", check.none), ("500 N m", check.law)):
+    for control, result in (("none", none), ("500 N m", law)):
         worst = max(result.runs, key=lambda run: run.ratio_1 if run.ratio_1 < np.inf else np.inf)
         numbers = {"multiple": worst.multiple, "ratio": worst.ratio_1, "later": worst.ratio_2}
         numbers |= {"n": len(result.runs), "sideways": min(run.sideways for run in result.runs)}

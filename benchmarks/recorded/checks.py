@@ -110,7 +110,7 @@ class InspectedDrive:
             return []
         seconds = [LoggedMotion(log).is_moving.sum() * log.record.dt for log in self.logs]
         parts = [log for log, x in zip(self.logs, seconds, strict=True) if x > 2.0]
-        slips = estimate_slips(parts, self.car) if parts else []
+        slips = estimate_slips(parts, self.car, SignalCalibration()) if parts else []
         return [
             dataclasses.replace(log, truth={"beta": slip})
             for log, slip in zip(parts, slips, strict=True)

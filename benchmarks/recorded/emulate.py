@@ -41,38 +41,28 @@ class Emulation:
         if self.course_rate <= 0.0:
             raise ValueError(f"course_rate must be positive, got {self.course_rate} Hz")
 
-    def add_gyro_bias(self, log: Log) -> Log:
-        """Return the log with the gyro's bias added.
-
-        Args:
-            log: Recorded drive.
-
-        Returns:
-            The biased log.
-        """
-        fast = log.record.fast.copy()
-        fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
-        return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
-
-    def add_course(self, log: Log, seed: int) -> Log:
-        """Return the log with the gyro's bias and a GPS that measures the course, nothing else.
+    def apply(self, log: Log, seed: int | None) -> Log:
+        """Return the log with the gyro's bias, and with a GPS that measures the course alone.
 
         course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
         ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
 
         Args:
-            log: Recorded drive.
-            seed: Seed of the course's noise.
+            log: Recorded drive, with the truth if it gets a GPS.
+            seed: Seed of the course's noise, None: its slow sensors stay as they are.
 
         Returns:
-            The log with a GPS.
+            The changed log.
 
         Raises:
-            ValueError: The log has no truth, or is slower than the course.
+            ValueError: The log is slower than the course.
         """
-        if "beta" not in log.truth:
-            raise ValueError(f"{log.name}: a course cannot be emulated without sideslip truth")
-        record, beta, motion = log.record, log.truth["beta"], LoggedMotion(log)
+        record, motion, fast = log.record, LoggedMotion(log), log.record.fast.copy()
+        fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
+        biased = dataclasses.replace(record, fast=fast)
+        if seed is None:
+            return dataclasses.replace(log, record=biased)
+        beta = log.truth["beta"]
         if self.course_rate * record.dt > 1.0 + 1e-6:
             raise ValueError(
                 f"a course at {self.course_rate:g} Hz needs a log at least as fast; "
@@ -90,8 +80,8 @@ class Emulation:
         quality = (motion.speed[captured][sent] >= COURSE_SPEED).astype(np.float64)
         packets = make_packet_rows("gps", ticks, ticks + late, values, quality)
         gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
-        quiet = dataclasses.replace(log, record=dataclasses.replace(record, packets=packets))
-        return self.add_gyro_bias(dataclasses.replace(quiet, slow={"gps": gps}))
+        biased = dataclasses.replace(biased, packets=packets)
+        return dataclasses.replace(log, record=biased, slow={"gps": gps})
 
 
 class LoggedMotion(NamedTuple):

@@ -43,8 +43,6 @@ _LATE = (-0.2, 1.2)  # s, of the GPS
 _LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
 
-_NO_WIRES = SignalCalibration()
-
 
 class Finding(NamedTuple):
     """A number with half of its 95 % interval, and whether the log determines it."""
@@ -266,9 +264,7 @@ def _make_car_findings(
     return findings
 
 
-def estimate_slips(
-    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration = _NO_WIRES
-) -> list[Array]:
+def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
     """Estimate the sideslip angle of drives by the gyro alone.
 
     Args:

@@ -122,8 +122,8 @@ def _make_drives(log: Log, settings: Settings) -> list[Log]:
             f"{log.name}: the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
         )
     if log.slow or "beta" not in log.truth or not settings.emulated:
-        return [settings.add_gyro_bias(log)]
-    return [settings.add_course(log, settings.seed + i) for i in range(settings.seeds)]
+        return [settings.apply(log, None)]
+    return [settings.apply(log, settings.seed + i) for i in range(settings.seeds)]
 
 
 def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:

@@ -101,7 +101,7 @@ def test_exact_ranks() -> None:
     numbers, _ = theory.compute_coms_ranks(0)
     ranks = {name: value for (name, _), value in numbers.items()}
     assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}
-    singular = [[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]]
+    singular = np.array([[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]])
     assert theory._rank(singular) == 1
 
 

@@ -71,7 +71,7 @@ def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
     options = {"q_beta": 1e-3, "q_gamma": 0.1, "q_psi": 0.0, "course_noise": 0.5 * DEG}
     errors = []
     for seed in (5, 6, 7):
-        seen = Emulation().add_course(log, seed)
+        seen = Emulation().apply(log, seed)
         facts: dict[str, Any] = {"vehicle": soft, "sensors": seen.slow, "dt": log.record.dt}
         estimator = make_estimator("multirate-kf", **facts, **options)
         error = estimator.run(seen)["beta"][200:] - log.truth["beta"][200:]
