@@ -21,8 +21,7 @@ _RULES: tuple[tuple[str, dict[str, str], tuple[float, ...]], ...] = (
     (PLAIN, {"intersample": "predict", "disturbances": "none"}, (2.2e-4, 1e-8, 1e-8)),
 )
 _FILTERS = tuple(
-    PaperFilter(name, "dual-rate", rule | dict(zip(_Q, q, strict=False)))
-    for name, rule, q in _RULES
+    PaperFilter(x, "dual-rate", rule | dict(zip(_Q, q, strict=False))) for x, rule, q in _RULES
 )
 
 SIMULATIONS = tuple(EstimationSimulation(name, _ENV, name, _FILTERS) for name in (FIG4, FIG5))

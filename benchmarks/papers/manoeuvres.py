@@ -81,9 +81,7 @@ def _compute_errors(
 ) -> Numbers:
     truth = log.truth
     errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
-    numbers: Numbers = {
-        (label, name): _compute_settled_rms(error, log) for name, error in errors.items()
-    }
+    numbers: Numbers = {(label, x): _compute_settled_rms(y, log) for x, y in errors.items()}
     if "beta" not in estimates:
         return numbers
     t, beta = log.time, estimates["beta"]

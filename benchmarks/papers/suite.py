@@ -19,9 +19,7 @@ _MODULES = (
     theory, dakf_stability,
 )  # fmt: skip
 
-SIMULATIONS: dict[str, Simulation] = {
-    simulation.name: simulation for module in _MODULES for simulation in module.SIMULATIONS
-}
+SIMULATIONS: dict[str, Simulation] = {x.name: x for y in _MODULES for x in y.SIMULATIONS}
 CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
 FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
 
@@ -107,10 +105,8 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
         remarks += [[entry.source, claim.note]] if claim.note else []
         cells = [_format_part(claim.source, item) for item in entry.parts]
         numbers.setdefault(claim.paper, []).extend(cells)
-    header, title = (
-        ("paper", "claim", "verdict", "thresholds"),
-        "The claims and what became of them",
-    )
+    title = "The claims and what became of them"
+    header: tuple[str, ...] = ("paper", "claim", "verdict", "thresholds")
     suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
     suite.tables.append(ResultTable("Why", ("paper", "what was found"), remarks, keyed=False))
     header = ("number", "median [range]", "paper states", "threshold")

@@ -175,15 +175,10 @@ def _measure_tunings(seed: int) -> tuple[Numbers, None]:
     sensors = {"camera": CAMERA_33_30}
     make: Any = partial(make_estimator, "multirate-residual-kf", vehicle=COMS, sensors=sensors)
     shipped = [make(speed=SPEED, Q=Q, allow_unstable=True).spectral_radius for Q in tunings]
-    radii = {
-        LITERAL: [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings],
-        SPREAD: shipped,
-    }
-    shares: Numbers = {
-        (name, "share"): float(np.mean(np.array(values) > 1.0 + 1e-9))
-        for name, values in radii.items()
-    }
-    return shares, None
+    literal = [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings]
+    radii = {LITERAL: literal, SPREAD: shipped}
+    shares = {name: float(np.mean(np.array(x) > 1.0 + 1e-9)) for name, x in radii.items()}
+    return {(name, "share"): value for name, value in shares.items()}, None
 
 
 def _measure_maps(seed: int) -> tuple[Numbers, Example]:
@@ -195,10 +190,8 @@ def _measure_maps(seed: int) -> tuple[Numbers, Example]:
     rules = {"ideal": "fast", "none": "predicted", "pseudo-residuals": "pseudo"}
     cases = {x: theory.make_maps(rule, G, model.C, K, PERIOD) for x, rule in rules.items()}
     size = np.linalg.norm(np.eye(len(G)))
-    curves = {
-        name: {"error": np.array([np.linalg.norm(matrix) / size for matrix in maps])}
-        for name, maps in cases.items()
-    }
+    errors = {x: np.array([np.linalg.norm(y) / size for y in maps]) for x, maps in cases.items()}
+    curves = {name: {"error": error} for name, error in errors.items()}
     difference = theory.compute_difference(cases["pseudo-residuals"], cases["ideal"])
     example = Example(np.arange(float(PERIOD)), curves)
     return {("pseudo-residuals", "difference"): difference}, example

@@ -155,11 +155,9 @@ class ProcedureEntry:
 
 
 _POLICIES = {"coms": "distill-coms-steering", "passenger-car": "distill-car-steering"}
-_FORCES: dict[str, Any] = {
-    "outputs": ["beta", "gamma", "F_d", "N_d"],
-    "options": {"slow": ["camera", "gps"]},
-}
-_TYRES = {"outputs": [*_FORCES["outputs"], "front_tyres", "rear_tyres", "inverse_friction"]}
+_STATES = ["beta", "gamma", "F_d", "N_d"]
+_FORCES: dict[str, Any] = {"outputs": _STATES, "options": {"slow": ["camera", "gps"]}}
+_TYRES = {"outputs": [*_STATES, "front_tyres", "rear_tyres", "inverse_friction"]}
 ENTRIES = (
     ProcedureEntry("none"),
     ProcedureEntry("two-dof", "exact-kf", _FORCES),

@@ -50,11 +50,8 @@ def _draw_yaw_rates(done: CaseResults) -> go.Figure:
     """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
     drives = {case.agent: results[0].shown for case, results in done.items()}
     t = max((shown.t for shown in drives.values()), key=len)
-    series = {
-        agent: _compute_shares(shown, t)
-        for agent, shown in drives.items()
-        if shown.t[-1] >= fmvss126.COMPLETION
-    }
+    whole = {agent: x for agent, x in drives.items() if x.t[-1] >= fmvss126.COMPLETION}
+    series = {agent: _compute_shares(shown, t) for agent, shown in whole.items()}
     figure = draw_time_series(t, series, "yaw rate / its peak after the reversal")
     for time, max_ratio in fmvss126.RATIOS:
         position = fmvss126.COMPLETION + time

@@ -22,10 +22,8 @@ _RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
 A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY  # m/s2: at A, the line's ends
 FIRST, STEP, LAST = 1.5, 0.5, 6.5  # of A
 MIN_AMPLITUDE, MAX_AMPLITUDE = math.radians(270.0), math.radians(300.0)  # at the steering wheel
-RATIOS = (
-    (1.0, 0.35),
-    (1.75, 0.20),
-)  # s after completion of steer, share of the peak: S5.2.1, S5.2.2
+# s after completion of steer, share of the peak: S5.2.1, S5.2.2
+RATIOS = ((1.0, 0.35), (1.75, 0.20))
 _RESPONSIVE = 5.0  # of A
 SIDEWAYS, SIDEWAYS_AT = 1.83, 1.07  # m, s after the beginning of steer: S5.2.3
 

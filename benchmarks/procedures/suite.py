@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from itertools import product
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -64,18 +65,15 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
     indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
     driven = (("fmvss-126", seeds), *((track, ()) for track in iso3888.TRACKS))
-    cases = [
-        ProcedureCase(p, car, k, some, quick) for p, some in driven for car in CARS for k in indices
-    ]
+    triples = product(driven, CARS, indices)
+    cases = [ProcedureCase(name, car, k, some, quick) for (name, some), car, k in triples]
     cases += [ProcedureCase(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
     if not _HAS_OUTSIDE:
         return cases
     cases.append(ProcedureCase("check", outside.MODEL))
     outside_seeds = seeds[: len(seeds) if quick else OUTSIDE_EPISODES]
-    cases += [
-        ProcedureCase("outside", x, k, outside_seeds) for x in OUTSIDE_PLANTS for k in indices
-    ]
-    return cases
+    pairs = product(OUTSIDE_PLANTS, indices)
+    return cases + [ProcedureCase("outside", model, k, outside_seeds) for model, k in pairs]
 
 
 def _group_results(done: CaseResults) -> dict[str, CaseResults]:
@@ -190,10 +188,8 @@ def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
 
 
 def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
-    return [
-        _make_record(case, understeer_gradient=handling.K, theory=handling.theory)
-        for case, handling in done.items()
-    ]
+    pairs = done.items()
+    return [_make_record(case, understeer_gradient=x.K, theory=x.theory) for case, x in pairs]
 
 
 def _make_step_records(done: CaseResults) -> list[dict[str, object]]:

@@ -6,6 +6,7 @@ its first second, in which the unknown start is forgotten, does not count.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -263,23 +264,17 @@ class BicycleFit:
         rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
         return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))
 
-    def half(self, name: str) -> float:
-        """Compute half of the 95 % interval: a jackknife, and the priors' part.
-
-        Args:
-            name: Name of a parameter.
-
-        Returns:
-            Half of the interval, infinite if the parameter is not free.
-        """
-        count = len(self.g)
-        if name not in self.free or count < 2:
-            return float("inf")
-        at = self.free.index(name)
+    @cached_property
+    def halves(self) -> dict[str, float]:
+        """Halves of the free parameters' 95 % intervals: a jackknife, and the priors' part."""
+        count, inverse = len(self.g), np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))
         moves = np.array([self.estimate_shift(one) for one in np.eye(count, dtype=bool)])
-        pulled = np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))[at]
-        variance = (count - 1) / count * np.sum(moves[:, at] ** 2) + pulled**2 @ self.prior
-        return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
+        variances = [
+            (count - 1) / count * np.sum(move**2) + pulled**2 @ self.prior
+            for move, pulled in zip(moves.T, inverse, strict=True)
+        ]
+        reach = student.ppf(0.975, count - 1)
+        return {x: float(reach * np.sqrt(v)) for x, v in zip(self.free, variances, strict=True)}
 
 
 def _estimate_noise_levels(left: Array, dt: float) -> Array:

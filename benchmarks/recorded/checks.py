@@ -111,10 +111,8 @@ class InspectedDrive:
         seconds = [LoggedMotion(log).is_moving.sum() * log.record.dt for log in self.logs]
         parts = [log for log, x in zip(self.logs, seconds, strict=True) if x > 2.0]
         slips = estimate_slips(parts, self.car, SignalCalibration()) if parts else []
-        return [
-            dataclasses.replace(log, truth={"beta": slip})
-            for log, slip in zip(parts, slips, strict=True)
-        ]
+        pairs = zip(parts, slips, strict=True)
+        return [dataclasses.replace(log, truth={"beta": slip}) for log, slip in pairs]
 
 
 def _judge(check: str, channel: str, is_wrong: bool, text: str, cure: str) -> LogFinding:

@@ -107,10 +107,8 @@ def identify(
     gain, related = quality.estimate_steering_gain(logs, car)
     if reason := _find_reason(w, related):
         result.reason = reason
-        result.findings = [
-            Finding(label, value, unit=unit, remark=reason)
-            for _, label, value, unit in _list_parameters(car, stated)
-        ]
+        for _, label, value, unit in _list_parameters(car, stated):
+            result.findings.append(Finding(label, value, unit=unit, remark=reason))
     else:
         near = 1.0 / _MAX_RATIO_FACTOR < gain / stated.gain < _MAX_RATIO_FACTOR
         start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
@@ -178,9 +176,8 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     elif not any(row.is_determined for row in result.findings[:3]):
         result.reason = "it tells neither the stiffnesses nor the yaw inertia"
     if result.reason:
-        result.findings = [
-            row._replace(is_determined=False, remark=result.reason) for row in result.findings
-        ]
+        untold = {"is_determined": False, "remark": result.reason}
+        result.findings = [row._replace(**untold) for row in result.findings]
         return
     result.car, result.theta, result.tyres = fitted, theta, w.tyres
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
@@ -208,7 +205,7 @@ def _fit_latencies(
     usual, pays, rows = np.linalg.norm(_evaluate_folds(car, w, base) / base.scale), [], []
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
     for name in names:
-        half, value = free.half(name), float(getattr(free.theta, name))
+        half, value = free.halves[name], float(getattr(free.theta, name))
         is_determined, remark = half < _LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
             single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
@@ -247,7 +244,7 @@ def _make_car_findings(
     findings, (best, free) = [], fits
     for name, label, value, unit in _list_parameters(car, stated):
         at = float(getattr(best.theta, name))
-        half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
+        half = math.hypot(best.halves.get(name, math.inf), float(getattr(free.theta, name)) - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
         remark = "" if is_determined else _WIDE
         if name in _OF_CAR:
@@ -341,9 +338,8 @@ def _make_sensor_findings(
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
         if blocks:  # a difference has twice the variance
-            sd, half = jackknife(
-                np.array(blocks), lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at])
-            )
+            left = np.array(blocks)
+            sd, half = jackknife(left, lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at]))
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
             findings, noise = [*findings, row], noise | {NOISES[name]: sd}
     return findings, noise, {"gps": late} if pays else {}

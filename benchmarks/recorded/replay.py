@@ -174,25 +174,18 @@ def _make_suite(result: IdentificationResult, name: str) -> Suite:
     """Make a suite of what a log shows: a table with a verdict."""
     suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
     missing = [finding.name for finding in result.findings if not finding.is_determined]
-    if result.reason:
-        answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
-        answer += "It stays as stated."
-    else:
-        rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
-            *map(math.degrees, result.rates)
-        )
-        answer = f"The stated car leaves {rates}."
+    answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
+    answer += "It stays as stated."
+    if not result.reason:
+        text = "The stated car leaves {:.2f} deg/s of the yaw rate, the found one {:.2f} "
+        answer = (text + "({:.2f} held out).").format(*map(math.degrees, result.rates))
     slip = ""
     if not any(map(math.isnan, result.slips)):
-        slip = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg.".format(
-            *map(math.degrees, result.slips)
-        )
-    suite.verdict = format_verdict(
-        answer,
-        slip,
-        f"Not told by this log: {', '.join(missing) or 'nothing'}.",
-        "Not covered: the mass, which scales all; drives beside the part that was used.",
-    )
+        text = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg."
+        slip = text.format(*map(math.degrees, result.slips))
+    untold = f"Not told by this log: {', '.join(missing) or 'nothing'}."
+    limits = "Not covered: the mass, which scales all; drives beside the part that was used."
+    suite.verdict = format_verdict(answer, slip, untold, limits)
     header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
     cells = list(map(_format_cells, result.findings))
     suite.tables = [ResultTable("What the log shows", header, cells, _FINDINGS_NOTE, keyed=False)]
@@ -250,10 +243,8 @@ def _make_validation_table(
         return ResultTable(title, columns, [], f"Not validated: {reason}.", keyed=False)
     w = dataclasses.replace(w, tyres=result.tyres)
     places, residual = w.scored_rows, compute_residual(car, result.theta, w)
-    measured = {
-        name: (w.rows[i][places], w.rows[i][places] - residual[:, i])
-        for i, name in enumerate([*_CORRIDORS][: 2 if w.accel else 1])
-    }
+    rows = zip([*_CORRIDORS][: 2 if w.accel else 1], w.rows, residual.swapaxes(0, 1), strict=False)
+    measured = {name: (row[places], row[places] - left) for name, row, left in rows}
     if all("beta" in log.truth for log in even):
         every = round(w.dt / even[0].record.dt)
         truth = np.concatenate([log.truth["beta"][::every] for log in even])

@@ -61,9 +61,8 @@ class Settings(Emulation):
         requested = (*(self.estimators or ()), *self.options)
         unknown = [name for name in requested if name not in ESTIMATORS]
         if unknown:
-            raise ValueError(
-                f"unknown estimator {', '.join(unknown)}; known here: {', '.join(ESTIMATORS)}"
-            )
+            names = ", ".join(unknown)
+            raise ValueError(f"unknown estimator {names}; known here: {', '.join(ESTIMATORS)}")
         if self.seeds < 1 or self.seed < 0:
             raise ValueError(f"expected seeds >= 1 and seed >= 0, got {self.seeds}, {self.seed}")
         for name in ("q_beta", "q_gamma", "q_psi"):
@@ -118,9 +117,8 @@ def _make_drives(log: Log, settings: Settings) -> list[Log]:
     """A drive for each noise of the course, or the logged one; ValueError if it is too short."""
     duration = log.time[-1] - log.time[0]
     if duration < SETTLED:
-        raise ValueError(
-            f"{log.name}: the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
-        )
+        text = f"the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
+        raise ValueError(f"{log.name}: {text}")
     if log.slow or "beta" not in log.truth or not settings.emulated:
         return [settings.apply(log, None)]
     return [settings.apply(log, settings.seed + i) for i in range(settings.seeds)]
@@ -132,9 +130,8 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
     counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~LoggedMotion(log).is_backward
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
-        raise ValueError(
-            f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
-        )
+        text = f"the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
+        raise ValueError(f"{log.name}: {text}")
     for name, serves in ESTIMATORS.items():
         if settings.estimators is not None and name not in (GYRO_ONLY, *settings.estimators):
             continue
@@ -168,9 +165,8 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
                 values = len(MEASUREMENTS[slow].rows)  # of a packet, each of which adds 1
                 result.nis.setdefault(name, float(np.nanmean(estimates.nis)) / values)
             ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
-            result.outcomes[name] = [
-                (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
-            ]
+            others = [(state, float(x), float(sd)) for state, x, sd in ends]
+            result.outcomes[name] = [end for end in others if end[0] not in _MOTION]
             if truth is not None:
                 wrong = (beta - truth)[counts]
                 deviation = estimates.std[counts, estimates.names.index("beta")]
@@ -404,9 +400,8 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         figure = _select_traces(over_time, result)
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
         held = {"truth": SHARES} | result.held
-        curves = draw_curves(
-            SHARES, held, "fraction that intervals should hold", "fraction they hold"
-        )
+        labels = "fraction that intervals should hold", "fraction they hold"
+        curves = draw_curves(SHARES, held, *labels)
         text = f"Below the line of truth an estimator is surer than it may be. {_HIDDEN}"
         shown.insert(3, ("whether intervals hold", _select_traces(curves, result), text))
         groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}

@@ -107,11 +107,10 @@ def _main(
     check_writable(out)
     console, timings, copied = Console(), [], 0.0
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
-    options: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
+    options: dict[str, Any] = {"engine": engine, "on_bad_action": "fail"}
+    options |= {"compile": True} if compiled else {}
     for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
-        batch = make_device_env(
-            env, size, device=device, dtype=kind, on_bad_action="fail", **options
-        )
+        batch = make_device_env(env, size, device=device, dtype=kind, **options)
         copied = copied or _measure_bandwidth(batch.device)
         timings.append(_measure(batch, copied, rounds, steps))
         console.print(f"{size}, {kind}: {timings[-1].rate.value:.3g} env-steps/s", highlight=False)

@@ -140,10 +140,9 @@ def evaluate_policy(
     options = dict(card.env_options) if env_id in (None, card.env_id) else {}
     options |= {} if scenario is None else {"scenario": scenario}
     base: Any = gym.make(home, **options).unwrapped
-    salt = loaded.salt if seed is None else ""
-    seeds = (
-        make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
-    )
+    salt, seeds = loaded.salt, make_salted_seeds(loaded.salt, episodes)
+    if seed is not None:
+        salt, seeds = "", list(range(seed, seed + episodes))
     rivals = {f"{_CLASSICAL} on {FILTER}": Entry(_CLASSICAL, FILTER), "none": Entry("none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
@@ -330,11 +329,8 @@ def prepare_start(
             tasks, rng = _list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
-            fields["scenarios"] = [
-                _vary_scenario(task, change) if change else task.scenario
-                for task in tasks
-                for change in _draw_changes(varied, rng)
-            ]
+            pairs = ((task, x) for task in tasks for x in _draw_changes(varied, rng))
+            fields["scenarios"] = [_vary_scenario(t, x) if x else t.scenario for t, x in pairs]
         return make_finetune_task(policy, **fields)
 
     return policy, make_task
