@@ -184,11 +184,8 @@ def _measure_gains(seed: int) -> tuple[Numbers, None]:
     return radii, None
 
 
-SIMULATIONS = (
-    Analysis(MAPS, _measure_maps),
-    Analysis(GAINS, _measure_gains),
-    Analysis(RANKS, compute_coms_ranks, share=0.0),
-)
+_RANK = Analysis(RANKS, compute_coms_ranks, share=0.0)
+SIMULATIONS = (Analysis(MAPS, _measure_maps), Analysis(GAINS, _measure_gains), _RANK)
 
 claim = partial(Claim, PAPER)
 # fmt: off

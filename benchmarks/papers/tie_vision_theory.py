@@ -197,11 +197,8 @@ def _measure_maps(seed: int) -> tuple[Numbers, Example]:
     return {("pseudo-residuals", "difference"): difference}, example
 
 
-SIMULATIONS = (
-    Analysis(TUNINGS, _measure_tunings),
-    Analysis(MAPS, _measure_maps),
-    Analysis(APPENDIX, _compute_residuals),
-)
+_FUNCTIONS = {TUNINGS: _measure_tunings, MAPS: _measure_maps, APPENDIX: _compute_residuals}
+SIMULATIONS = tuple(Analysis(name, function) for name, function in _FUNCTIONS.items())
 
 _zero = Bound("<=", 1e-12)
 claim = partial(Claim, PAPER)

@@ -18,12 +18,8 @@ from ..harness.drives import make_env
 
 Fields = Mapping[str, Any]
 
-CALM: dict[str, Any] = {
-    "name": "procedure",
-    "disturbance_force": 0.0,
-    "disturbance_moment": 0.0,
-    "half_width": 1e6,  # m
-}
+CALM: dict[str, Any] = {"name": "procedure", "half_width": 1e6}  # m
+CALM |= {"disturbance_force": 0.0, "disturbance_moment": 0.0}
 """A proving ground without wind: what every procedure's scenario starts from."""
 
 

@@ -52,10 +52,6 @@ _RESOLUTION = {  # SI, noise that filters assume at least; even steps have sqrt(
 _SCALES = {  # ordinary: 1 % of a gyro and other tyres; 1.3 % and wear of a wheel; another roll
     "yaw_rate": 0.05, "speed_x": 0.04, "accel_y": 0.12,
 }  # fmt: skip
-_ADVICE = {
-    "accel_y": "log accel_y: it shows tyres that slide",
-    "course": "log a GPS's course: it alone shows the slip itself",
-}
 
 
 @dataclass
@@ -156,9 +152,12 @@ def _check_missing(drive: InspectedDrive) -> Iterator[LogFinding]:
             cure = f"--map {name}_UNIT=COLUMN"
             yield LogFinding("missing", BLOCKER, name, "no such column", cure)
     slow = any(names[0] in drive.values for names in SENSORS.values())
-    for name, is_there in (("accel_y", "accel_y" in drive.values), ("course", slow)):
+    for name, is_there, cure in (
+        ("accel_y", "accel_y" in drive.values, "log accel_y: it shows tyres that slide"),
+        ("course", slow, "log a GPS's course: it alone shows the slip itself"),
+    ):
         text = "logged" if is_there else "no such column"
-        yield _judge("missing", name, not is_there, text, _ADVICE[name])
+        yield _judge("missing", name, not is_there, text, cure)
 
 
 def _check_stamps(drive: InspectedDrive) -> Iterator[LogFinding]:

@@ -145,9 +145,8 @@ _IDEAL = (  # a camera that errs cannot see a road from which the car turns away
     Condition("camera and GPS, straight road", _BOTH, fault=np.inf),
     *_IN_V1[1:],
 )
-CONDITIONS = (
-    *_IN_V1,
-    *(replace(x, name=x.name + IDEAL_SUFFIX, env_id=f"{x.env_id[:-1]}0") for x in _IDEAL),
+CONDITIONS = _IN_V1 + tuple(
+    replace(x, name=x.name + IDEAL_SUFFIX, env_id=f"{x.env_id[:-1]}0") for x in _IDEAL
 )
 
 

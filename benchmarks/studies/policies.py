@@ -340,26 +340,20 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     """Cost in % of nominal's and win rates, with intervals, and the fraction of failures."""
     policy = load_policy(path)
     seeds = tuple(make_salted_seeds(policy.salt, episodes, task.seed_text))
-    entries = {
-        "policy": Entry(str(path), policy.card.estimator),
-        NOMINAL: Entry(NOMINAL),
-        _RIVAL: Entry(_RIVAL, JOINT),
-        PARAMETERS: Entry(PARAMETERS),
-    }
+    entries = {"policy": Entry(str(path), policy.card.estimator), NOMINAL: Entry(NOMINAL)}
+    entries |= {_RIVAL: Entry(_RIVAL, JOINT), PARAMETERS: Entry(PARAMETERS)}
     results = {name: run_chunk(Chunk(task, entry, seeds)) for name, entry in entries.items()}
     for name, result in results.items():
         if result.error:
             raise ValueError(f"{name} cannot drive {task.name}: {result.error}")
-    costs = results[NOMINAL].costs
-    shown: JsonMap = {
-        name: _list_rounded(geometric_mean(-compute_log_ratios(costs, result)), 100.0)
-        for name, result in results.items()
-        if name != NOMINAL
-    }
-    policy_costs, rivals = results["policy"].costs, (NOMINAL, _RIVAL)
-    beaten = {name: compute_win_rate(policy_costs, results[name].costs) for name in rivals}
-    better = {f"better than {name}": _list_rounded(result, 1.0) for name, result in beaten.items()}
-    return shown | better | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
+    nominal, policy_costs, shown = results[NOMINAL].costs, results["policy"].costs, JsonMap()
+    for name in ("policy", _RIVAL, PARAMETERS):
+        ratio = geometric_mean(-compute_log_ratios(nominal, results[name]))
+        shown[name] = _list_rounded(ratio, 100.0)
+    for name in (NOMINAL, _RIVAL):
+        rate = compute_win_rate(policy_costs, results[name].costs)
+        shown[f"better than {name}"] = _list_rounded(rate, 1.0)
+    return shown | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
 
 
 def _list_rounded(numbers: Estimate, unit: float) -> Sequence[float]:
