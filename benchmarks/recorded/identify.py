@@ -176,8 +176,8 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     elif not any(row.is_determined for row in result.findings[:3]):
         result.reason = "it tells neither the stiffnesses nor the yaw inertia"
     if result.reason:
-        reason, told = result.reason, result.findings
-        result.findings = [x._replace(is_determined=False, remark=reason) for x in told]
+        reason, findings = result.reason, result.findings
+        result.findings = [x._replace(is_determined=False, remark=reason) for x in findings]
         return
     result.car, result.theta, result.tyres = fitted, theta, w.tyres
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
