@@ -1,5 +1,6 @@
 """dakf-stability: slip from a GPS course and a gyro by disturbance accommodation, and control."""
 
+from collections.abc import Iterator
 from functools import partial
 
 from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
@@ -12,6 +13,7 @@ FIG7, LARGER, FIG9 = "dakf-fig7", "dakf-fig7-larger", "dakf-fig9"
 BIAS, RANKS = "dakf-bias", "dakf-rank"
 DAKF, KF, LOB = "dakf", "course-kf", "lob"
 WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no rejection"
+_ERRORS = ("rms_beta", "rms_gamma")
 _GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 _ENV = "sideslip/YawGps-v0"
@@ -36,18 +38,13 @@ SIMULATIONS = (
 # fmt: on
 
 
-def _make_tracking_parts(
-    scenario: str, beta: float | None, gamma: float | None
-) -> tuple[ClaimPart, ...]:
-    slip, rate = "sideslip error, with / without", "yaw rate error, with / without"
-    return (
-        compare(slip, scenario, WITH, WITHOUT, beta, "rms_beta"),
-        compare(rate, scenario, WITH, WITHOUT, gamma, "rms_gamma"),
-    )
+def _make_tracking_parts(scenario: str, *thresholds: float | None) -> Iterator[ClaimPart]:
+    for text, metric, max_ratio in zip(("sideslip", "yaw rate"), _ERRORS, thresholds, strict=True):
+        label = f"{text} error, with / without"
+        yield compare(label, scenario, WITH, WITHOUT, max_ratio, metric)
 
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
@@ -79,7 +76,7 @@ CLAIMS = (
         *(
             compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
                 quantity=metric)
-            for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
+            for text, metric in zip(("sideslip", "yaw rate"), _ERRORS, strict=True)
         ),
         note="The feedback's integrals already take away what is constant."),
     claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",

@@ -28,7 +28,6 @@ _FILTERS = (
 )
 _SLALOMS = ((FIG9, "0.2 Hz"), (FASTER, "0.4 Hz"), (PERIODS, "two single periods"))
 
-
 _OPEN, _POOR = (1.4, 0.5), (3.0, 0.3)  # median of HDOP, spread of its logarithm
 _SKIES = (
     ("poor sky, noise law: table", _POOR, "table", 0.97),
@@ -53,7 +52,6 @@ SIMULATIONS = (
 # fmt: on
 
 claim = partial(Claim, PAPER)
-# Formatted by hand: each claim is a paragraph, each part a line.
 # fmt: off
 CLAIMS = (
     claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
@@ -63,8 +61,7 @@ CLAIMS = (
             for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
                 ("double layer", PROPOSED, 0.95))
         ),
-        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name,
-          text in _SLALOMS),
+        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name, text in _SLALOMS),
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
     claim("Fig. 9 (b)", "the smallest error between courses",

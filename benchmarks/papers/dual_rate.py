@@ -13,28 +13,18 @@ _ENV = "sideslip/YawGps-v0"
 
 # every rule has a tuning of its own, found by Nelder-Mead on the logarithms on seeds 1000 to 1011
 # of FIG4; they hold there, at other speeds and rates of the GPS they may diverge
-_TUNED = {
-    rule: dict(zip(("q_beta", "q_gamma", "q_psi", "q_d1", "q_d2", "q_d3"), q, strict=False))
-    for rule, q in (
-        (PSEUDO, (1.9e-5, 1.5e-7, 5.5e-4, 1.1e-7, 35.0, 6e-2)),
-        (CONVENTIONAL, (1.1e-7, 1.4e-2, 5.4e-8, 3.7e-8, 3.4, 9.8e-3)),
-        (HOLDING, (9.6e-6, 1.2e-2, 2.7e-8, 2e-8, 7.6, 2e-2)),
-        (PLAIN, (2.2e-4, 1e-8, 1e-8)),
-    )
-}
-_FILTERS = (
-    PaperFilter(CONVENTIONAL, "dual-rate", {"intersample": "predict", **_TUNED[CONVENTIONAL]}),
-    PaperFilter(HOLDING, "dual-rate", {"intersample": "hold", **_TUNED[HOLDING]}),
-    PaperFilter(PSEUDO, "dual-rate", {"intersample": "pseudo", **_TUNED[PSEUDO]}),
-    PaperFilter(
-        PLAIN, "dual-rate", {"intersample": "predict", "disturbances": "none", **_TUNED[PLAIN]}
-    ),
+_Q = ("q_beta", "q_gamma", "q_psi", "q_d1", "q_d2", "q_d3")
+_RULES: tuple[tuple[str, dict[str, str], tuple[float, ...]], ...] = (
+    (CONVENTIONAL, {"intersample": "predict"}, (1.1e-7, 1.4e-2, 5.4e-8, 3.7e-8, 3.4, 9.8e-3)),
+    (HOLDING, {"intersample": "hold"}, (9.6e-6, 1.2e-2, 2.7e-8, 2e-8, 7.6, 2e-2)),
+    (PSEUDO, {"intersample": "pseudo"}, (1.9e-5, 1.5e-7, 5.5e-4, 1.1e-7, 35.0, 6e-2)),
+    (PLAIN, {"intersample": "predict", "disturbances": "none"}, (2.2e-4, 1e-8, 1e-8)),
+)
+_FILTERS = tuple(
+    PaperFilter(x, "dual-rate", rule | dict(zip(_Q, q, strict=False))) for x, rule, q in _RULES
 )
 
-SIMULATIONS = (
-    EstimationSimulation(FIG4, _ENV, FIG4, _FILTERS),
-    EstimationSimulation(FIG5, _ENV, FIG5, _FILTERS),
-)
+SIMULATIONS = tuple(EstimationSimulation(name, _ENV, name, _FILTERS) for name in (FIG4, FIG5))
 
 
 def _make_order_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart, ...]:
@@ -46,7 +36,6 @@ def _make_order_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart
 
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 4",

@@ -1,8 +1,4 @@
-"""Filters and controllers over the papers' manoeuvres, and the papers' figures.
-
-tie-vision's controllers are measured by the sideslip angle that they leave, dakf-stability's by how
-well the car follows its reference model.
-"""
+"""Filters and controllers over the papers' manoeuvres, and the papers' figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,22 +15,13 @@ from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.scenarios.scenario import Scenario
 from ...estimators.analysis.bound import compute_error_bound
 from ..harness.drives import SETTLED, make_env, make_filter_arguments
-from .ledger import (
-    PAPER_TUNINGS,
-    Example,
-    Numbers,
-    PaperFilter,
-    SeedFunction,
-    Simulation,
-    make_filters,
-)
+from . import ledger
+from .ledger import Example, Numbers, PaperFilter, SeedFunction, Simulation
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
     from ...estimators.estimator import Estimator
-
-_Manoeuvre = str | Mapping[str, Any] | Scenario
 
 
 @dataclass(frozen=True)
@@ -44,7 +31,6 @@ class EstimationSimulation(Simulation):
     Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
     "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
     in which a packet arrives; "last", the mean of beta's error over the last second, its size.
-    Raises ValueError for the bound of a car whose tyres change on the way.
     """
 
     env_id: str
@@ -53,12 +39,7 @@ class EstimationSimulation(Simulation):
     bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
     control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
-    def __post_init__(self) -> None:
-        if self.bound and make_scenario(self.scenario).tyre_change_time is not None:
-            raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
-
-    def prepare(self) -> SeedFunction:
-        """Make the function that drives a seed and runs every filter over its record."""
+    def _prepare(self) -> SeedFunction:
         options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
         env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
         base: Any = env.unwrapped
@@ -72,11 +53,11 @@ class EstimationSimulation(Simulation):
             numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], log)}
             curves = {"truth": truth}
             if not estimators:
-                estimators.update(make_filters(self.filters, base))
+                estimators.update(ledger.make_filters(self.filters, base))
             for label, estimator in estimators.items():
                 estimates = estimator.run(log)
                 curves[label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _compute_errors(label, curves[label], truth, log, base.scenario)
+                numbers |= _compute_errors(label, curves[label], log, base.scenario)
             if self.bound:
                 facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
                 std = compute_error_bound(record=log.record, **facts)
@@ -96,16 +77,11 @@ def _compute_settled_rms(values: Array, log: Log) -> float:
 
 
 def _compute_errors(
-    label: str,
-    estimates: Mapping[str, Array],
-    truth: Mapping[str, Array],
-    log: Log,
-    scenario: Scenario,
+    label: str, estimates: Mapping[str, Array], log: Log, scenario: Scenario
 ) -> Numbers:
+    truth = log.truth
     errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
-    numbers: Numbers = {
-        (label, name): _compute_settled_rms(error, log) for name, error in errors.items()
-    }
+    numbers: Numbers = {(label, x): _compute_settled_rms(y, log) for x, y in errors.items()}
     if "beta" not in estimates:
         return numbers
     t, beta = log.time, estimates["beta"]
@@ -117,54 +93,6 @@ def _compute_errors(
         start, end = scenario.gps_outage
         numbers[label, "outage"] = _rms(errors["beta"][(t >= start) & (t < end)])
     return numbers
-
-
-_ENV_ID = "sideslip/AfsYawFusion-v0"
-_STATES = ("beta", "gamma", "d1", "d2")
-
-
-def run_episode(
-    seed: int,
-    scenario: _Manoeuvre = "dakf-fig7",
-    agent: str = "model-following",
-    estimator: str = "dakf",
-    **options: Any,
-) -> Rollout:
-    """Run an episode at 1 ms with GPS, gyro and camera on board; the estimator uses the GPS.
-
-    Args:
-        seed: Seed of the episode.
-        scenario: Scenario as `make_scenario` reads it.
-        agent: Controller; "none" is the steer-by-wire car without control.
-        estimator: Name of the estimator, tuned for its paper.
-        **options: Options of the controller (`bandwidth`, `rejection`).
-
-    Returns:
-        The episode.
-    """
-    tuned = {"slow": "gps"} | PAPER_TUNINGS.get(estimator, {})
-    estimate = {"outputs": _STATES, "options": tuned}
-    env = make_env(_ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
-    return rollout(env, make_agent(agent, env, **options), seed)
-
-
-def measure_tracking(episode: Rollout) -> dict[str, float]:
-    """Measure how an episode tracks its reference, over all ticks.
-
-    Args:
-        episode: Episode of `run_episode`.
-
-    Returns:
-        RMS errors rms_beta (rad) and rms_gamma (rad/s), peak_beta (rad) of the sideslip angle
-        itself, saturated: fraction of the ticks that command the whole yaw moment, and failed.
-    """
-    return {
-        "rms_beta": _rms(episode["beta"] - episode["beta_ref"]),
-        "rms_gamma": _rms(episode["gamma"] - episode["gamma_ref"]),
-        "peak_beta": float(np.abs(episode["beta"]).max()),
-        "saturated": float(np.mean(np.abs(episode["action_0"]) >= 1.0)),
-        "failed": float(episode.failed),
-    }
 
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
@@ -187,8 +115,7 @@ class _AgentSimulation(Simulation):
     scenario: str | Mapping[str, Any]
     entries: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
 
-    def prepare(self) -> SeedFunction:
-        """Return the function that drives every entry."""
+    def _prepare(self) -> SeedFunction:
         return self._measure_seed
 
     def _measure_seed(self, seed: int) -> tuple[Numbers, Example]:
@@ -240,16 +167,28 @@ class SlipSimulation(_AgentSimulation):
 
 @dataclass(frozen=True)
 class FollowingSimulation(_AgentSimulation):
-    """dakf-stability's controller by wire, with and without parts of it, by `measure_tracking`.
+    """dakf-stability's controller by wire on the GPS, with and without parts of it.
 
-    Entries are options of `run_episode` by label.
+    Entries are options of the controller by label, "agent" another controller, at 1 ms. Numbers of
+    each: RMS errors of slip and yaw rate, peak of the slip, and the fraction of ticks that command
+    the whole yaw moment.
     """
 
     entries: Mapping[str, Mapping[str, Any]]
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        drive = run_episode(seed, self.scenario, **self.entries[label])
-        return drive, measure_tracking(drive)
+        options = {"agent": "model-following", **self.entries[label]}
+        tuned = {"slow": "gps"} | ledger.PAPER_TUNINGS["dakf"]
+        estimate = {"outputs": ("beta", "gamma", "d1", "d2"), "options": tuned}
+        how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
+        env = make_env("sideslip/AfsYawFusion-v0", "dakf", estimate, **how)
+        drive = rollout(env, make_agent(options.pop("agent"), env, **options), seed)
+        return drive, {
+            "rms_beta": _rms(drive["beta"] - drive["beta_ref"]),
+            "rms_gamma": _rms(drive["gamma"] - drive["gamma_ref"]),
+            "peak_beta": float(np.abs(drive["beta"]).max()),
+            "saturated": float(np.mean(np.abs(drive["action_0"]) >= 1.0)),
+        }
 
 
 def _compute_courses(example: Example, labels: Sequence[str]) -> dict[str, Array]:
@@ -285,11 +224,8 @@ def _extract_samples(example: Example, sensor: str, row: int) -> Array:
 
 def _repeat_samples(values: Array) -> Array:
     """Hold samples until the next one, as a controller without an estimator reads them."""
-    known = np.flatnonzero(~np.isnan(values))
-    last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
-    out = np.full(len(values), np.nan)
-    out[last >= 0] = values[known[last[last >= 0]]]
-    return out
+    known = np.where(np.isnan(values), 0, np.arange(len(values)))
+    return values[np.maximum.accumulate(known)]
 
 
 _DERIVED = {"course": _compute_courses, "offset": _select_offsets, "delay": _compute_delays}

@@ -1,12 +1,10 @@
-"""Which claims of the five papers hold? Each claim, what was measured and its verdict; the figures.
-
-Each paper has one to three modules with its simulations, claims and figures, which are data.
-"""
+"""Which claims of the five papers hold? Each with what was measured, its verdict and figures."""
 
 from collections import Counter
 from types import ModuleType
 from typing import NamedTuple
 
+from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
@@ -21,12 +19,9 @@ _MODULES = (
     theory, dakf_stability,
 )  # fmt: skip
 
-SIMULATIONS: dict[str, Simulation] = {
-    simulation.name: simulation for module in _MODULES for simulation in module.SIMULATIONS
-}
+SIMULATIONS: dict[str, Simulation] = {x.name: x for y in _MODULES for x in y.SIMULATIONS}
 CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
 FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
-
 
 NAME = "papers"
 
@@ -49,6 +44,11 @@ class LedgerResults(NamedTuple):
     examples: dict[str, Example | None]
 
 
+def _split_seeds(simulation: Simulation, seeds: int) -> list[tuple[int, ...]]:
+    """Split a simulation's share of some seeds into cases."""
+    return split_seeds(max(1, round(simulation.share * seeds)), simulation.size)
+
+
 def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
     """Measure one simulation on a few of its seeds; case: its name and the seeds."""
     name, seeds = case
@@ -56,9 +56,8 @@ def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
 
 
 def _measure(request: Request) -> LedgerResults:
-    """Run every simulation once, then measure every claim."""
     seeds = request.episodes or 0
-    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
+    cases = [(name, part) for name, x in SIMULATIONS.items() for part in _split_seeds(x, seeds)]
     results: dict[str, SimulationResult] = {}
     for (name, _), result in zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True):
         results[name] = results[name] + result if name in results else result
@@ -67,7 +66,6 @@ def _measure(request: Request) -> LedgerResults:
 
 
 def _compose_verdict(results: LedgerResults) -> str:
-    """Compose the verdict: how many claims hold, which do not."""
     ledger = results.ledger
     counted = Counter(entry.verdict for entry in ledger)
     papers = dict.fromkeys(entry.claim.paper for entry in ledger)
@@ -96,7 +94,6 @@ _RANGE_NOTE = (
 
 
 def _add_tables(suite: Suite, results: LedgerResults) -> None:
-    """Add a row of each part, and the tables of verdicts, remarks, and each paper's numbers."""
     verdicts, remarks, numbers = [], [], dict[str, list[list[str]]]()
     for entry in results.ledger:
         claim = entry.claim
@@ -108,10 +105,8 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
         remarks += [[entry.source, claim.note]] if claim.note else []
         cells = [_format_part(claim.source, item) for item in entry.parts]
         numbers.setdefault(claim.paper, []).extend(cells)
-    header, title = (
-        ("paper", "claim", "verdict", "thresholds"),
-        "The claims and what became of them",
-    )
+    title = "The claims and what became of them"
+    header: tuple[str, ...] = ("paper", "claim", "verdict", "thresholds")
     suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
     suite.tables.append(ResultTable("Why", ("paper", "what was found"), remarks, keyed=False))
     header = ("number", "median [range]", "paper states", "threshold")
@@ -121,7 +116,6 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
 
 
 def _format_part(source: str, item: MeasuredPart) -> list[str]:
-    """Format a part's number, what the paper states of it, and its threshold."""
     part, number = item.part, item.number
     median, low, high = map(_format_number, number)
     shown = median if number.low == number.high else f"{median} [{low}, {high}]"
@@ -137,11 +131,9 @@ def _format_number(value: float) -> str:
 
 
 def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
-    """Format whether a claim's thresholds are met, or how many are not."""
     checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
-    if not checked:
-        return ""
-    return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
+    missed = f"{checked.count(False)} of {len(checked)} MISSED"
+    return missed if False in checked else "met" if checked else ""
 
 
 def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:
@@ -152,12 +144,6 @@ def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:
 
 
 STUDY = Study(
-    NAME,
-    "Which claims of the papers hold",
-    _TEXT,
-    (20, 4),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-    _add_figures,
-)
+    NAME, "Which claims of the papers hold", _TEXT, (20, 4),
+    _measure, _add_tables, _compose_verdict, _add_figures,
+)  # fmt: skip

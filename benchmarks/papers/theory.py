@@ -10,6 +10,7 @@ from fractions import Fraction
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import expm
 
 from ...envs.record import Array
@@ -66,50 +67,41 @@ def compute_difference(maps: list[Array], others: list[Array]) -> float:
     return max(float(np.linalg.norm(a - b)) / size for a, b in zip(maps, others, strict=True))
 
 
-Matrix = list[list[Fraction]]
+Matrix = npt.NDArray[np.object_]
+"""Matrix of fractions."""
 
 
-def _rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
-    """Compute the rank of a matrix of fractions by elimination.
-
-    >>> _rank([[1, 2], [2, 4]]), _rank([[Fraction(1, 3), 0], [0, 1]])
-    (1, 2)
-    """
-    rows = [[Fraction(entry) for entry in row] for row in matrix]
-    done = 0
-    for column in range(len(rows[0])):
-        pivot = next((i for i in range(done, len(rows)) if rows[i][column] != 0), None)
-        if pivot is None:
-            continue
-        rows[done], rows[pivot] = rows[pivot], rows[done]
-        for i in range(done + 1, len(rows)):
-            factor = rows[i][column] / rows[done][column]
-            rows[i] = [a - factor * b for a, b in zip(rows[i], rows[done], strict=True)]
-        done += 1
-    return done
+def _rank(matrix: Matrix) -> int:
+    """Compute the rank of a matrix of fractions by elimination."""
+    rank = 0
+    for column in range(matrix.shape[1]):
+        pivot = next((i for i in range(rank, len(matrix)) if matrix[i, column] != 0), None)
+        if pivot is not None:
+            matrix[[rank, pivot]] = matrix[[pivot, rank]]
+            factors = matrix[rank + 1 :, column] / matrix[rank, column]
+            matrix[rank + 1 :] -= np.outer(factors, matrix[rank])
+            rank += 1
+    return rank
 
 
-def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
+def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[int]]) -> int:
     """Compute the rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D, for the continuous A."""
     # exact sampling cannot raise it, since e^(A T) keeps every A-invariant subspace, nor lower it
     # but for special sampling times
-    block: Matrix = [[Fraction(entry) for entry in row] for row in C]
-    stacked = list(block)
+    blocks = [np.full((len(C), len(A)), Fraction(0))]
+    blocks[0][:, : len(C[0])] += np.array(C)
     for _ in range(len(A) - 1):
-        block = [
-            [sum((a * A[k][j] for k, a in enumerate(row)), Fraction(0)) for j in range(len(A))]
-            for row in block
-        ]
-        stacked += block
-    return _rank(stacked)
+        blocks.append(blocks[-1] @ A)
+    return _rank(np.concatenate(blocks))
 
 
 def _add_disturbances(A: Matrix, rows: int) -> Matrix:
     """Add a constant disturbance behind each of the first rows: dakf-stability (15)-(17)."""
     n = len(A)
-    ends = [[Fraction(int(i == j)) for j in range(rows)] for i in range(n)]
-    zeros = [[Fraction(0)] * (n + rows) for _ in range(rows)]
-    return [a + e for a, e in zip(A, ends, strict=True)] + zeros
+    extended = np.full((n + rows, n + rows), Fraction(0))
+    extended[:n, :n] = A
+    extended[range(rows), range(n, n + rows)] = Fraction(1)
+    return extended
 
 
 def compute_coms_ranks(seed: int) -> tuple[Numbers, None]:
@@ -121,21 +113,16 @@ def compute_coms_ranks(seed: int) -> tuple[Numbers, None]:
     Returns:
         Rank by paper, and no signals.
     """
-    model = linear.make_vision_model(COMS, 25.0 * KMH)
-    vision = [[Fraction(entry) for entry in row] for row in model.A]
-    course = [row[:3] for row in vision[:3]]
+    A = linear.make_vision_model(COMS, 25.0 * KMH).A
+    vision: Matrix = np.array([[Fraction(entry) for entry in row] for row in A])
+    course = vision[:3, :3]
     models: dict[str, tuple[Matrix, list[list[int]]]] = {
         "dakf": (_add_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
         "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
-    ranks: Numbers = {
-        (name, "rank"): float(
-            _compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
-        )
-        for name, (A, C) in models.items()
-    }
-    return ranks, None
+    ranks = {(name, "rank"): _compute_observability_rank(*model) for name, model in models.items()}
+    return {key: float(rank) for key, rank in ranks.items()}, None
 
 
 PAPER = "dual-rate"
@@ -197,14 +184,10 @@ def _measure_gains(seed: int) -> tuple[Numbers, None]:
     return radii, None
 
 
-SIMULATIONS = (
-    Analysis(MAPS, _measure_maps),
-    Analysis(GAINS, _measure_gains),
-    Analysis(RANKS, compute_coms_ranks, share=0.0),
-)
+_RANK = Analysis(RANKS, compute_coms_ranks, share=0.0)
+SIMULATIONS = (Analysis(MAPS, _measure_maps), Analysis(GAINS, _measure_gains), _RANK)
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(33)", "the error dynamics are those of fast measurements",

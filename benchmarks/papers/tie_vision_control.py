@@ -1,16 +1,14 @@
 """tie-vision's controller: feedforward, the loops of Table II, the lane changes of Fig. 8 and 10.
 
-Table II gives two gain margins, 5.92 dB at 15.15 Hz (half of 1 / 33 ms) and 22.8 dB at 477.46 Hz
-(3000 rad/s, probably where a frequency grid ended), for closed-loop poles "at -2 Hz", and nothing
-else: no speed, no Q and R, no discretisation. `_search` tries what is open, for loops of a PI
-on the sideslip angle, opened at the plant's input.
+Table II gives two gain margins for closed-loop poles "at -2 Hz", and nothing else. `_search` tries
+what is open, for loops of a PI on the sideslip angle, opened at the plant's input.
 """
 
 import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +18,7 @@ from scipy.optimize import brentq
 
 from ...agents import make_agent
 from ...agents.controllers.two_dof import CAMERA_PERIOD
-from ...agents.design.pi import PI, PLACEMENTS, POLE, design_pi
+from ...agents.design.pi import PLACEMENTS, POLE, design_pi
 from ...agents.rollout import rollout
 from ...envs.record import Array
 from ...envs.scenarios.draws import KMH
@@ -32,11 +30,10 @@ from .ledger import Analysis, Bound, Claim, ClaimPart, Example, Numbers, compare
 from .manoeuvres import Curves, PaperFigure, SlipSimulation
 
 if TYPE_CHECKING:
-    from control import StateSpace, TransferFunction
-
-    Loop: TypeAlias = StateSpace | TransferFunction
+    from control import StateSpace
 
 Parts = tuple[Array, Array, Array, Array]
+_Complex = npt.NDArray[np.complex128]
 
 PRINTED = (5.92, 22.8)  # dB, single-rate and multirate: Table II of tie-vision
 SENSORS = ("gyro", "vision", "vision-delayed")
@@ -56,11 +53,6 @@ class LoopDesign:
     noise: float = 1e-9  # variance of every measurement over gamma's process variance
 
 
-def _compute_direct_gain(pi: PI, dt: float, integral: str) -> float:
-    """Compute the PI's direct gain; its sum grows by k_i dt error in all three forms."""
-    return pi.k_p + INTEGRALS[integral] * pi.k_i * dt
-
-
 def _make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of PI and plant with beta measured without delay; moment held over dt (s)."""
     import control
@@ -68,7 +60,7 @@ def _make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateS
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
     G, H = make_bicycle_model(vehicle, design.speed).discretise(dt)
     plant = control.StateSpace(G, H[:, 1:], [[1.0, 0.0]], 0.0, dt)
-    direct = _compute_direct_gain(pi, dt, design.integral)
+    direct = pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
     return plant * control.StateSpace(1.0, pi.k_i * dt, 1.0, direct, dt)
 
 
@@ -94,37 +86,23 @@ def _make_filter(
 _pi = lru_cache(maxsize=256)(design_pi)
 
 
-def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Parts]:
-    """Make (A, B, C, D) of the plant and, with negative feedback, of filter and PI."""
-    pi = _pi(vehicle, design.speed, design.pole, design.placement)
-    G, H, C, K = _make_filter(
-        vehicle, design.speed, design.sensors, design.q_ratio, design.noise, dt
-    )
-    F, direct = np.eye(len(G)) - K @ C, _compute_direct_gain(pi, dt, design.integral)
-    beta_x, beta_y = F[:1], K[:1]  # the estimate of beta from the prediction and from y
-    one = np.ones((1, 1))
-    A = np.block([[G @ F - direct * H @ beta_x, H], [-pi.k_i * dt * beta_x, one]])
-    B = np.vstack([G @ K - direct * H @ beta_y, -pi.k_i * dt * beta_y])
-    plant = (G, H, C, np.zeros((len(C), 1)))
-    return plant, (A, B, np.hstack([direct * beta_x, -one]), direct * beta_y)
-
-
 def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
     # The filter's input is the moment that the PI commands: opened behind both, a filter with the
     # right model would not show in the loop at all.
     import control
 
-    plant, asks = _split_loop(vehicle, design, dt)
-    return control.StateSpace(*asks, dt) * control.StateSpace(*plant, dt)
-
-
-def _evaluate_nyquist(parts: tuple[Parts, Parts]) -> float:
-    """Evaluate the loop at z = -1, where it is real."""
-    value = np.eye(1)
-    for A, B, C, D in parts:
-        value = (D - C @ np.linalg.solve(np.eye(len(A)) + A, B)) @ value
-    return float(value[0, 0])
+    pi = _pi(vehicle, design.speed, design.pole, design.placement)
+    covariances = design.q_ratio, design.noise
+    G, H, C, K = _make_filter(vehicle, design.speed, design.sensors, *covariances, dt)
+    # the integral's sum grows by k_i dt error in all three forms
+    F, direct = np.eye(len(G)) - K @ C, pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
+    beta_x, beta_y = F[:1], K[:1]  # the estimate of beta from the prediction and from y
+    one = np.ones((1, 1))
+    A = np.block([[G @ F - direct * H @ beta_x, H], [-pi.k_i * dt * beta_x, one]])
+    B = np.vstack([G @ K - direct * H @ beta_y, -pi.k_i * dt * beta_y])
+    asks = control.StateSpace(A, B, np.hstack([direct * beta_x, -one]), direct * beta_y, dt)
+    return asks * control.StateSpace(G, H, C, np.zeros((len(C), 1)), dt)
 
 
 _GRID: dict[str, tuple[float | str, ...]] = {
@@ -152,11 +130,10 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
         design, differences = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
-            # a screen, before all crossings
-            end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
+            loop = _make_estimator_loop(vehicle, design, dt)
+            end = _compute_response(loop, np.array([-1.0 + 0.0j]))[0].real  # before all crossings
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
                 break
-            loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = _compute_gain_margin(loop)
             is_stable = np.abs(control.feedback(loop, 1).poles()).max() < 1.0
             if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper
@@ -171,16 +148,11 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
 _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
 
 
-def _find_crossings(loop: "Loop") -> Array:
+def _find_crossings(loop: "StateSpace") -> Array:
     """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2)."""
     # L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
     # python-control's `stability_margins` finds crossings by a change of sign, and there is none at
     # the end of the axis. The others are bracketed on a grid and refined.
-    if not loop.isdtime(strict=True) or loop.dt is True:
-        raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
-    if not loop.issiso():
-        sizes = f"{loop.ninputs} x {loop.noutputs}"
-        raise ValueError(f"margins need one input and one output, got {sizes}")
     dt = float(loop.dt)
     top = math.pi / dt
 
@@ -200,7 +172,7 @@ def _find_crossings(loop: "Loop") -> Array:
     return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
 
 
-def _compute_gain_margin(loop: "Loop") -> tuple[float, float]:
+def _compute_gain_margin(loop: "StateSpace") -> tuple[float, float]:
     """Compute the smallest gain (dB) above 1 with which a loop reaches -1, and its rad/s."""
     margins = _find_crossings(loop)
     rising = margins[margins[:, 0] > 1.0]
@@ -210,10 +182,8 @@ def _compute_gain_margin(loop: "Loop") -> tuple[float, float]:
     return 20.0 * math.log10(factor), float(omega)
 
 
-def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-    """Compute a loop's response at points z, (n,); one solve takes all points of a state space."""
-    if not hasattr(loop, "A"):
-        return np.asarray(loop(z))
+def _compute_response(loop: "StateSpace", z: _Complex) -> _Complex:
+    """Compute a loop's response at points z, (n,), by one solve."""
     shifted = z[:, None, None] * np.eye(len(loop.A)) - loop.A
     return np.asarray((loop.C @ np.linalg.solve(shifted, loop.B[None]) + loop.D)[:, 0, 0])
 
@@ -241,7 +211,7 @@ def _measure_static_slip(_: int) -> tuple[Numbers, None]:
 
 def _compute_margin_gain(design: LoopDesign) -> float:
     """Compute by how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
-    loops = [_make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK)]
+    loops = (_make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK))
     slow, fast = (_compute_gain_margin(loop)[0] for loop in loops)
     return float(fast - slow)
 
@@ -289,7 +259,6 @@ SIMULATIONS = (
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("(24)", "the feedforward brings the static slip to zero",
@@ -333,11 +302,10 @@ CLAIMS = (
         compare("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
             quantity="total_variation")),
     claim("Fig. 8", "the gain margins of both control systems were set to be the same",
-        ClaimPart(
-            "share of time at the yaw moment's limit, multirate with single-rate's margin", FIG8,
-            EQUAL, "saturation", metric="share"),
-        ClaimPart("its slip / multirate with the same PI", FIG8,
-            EQUAL, "rms_slip", rivals=(MULTI,)),
+        ClaimPart("share of time at the yaw moment's limit, multirate with single-rate's margin",
+            FIG8, EQUAL, "saturation", metric="share"),
+        ClaimPart("its slip / multirate with the same PI", FIG8, EQUAL, "rms_slip",
+            rivals=(MULTI,)),
         note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
         "limit to limit with the noise."),
     claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",

@@ -46,7 +46,6 @@ def _make_best_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart,
 
 
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 7", "the bicycle model's filter is the poorest",

@@ -36,7 +36,6 @@ SIMULATIONS = (
 
 _NOISES = ((FIG5, ""), (NOISY, ", three times the noise"))
 claim = partial(Claim, PAPER)
-# A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Sec. 1.3", "slip is observable from vision alone",

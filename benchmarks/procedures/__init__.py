@@ -1,6 +1,5 @@
-"""Standard test procedures: what is driven, what is measured, what passes; one module a standard.
+"""Standard test procedures, one module a standard: what is driven, what is measured, what passes.
 
-A procedure drives a car through `drive.DriveFunction`, a function from a scenario's fields to the
-time series of what the car did, so that the same code tests an environment of ours with any
-controller and an outside plant. Criteria are pure functions of these series.
+A procedure drives a car through `drive.DriveFunction`, whether that is an environment of ours with
+any controller or an outside plant; criteria are pure functions of the time series.
 """

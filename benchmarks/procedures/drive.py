@@ -1,7 +1,4 @@
-"""A drive: from a scenario's fields to the time series of what the car did.
-
-Cars and controllers under test are drives too: of an environment of ours or of an outside plant.
-"""
+"""A drive: from a scenario's fields to what the car did over time; the cars and the controllers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +10,7 @@ from ...agents import Agent, make_agent
 from ...agents.learned.policy import load_policy
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
+from ...envs.task import make_reference_params
 from ...envs.vehicle.parameters import COMS, PASSENGER_CAR, Vehicle
 from ..control.entries import ControlCase, Entry
 from ..control.tasks import STEERING, ControlTask
@@ -20,12 +18,8 @@ from ..harness.drives import make_env
 
 Fields = Mapping[str, Any]
 
-CALM: dict[str, Any] = {
-    "name": "procedure",
-    "disturbance_force": 0.0,
-    "disturbance_moment": 0.0,
-    "half_width": 1e6,  # m
-}
+CALM: dict[str, Any] = {"name": "procedure", "half_width": 1e6}  # m
+CALM |= {"disturbance_force": 0.0, "disturbance_moment": 0.0}
 """A proving ground without wind: what every procedure's scenario starts from."""
 
 
@@ -44,11 +38,6 @@ class Series:
     moment: Array  # N m, the yaw moment delivered
     failed: bool = False  # the episode ended by a failure
 
-    def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            if name != "failed" and values.shape != self.t.shape:
-                raise ValueError(f"{name} has shape {values.shape}, the times {self.t.shape}")
-
     @property
     def beta(self) -> Array:
         """The sideslip angle (rad)."""
@@ -58,19 +47,6 @@ class Series:
     def a_y(self) -> Array:
         """The lateral acceleration (m/s2), v_y' + v_x gamma."""
         return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
-
-    def interpolate(self, name: str, time: float) -> float:
-        """Interpolate a signal between two samples.
-
-        Args:
-            name: Name of the signal.
-            time: Time (s).
-
-        Returns:
-            Value; NaN after the end.
-        """
-        values = np.asarray(getattr(self, name))
-        return float(np.interp(time, self.t, values, right=np.nan))
 
 
 POSE = 6  # numbers of a `Motion` in a series, from v_x to Y
@@ -89,6 +65,11 @@ class TestCar:
     front_overhang: float  # m, of its body, from the front axle forward
 
     __test__ = False  # pytest would take it for tests
+
+    @property
+    def understeer_gradient(self) -> float:
+        """The understeer gradient K of the linear model (rad s2/m)."""
+        return float(make_reference_params(self.vehicle).G) * self.vehicle.wheelbase
 
 
 ENV_ID = STEERING.replace("-v0", "-v1")  # of every drive
@@ -170,11 +151,9 @@ class ProcedureEntry:
 
 
 _POLICIES = {"coms": "distill-coms-steering", "passenger-car": "distill-car-steering"}
-_FORCES: dict[str, Any] = {
-    "outputs": ["beta", "gamma", "F_d", "N_d"],
-    "options": {"slow": ["camera", "gps"]},
-}
-_TYRES = {"outputs": [*_FORCES["outputs"], "front_tyres", "rear_tyres", "inverse_friction"]}
+_STATES = ["beta", "gamma", "F_d", "N_d"]
+_FORCES: dict[str, Any] = {"outputs": _STATES, "options": {"slow": ["camera", "gps"]}}
+_TYRES = {"outputs": [*_STATES, "front_tyres", "rear_tyres", "inverse_friction"]}
 ENTRIES = (
     ProcedureEntry("none"),
     ProcedureEntry("two-dof", "exact-kf", _FORCES),

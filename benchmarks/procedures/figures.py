@@ -50,11 +50,8 @@ def _draw_yaw_rates(done: CaseResults) -> go.Figure:
     """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
     drives = {case.agent: results[0].shown for case, results in done.items()}
     t = max((shown.t for shown in drives.values()), key=len)
-    series = {
-        agent: _compute_shares(shown, t)
-        for agent, shown in drives.items()
-        if shown.t[-1] >= fmvss126.COMPLETION
-    }
+    whole = {agent: x for agent, x in drives.items() if x.t[-1] >= fmvss126.COMPLETION}
+    series = {agent: _compute_shares(shown, t) for agent, shown in whole.items()}
     figure = draw_time_series(t, series, "yaw rate / its peak after the reversal")
     for time, max_ratio in fmvss126.RATIOS:
         position = fmvss126.COMPLETION + time
@@ -77,11 +74,10 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
     starts = {case: run.speed * iso3888.ONSET for case, run in done.items()}
     paths = {x.agent: (run.series.X - starts[x], run.series.Y) for x, run in done.items()}
     case, run = list(done.items())[-1]
-    lanes = iso3888.make_lanes(CARS[case.car], case.procedure, run.speed)
     figure = draw_track(paths)
     places = [
         (x - starts[case], lane.offset + side * 0.5 * lane.width)
-        for lane in lanes
+        for lane in run.lanes
         for x in np.linspace(lane.start, lane.start + lane.length, 5)
         for side in (-1.0, 1.0)
     ]
@@ -94,7 +90,6 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
 
 
 def _draw_bode(result: iso7401.Transient) -> go.Figure:
-    """Draw magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
         measured, linear = result.sweep[name], result.linear_sweep[name]

@@ -1,17 +1,11 @@
 """ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
 
-The lanes are `make_sections`; a driver model steers. A car hits a cone where any part of
-its body, a rectangle, is outside a lane while within its length. Part 1 is driven at a held speed,
-part 2 coasting. A driver may try again: at every speed each driver of `DRIVERS` goes until one hits
-no cone. The result is the highest speed of a clean run, which is that of the car and our drivers
-together: they do not reach what test drivers do.
-
-A car built for lower speeds drives tracks shortened by a fixed share of their lengths: that of its
-own speed to the standards' 80 km/h. Lane widths go by the car's width as the standards have it.
+Part 1 is driven at a held speed, part 2 coasting, until one of `DRIVERS` hits no cone: the highest
+clean speed is that of car and drivers together, below what test drivers do. A slower car's tracks
+are shortened by its own speed over the standards' 80 km/h, but for the widths of the lanes.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +29,7 @@ class TrackRun:
     """One run through a track."""
 
     speed: float  # m/s
+    lanes: tuple[Section, ...]  # where the car drives them
     margins: tuple[float, ...]  # m, by lane, to its edge; below 0 a cone falls, NaN: not driven
     series: Series
 
@@ -86,17 +81,8 @@ def _compute_margin(body: Array, lane: Section) -> float:
     return 0.5 * lane.width - max_offset
 
 
-def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
-    """Make the lanes where the car drives them.
-
-    Args:
-        car: Car under test, with speed and steering ratio.
-        track: One of `TRACKS`.
-        speed: Speed (m/s).
-
-    Returns:
-        Lanes in the order in which they are driven.
-    """
+def _make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
+    """Make the lanes where the car drives them, in their order."""
     return make_sections(track, car.vehicle.width, speed * ONSET, _compute_length_share(car))
 
 
@@ -110,42 +96,32 @@ def _make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
     last = make_sections(track, car.vehicle.width, 0.0, _compute_length_share(car))[-1]
     way = last.start + last.length + RUN_OUT
     return {
-        "steering": "driver",
-        "path": track,
-        "path_speed": speed / _compute_length_share(car),
-        "onset": ONSET,
-        "speed": speed,
-        "acceleration": None if track == TRACKS[0] else 0.0,
+        "steering": "driver", "path": track, "path_speed": speed / _compute_length_share(car),
+        "onset": ONSET, "speed": speed, "acceleration": None if track == TRACKS[0] else 0.0,
         "duration": ONSET + 1.3 * way / speed,  # a coasting car is slower
-    }
+    }  # fmt: skip
 
 
 def _evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
-    """Evaluate a run's margins."""
-    body, lanes = _compute_corners(series, car), make_lanes(car, track, speed)
-    return TrackRun(speed, tuple(_compute_margin(body, lane) for lane in lanes), series)
+    body, lanes = _compute_corners(series, car), _make_lanes(car, track, speed)
+    return TrackRun(speed, lanes, tuple(_compute_margin(body, lane) for lane in lanes), series)
 
 
-def _try_speed(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
-    """Try a speed (m/s): the first clean run of a driver, or the one that came closest to it."""
-    runs, fields = [], _make_lane_change(car, track, speed)
-    for driver in DRIVERS:
-        runs.append(_evaluate_run(drive({**fields, **driver}), car, track, speed))
-        if runs[-1].passed:
-            return runs[-1]
-    return max(runs, key=lambda track_run: track_run.min_margin)
-
-
-def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float]) -> list[TrackRun]:
-    """Drive one attempt at each speed.
+def run(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
+    """Try a speed with each driver until one is clean.
 
     Args:
         drive: Function that drives the car through a scenario.
         car: Car under test, with speed and steering ratio.
         track: One of `TRACKS`.
-        speeds: Speeds (m/s).
+        speed: Speed (m/s).
 
     Returns:
-        Run of the best driver at each speed.
+        The clean run, or the one that came closest to it.
     """
-    return [_try_speed(drive, car, track, speed) for speed in speeds]
+    runs, fields = list[TrackRun](), _make_lane_change(car, track, speed)
+    for driver in DRIVERS:
+        runs.append(_evaluate_run(drive({**fields, **driver}), car, track, speed))
+        if runs[-1].passed:
+            break
+    return max(runs, key=lambda track_run: track_run.min_margin)

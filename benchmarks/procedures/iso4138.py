@@ -1,8 +1,7 @@
 """ISO 4138: steady-state circular driving, constant steering angle with slowly rising speed.
 
-The handling diagram is l gamma / v_x - delta_f over the lateral acceleration; its slope is minus
-the understeer gradient K: delta_f = l / R + K a_y. Of the linear model it is l times the stability
-factor G of dakf-stability (24).
+The handling diagram is l gamma / v_x - delta_f over a_y; its slope is minus the understeer gradient
+K: delta_f = l / R + K a_y. The linear model's is l times G of dakf-stability (24).
 """
 
 from dataclasses import dataclass
@@ -10,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...envs.record import Array
-from ...envs.task import make_reference_params
-from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import GRAVITY
 from .drive import DriveFunction, Series, TestCar
 
 _SETTLE = 3.0  # s, at the first speed
@@ -28,30 +26,18 @@ class Handling:
     theory: float  # K of the linear model
 
 
-def compute_understeer_gradient(vehicle: Vehicle) -> float:
-    """Compute the understeer gradient of the linear model.
-
-    Args:
-        vehicle: Vehicle of the linear model.
-
-    Returns:
-        Gradient K (rad s2/m).
-    """
-    return float(make_reference_params(vehicle).G) * vehicle.wheelbase
-
-
-def _compute_handling(series: Series, vehicle: Vehicle) -> Handling:
+def _compute_handling(series: Series, car: TestCar) -> Handling:
     """Compute a circle's handling diagram and slope; ValueError where it stays below 0.25 g."""
     settled = series.t >= _SETTLE
     side = np.sign(np.mean(series.gamma[settled]))
     a_y = side * (series.v_x * series.gamma)[settled]  # quasi-steady: v_y' is left out
-    path = vehicle.wheelbase * side * (series.gamma / series.v_x)[settled]
+    path = car.vehicle.wheelbase * side * (series.gamma / series.v_x)[settled]
     angle = path - side * series.steer[settled]
     linear = (a_y >= LINEAR_FROM) & (a_y <= LINEAR_TO)
     if a_y.max() < LINEAR_TO or linear.sum() < 2:
         raise ValueError(f"the circle reached {a_y.max():.2f} m/s2, not {LINEAR_TO:.2f}")
     slope = float(np.polyfit(a_y[linear], angle[linear], 1)[0])
-    return Handling(a_y, angle, -slope, compute_understeer_gradient(vehicle))
+    return Handling(a_y, angle, -slope, car.understeer_gradient)
 
 
 def run(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
@@ -65,12 +51,12 @@ def run(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
     Returns:
         The handling diagram.
     """
-    v, K = car.speed, compute_understeer_gradient(car.vehicle)
-    steer = (car.vehicle.wheelbase / v**2 + K) * (0.5 * GRAVITY)
+    v = car.speed
+    steer = (car.vehicle.wheelbase / v**2 + car.understeer_gradient) * (0.5 * GRAVITY)
     first = 0.2 * v
     circle = {
         "steering": "held-step", "amplitude": steer, "onset": 0.0, "speed": first,
         "speed_change": v - first, "change_start": _SETTLE, "change_length": seconds,
         "duration": _SETTLE + seconds,
     }  # fmt: skip
-    return _compute_handling(drive(circle), car.vehicle)
+    return _compute_handling(drive(circle), car)

@@ -1,13 +1,8 @@
 """ISO 7401: lateral transient response, by a step of the steering angle and by a swept sine.
 
-Step: times count from where the steering angle passes half its end value; the response time is
-that to 90 % of the steady state, the peak response time that to the peak, the overshoot the peak
-over the steady state less one.
-
-Swept sine: the frequency response is S_xy / S_xx of Welch's averaged periodograms (H1), with the
-coherence and from it the standard deviation of the estimate, |H| sqrt((1 - c) / (2 c n)) over n
-segments (Bendat and Piersol, Random Data, 9.2). It is held against the linear model's
-C (j w I - A)^-1 B + D, where a_y = V (beta' + gamma).
+A step's times count from where the steering angle passes half its end value. The sweep's frequency
+response is S_xy / S_xx of Welch's averaged periodograms, whose standard deviation follows from the
+coherence (Bendat and Piersol, Random Data, 9.2), beside the linear model's C (j w I - A)^-1 B + D.
 """
 
 import math
@@ -20,7 +15,6 @@ from ...envs.record import Array
 from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
-from .iso4138 import compute_understeer_gradient
 
 _Complex = npt.NDArray[np.complex128]
 
@@ -37,8 +31,8 @@ class StepResponse:
     """The numbers of a step of the steering angle."""
 
     gain: float  # steady state per rad of steering
-    response_time: float  # s
-    peak_time: float  # s
+    response_time: float  # s, to 90 % of the steady state
+    peak_time: float  # s, to the peak
     overshoot: float  # fraction of the steady state
 
 
@@ -126,7 +120,6 @@ def _compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict
 
 
 def _compute_responses(series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of yaw rate and lateral acceleration after a step."""
     t, steer = series.t, series.steer
     return {name: _compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
 
@@ -164,7 +157,7 @@ def run(drive: DriveFunction, car: TestCar) -> Transient:
         The responses.
     """
     vehicle, speed = car.vehicle, car.speed
-    per = vehicle.wheelbase / speed**2 + compute_understeer_gradient(vehicle)  # rad s2/m
+    per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m
     stepped = drive(_make_step(car, per * _STEP_AT))
     sweep = _run_sweep(drive, car, per * _SWEEP_AT)
     linear_step = _compute_linear_step(vehicle, speed, stepped)

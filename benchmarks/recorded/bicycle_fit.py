@@ -6,6 +6,7 @@ its first second, in which the unknown start is forgotten, does not count.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,17 +17,11 @@ from scipy.stats import t as student
 
 from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.vehicle.dynamics import (
-    CarParams,
-    DisturbanceForces,
-    Motion,
-    RoadParams,
-    derivative,
-    rk4,
-)
+from ...envs.vehicle import dynamics
+from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, PlantVariant, TyreInputs, compute_tyre_load
-from .emulate import compute_ground_speed, compute_heading
+from .emulate import LoggedMotion
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 _BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
@@ -62,14 +57,11 @@ inertia, one of I/(m l_f l_r), is narrow: with both stiffnesses it leaves the ya
 
 @dataclass(frozen=True)
 class Windows:
-    """Drives on the fit's grid and where windows start on it.
+    """Drives on the fit's grid and where windows start on it."""
 
-    Rows are smoothed gyro, accel_y, speed, steering, left and right torque, of which the last three
-    acted until their row; the integral of the gyro, and the GPS's course less that, NaN without a
-    fix.
-    """
-
-    rows: Array  # channels, shape (8, n)
+    # smoothed gyro, accel_y, speed, steering, left and right torque (these three acted until their
+    # row), the integral of the gyro, the GPS's course less that, NaN without a fix: shape (8, n)
+    rows: Array
     starts: npt.NDArray[np.int64]  # first row of each window, shape (count,)
     stretch: npt.NDArray[np.int64]  # stretch of the log of each window, shape (count,)
     dt: float  # step (s)
@@ -101,10 +93,10 @@ def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]])
     before, after = (round(s / (every * dt)) for s in (_MARGIN, _BURN + _WINDOW + 2.0 * _MARGIN))
     pieces, starts = [], []
     for log, out in zip(logs, left_out, strict=True):
-        fast = log.record.fast.T
+        fast, motion = log.record.fast.T, LoggedMotion(log)
         rows = np.stack([
-            fast[FAST.gyro], fast[FAST.accel_y], compute_ground_speed(log), fast[FAST.steer],
-            fast[FAST.torque_left], fast[FAST.torque_right], compute_heading(log),
+            fast[FAST.gyro], fast[FAST.accel_y], motion.speed, fast[FAST.steer],
+            fast[FAST.torque_left], fast[FAST.torque_right], motion.heading,
             np.zeros(len(log.time)),
         ])  # fmt: skip
         rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
@@ -133,7 +125,7 @@ def _compute_courses(log: Log, every: int, count: int) -> Array:
     packets = log.record.select_packets("gps")
     fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
     places = fixes[:, PACKET.captured] - log.record.first
-    turned = np.interp(places, np.arange(len(log.time)), compute_heading(log))
+    turned = np.interp(places, np.arange(len(log.time)), LoggedMotion(log).heading)
     near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
     courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
     return courses
@@ -144,9 +136,8 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
     """The plant's load in row i with the steering logged at a place between the rows."""
     j = min(max(int(np.floor(place)), 0), rows.shape[1] - 2)
     logged = rows[3, j] + (place - j) * (rows[3, j + 1] - rows[3, j])
-    return compute_tyre_load(
-        TyreInputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i]), car, 0, 1
-    )
+    inputs = TyreInputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i])
+    return compute_tyre_load(inputs, car, 0, 1)
 
 
 @jit
@@ -162,8 +153,8 @@ def _simulate_windows(
         fixed[10], fixed[11], fixed[12], fixed[13], fixed[14], 0.0, 0.0, mu, 0.0, 0.0,
         1.0, 1.0, 0.0,
     )  # fmt: skip
-    road = RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    push = DisturbanceForces(0.0, 0.0, 0.0)
+    road = dynamics.RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    push = dynamics.DisturbanceForces(0.0, 0.0, 0.0)
     variant = PlantVariant(0, law, roll)
     for w in range(len(starts)):
         at = starts[w]
@@ -178,10 +169,10 @@ def _simulate_windows(
             before, after = after, _compute_load(rows, i, late + 0.5, theta, car)
             loads = (before, _compute_load(rows, i, late, theta, car), after)
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot, 0.0, 0.0)
-            motion = rk4(motion, loads, push, car, road, h, variant)
+            motion = dynamics.rk4(motion, loads, push, car, road, h, variant)
             v_y, gamma, phi, phi_dot = motion.v_y, motion.gamma, motion.phi, motion.phi_dot
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot, 0.0, 0.0)
-            slope = derivative(motion, after, push, car, road, variant)
+            slope = dynamics.derivative(motion, after, push, car, road, variant)
             out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
             out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
@@ -273,23 +264,17 @@ class BicycleFit:
         rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
         return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))
 
-    def half(self, name: str) -> float:
-        """Compute half of the 95 % interval: a jackknife, and the priors' part.
-
-        Args:
-            name: Name of a parameter.
-
-        Returns:
-            Half of the interval, infinite if the parameter is not free.
-        """
-        count = len(self.g)
-        if name not in self.free or count < 2:
-            return float("inf")
-        at = self.free.index(name)
+    @cached_property
+    def halves(self) -> dict[str, float]:
+        """Halves of the free parameters' 95 % intervals: a jackknife, and the priors' part."""
+        count, inverse = len(self.g), np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))
         moves = np.array([self.estimate_shift(one) for one in np.eye(count, dtype=bool)])
-        pulled = np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))[at]
-        variance = (count - 1) / count * np.sum(moves[:, at] ** 2) + pulled**2 @ self.prior
-        return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
+        variances = [
+            (count - 1) / count * np.sum(move**2) + pulled**2 @ self.prior
+            for move, pulled in zip(moves.T, inverse, strict=True)
+        ]
+        reach = student.ppf(0.975, count - 1)
+        return {x: float(reach * np.sqrt(v)) for x, v in zip(self.free, variances, strict=True)}
 
 
 def _estimate_noise_levels(left: Array, dt: float) -> Array:

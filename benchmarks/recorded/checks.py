@@ -4,11 +4,13 @@ A check is a function of a drive that yields findings; `CHECKS` names them. Limi
 the filter `joint` allows for, or what an ordinary car of world v1 shows.
 """
 
+import copy
 import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,15 +21,7 @@ from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
 from ...estimators.wires import SignalCalibration, apply_wires
-from .emulate import (
-    COURSE,
-    MIN_SPEED,
-    collect_fixes,
-    compute_ground_speed,
-    compute_heading,
-    find_latency,
-    find_moving,
-)
+from .emulate import COURSE, MIN_SPEED, LoggedMotion, collect_fixes, find_latency
 from .identify import estimate_slips
 from .quality import (
     BLOCKER,
@@ -58,10 +52,6 @@ _RESOLUTION = {  # SI, noise that filters assume at least; even steps have sqrt(
 _SCALES = {  # ordinary: 1 % of a gyro and other tyres; 1.3 % and wear of a wheel; another roll
     "yaw_rate": 0.05, "speed_x": 0.04, "accel_y": 0.12,
 }  # fmt: skip
-_ADVICE = {
-    "accel_y": "log accel_y: it shows tyres that slide",
-    "course": "log a GPS's course: it alone shows the slip itself",
-}
 
 
 @dataclass
@@ -81,7 +71,9 @@ class InspectedDrive:
         if not 1.0 / FACTOR < ratio < FACTOR and not math.isnan(ratio):
             text, cure = f"{ratio:.3g} times gps_speed: another unit?", "--map speed_x_kmh=COLUMN"
             of_speed = [LogFinding("unit", BLOCKER, "speed_x", text, cure)]
-            logs = [_divide_wheels(log, ratio) for log in logs]
+            logs = [copy.deepcopy(log) for log in logs]
+            for log in logs:
+                log.record.fast[:, [FAST.wheel_left, FAST.wheel_right]] /= ratio
         findings = find_contradictions(logs, self.car) if logs else []
         late = self._find_lateness(logs) if any(map(_is_course, findings)) else 0.0
         if late:  # a late course does not follow the gyro, but later it does
@@ -92,22 +84,18 @@ class InspectedDrive:
 
     def _compose_cure(self, finding: LogFinding) -> LogFinding:
         """Put what is stated already into a cure of the steering: an option replaces it."""
-        if finding.channel == "steering" and finding.check == "sign":
-            cure = f"--steering-sign {-self.wires.sign}"
-        elif finding.channel == "steering" and finding.check == "ratio":
+        if finding.channel != "steering" or finding.check not in ("sign", "ratio"):
+            return finding
+        cure = f"--steering-sign {-self.wires.sign}"
+        if finding.check == "ratio":
             ratio = float(finding.cure.split()[1]) * self.wires.ratio
             cure = f"--steering-ratio {ratio:.3g}"
-        else:
-            return finding
         text = finding.text.replace(finding.cure, cure)
         return dataclasses.replace(finding, text=text, cure=cure)
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
-        blocks = list[Array]()
-        for log in (log for log in logs if "gps" in log.slow):
-            heading = compute_heading(log)
-            blocks += collect_fixes(log, COURSE, heading, 0.0 * heading, _TIMES)
+        blocks = collect_fixes(logs, COURSE, None, _TIMES)
         late = find_latency(blocks, _TIMES, 0.0)[0] if blocks else 0.0
         return late if 0.0 < late < _TIMES[-2] else 0.0
 
@@ -116,31 +104,22 @@ class InspectedDrive:
         """Moving parts with the model's sideslip for truth; none where columns contradict."""
         if any(finding.level == BLOCKER for finding in self.contradictions):
             return []
-        parts = [log for log in self.logs if find_moving(log).sum() * log.record.dt > 2.0]
-        slips = estimate_slips(parts, self.car) if parts else []
-        return [
-            dataclasses.replace(log, truth={"beta": slip})
-            for log, slip in zip(parts, slips, strict=True)
-        ]
+        seconds = [LoggedMotion(log).is_moving.sum() * log.record.dt for log in self.logs]
+        parts = [log for log, x in zip(self.logs, seconds, strict=True) if x > 2.0]
+        slips = estimate_slips(parts, self.car, SignalCalibration()) if parts else []
+        pairs = zip(parts, slips, strict=True)
+        return [dataclasses.replace(log, truth={"beta": slip}) for log, slip in pairs]
 
 
-def _judge(
-    check: str, channel: str, is_wrong: bool, text: str, cure: str = "", level: str = WARNING
-) -> LogFinding:
+def _judge(check: str, channel: str, is_wrong: bool, text: str, cure: str) -> LogFinding:
     """A finding that is OK, and then without a cure, or not."""
-    return LogFinding(check, level if is_wrong else OK, channel, text, cure if is_wrong else "")
+    level, cure = (WARNING, cure) if is_wrong else (OK, "")
+    return LogFinding(check, level, channel, text, cure)
 
 
 def _is_course(finding: LogFinding) -> bool:
     """Whether it says that the course does not follow the gyro."""
     return finding.channel == "course" and finding.check in ("unrelated", "unit")
-
-
-def _divide_wheels(log: Log, ratio: float) -> Log:
-    """The log with the speed of its wheels divided."""
-    fast = log.record.fast.copy()
-    fast[:, [FAST.wheel_left, FAST.wheel_right]] /= ratio
-    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
 
 def _divide(y: Array, x: Array) -> tuple[float, float]:
@@ -162,20 +141,23 @@ def _divide_speeds(logs: Sequence[Log]) -> float:
         fixes = log.record.select_packets("gps")
         rows = (fixes[:, PACKET.captured] - log.record.first).astype(int)
         inside = (rows >= 0) & (rows < len(log.time)) & (fixes[:, PACKET.value + 1] > MIN_SPEED)
-        ratios.append(compute_ground_speed(log)[rows[inside]] / fixes[inside, PACKET.value + 1])
+        ratios.append(LoggedMotion(log).speed[rows[inside]] / fixes[inside, PACKET.value + 1])
     merged = np.concatenate(ratios)
     return float(np.median(merged)) if len(merged) >= 20 else math.nan
 
 
 def _check_missing(drive: InspectedDrive) -> Iterator[LogFinding]:
     for name in NEEDED:
-        text, cure = "no such column", f"--map {name}_UNIT=COLUMN"
         if name not in drive.values:
-            yield LogFinding("missing", BLOCKER, name, text, cure)
+            cure = f"--map {name}_UNIT=COLUMN"
+            yield LogFinding("missing", BLOCKER, name, "no such column", cure)
     slow = any(names[0] in drive.values for names in SENSORS.values())
-    for name, is_there in (("accel_y", "accel_y" in drive.values), ("course", slow)):
+    for name, is_there, cure in (
+        ("accel_y", "accel_y" in drive.values, "log accel_y: it shows tyres that slide"),
+        ("course", slow, "log a GPS's course: it alone shows the slip itself"),
+    ):
         text = "logged" if is_there else "no such column"
-        yield _judge("missing", name, not is_there, text, _ADVICE[name])
+        yield _judge("missing", name, not is_there, text, cure)
 
 
 def _check_stamps(drive: InspectedDrive) -> Iterator[LogFinding]:
@@ -222,7 +204,7 @@ def _check_sampling(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 def _check_stuck(drive: InspectedDrive) -> Iterator[LogFinding]:
     for log in drive.logs:
-        fast, speed, dt = log.record.fast, compute_ground_speed(log), log.record.dt
+        fast, speed, dt = log.record.fast, LoggedMotion(log).speed, log.record.dt
         turning, pulled = speed * fast[:, FAST.gyro], np.cumsum(fast[:, FAST.accel_x]) * dt
         others = {"gyro": fast[:, FAST.accel_y], "accel_y": turning, "steer": turning}
         width = max(round(0.2 / dt), 1)
@@ -239,10 +221,6 @@ def _check_stuck(drive: InspectedDrive) -> Iterator[LogFinding]:
             text = f"no change for {(stop - start) * dt:.3g} s, while others show {moved:.2g} m/s2"
             stuck = bool(moved > max(_MOVES, 0.5 * size))
             yield _judge("stuck", _COLUMNS[name], stuck, text, "leave such rows empty")
-
-
-def _check_contradictions(drive: InspectedDrive) -> Iterator[LogFinding]:
-    yield from drive.contradictions
 
 
 def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
@@ -272,7 +250,7 @@ def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     rest = [np.zeros(0)]
     for log in drive.logs:
-        still = np.abs(compute_ground_speed(log)) < _STANDING
+        still = np.abs(LoggedMotion(log).speed) < _STANDING
         rest.append(log.record.fast[still, FAST.gyro])
     gyro, bias, where = np.concatenate(rest), 0.0, "at rest"
     if drive.logs and len(gyro) * drive.logs[0].record.dt > _REST:
@@ -307,9 +285,8 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
-    blocks = []
-    for log in (log for log in drive.judged if "gps" in log.slow):
-        blocks += collect_fixes(log, COURSE, compute_heading(log), log.truth["beta"], _TIMES)
+    slips = [log.truth["beta"] for log in drive.judged]
+    blocks = collect_fixes(drive.judged, COURSE, slips, _TIMES)
     if not blocks:
         return
     half = len(blocks) // 2
@@ -340,12 +317,9 @@ def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:
-    moving = [compute_ground_speed(log)[find_moving(log)] for log in drive.logs]
-    turning = [
-        speed * log.record.fast[find_moving(log), FAST.gyro]
-        for speed, log in zip(moving, drive.logs, strict=True)
-    ]
     if drive.logs:
+        motions = [(log.record.fast, LoggedMotion(log)) for log in drive.logs]
+        turning = [(x.speed * fast[:, FAST.gyro])[x.is_moving] for fast, x in motions]
         merged = np.concatenate(turning)
         size = float(np.std(merged)) if len(merged) else 0.0
         text = f"speed x yaw rate has {size:.2g} m/s2 RMS above {MIN_SPEED:g} m/s"
@@ -353,13 +327,13 @@ def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:
         yield _judge("excitation", "yaw_rate", size < MIN_TURNING, text, cure)
 
 
-CHECKS: dict[str, Callable[[InspectedDrive], Iterator[LogFinding]]] = {
+CHECKS: dict[str, Callable[[InspectedDrive], Iterable[LogFinding]]] = {
     "missing channels": _check_missing,
     "stamps": _check_stamps,
     "gaps": _check_gaps,
     "held or interpolated": _check_sampling,
     "stuck": _check_stuck,
-    "swapped, signs, units, jumps, limits": _check_contradictions,
+    "swapped, signs, units, jumps, limits": operator.attrgetter("contradictions"),
     "scales": _check_scale,
     "biases": _check_bias,
     "clocks": _check_clocks,
@@ -367,16 +341,3 @@ CHECKS: dict[str, Callable[[InspectedDrive], Iterator[LogFinding]]] = {
     "excitation": _check_excitation,
 }
 """What is asked of a log; another check is another line."""
-
-
-def check_drive(drive: InspectedDrive) -> list[LogFinding]:
-    """Run all checks on a drive.
-
-    Args:
-        drive: The drive.
-
-    Returns:
-        Findings, the worst level first.
-    """
-    findings = [finding for check in CHECKS.values() for finding in check(drive)]
-    return sorted(findings, key=lambda finding: (BLOCKER, WARNING, OK).index(finding.level))

@@ -1,9 +1,10 @@
-"""Course, speed and path of a drive, a GPS course made of truth and gyro, a GPS's latency."""
+"""The motion in a recorded drive, a GPS course made of truth and gyro, a GPS's latency."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,25 +23,13 @@ _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
 @dataclass(frozen=True, kw_only=True)
 class Emulation:
-    """A GPS course and a gyro bias put on top of a recorded drive.
+    """A GPS course and a gyro bias put on top of a recorded drive; ValueError for a bad value."""
 
-    Attributes:
-        course_rate: Rate of the course (Hz), a sample every so many whole rows of the log.
-        course_noise_deg: Standard deviation of the course (deg).
-        delay: Delay of the course (s).
-        bias_deg: Constant error of the course (deg).
-        gyro_bias_degps: Bias of the gyro that estimators see (deg/s), not of the emulated heading.
-
-    Raises:
-        ValueError: A value that is not finite, a rate that is not positive, a negative noise or
-            delay.
-    """
-
-    course_rate: float = 10.0
-    course_noise_deg: float = 0.5
-    delay: float = 0.0
-    bias_deg: float = 0.0
-    gyro_bias_degps: float = 0.0
+    course_rate: float = 10.0  # Hz; a sample every so many whole rows of the log
+    course_noise_deg: float = 0.5  # standard deviation of the course (deg)
+    delay: float = 0.0  # of the course (s)
+    bias_deg: float = 0.0  # constant error of the course (deg)
+    gyro_bias_degps: float = 0.0  # of the gyro that estimators see, not of the emulated heading
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(Emulation):
@@ -52,131 +41,78 @@ class Emulation:
         if self.course_rate <= 0.0:
             raise ValueError(f"course_rate must be positive, got {self.course_rate} Hz")
 
-    def _compute_rows(self, dt: float) -> int:
-        """Compute the rows of a log from one sample to the next; ValueError for a slow log."""
-        if self.course_rate * dt > 1.0 + 1e-6:
-            raise ValueError(
-                f"a course at {self.course_rate:g} Hz needs a log at least as fast; "
-                f"this one has {1.0 / dt:.4g} rows a second"
-            )
-        return round(1.0 / (self.course_rate * dt))
-
-    def add_gyro_bias(self, log: Log) -> Log:
-        """Return the log with the gyro's bias added.
-
-        Args:
-            log: Recorded drive.
-
-        Returns:
-            The biased log.
-        """
-        fast = log.record.fast.copy()
-        fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
-        return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
-
-    def add_course(self, log: Log, seed: int) -> Log:
-        """Return the log with the gyro's bias and a GPS that measures the course, nothing else.
+    def apply(self, log: Log, seed: int | None) -> Log:
+        """Return the log with the gyro's bias, and with a GPS that measures the course alone.
 
         course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
         ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
 
         Args:
-            log: Recorded drive.
-            seed: Seed of the course's noise.
+            log: Recorded drive, with the truth if it gets a GPS.
+            seed: Seed of the course's noise, None: its slow sensors stay as they are.
 
         Returns:
-            The log with a GPS.
+            The changed log.
 
         Raises:
-            ValueError: If the log has no truth.
+            ValueError: The log is slower than the course.
         """
-        if "beta" not in log.truth:
-            raise ValueError(f"{log.name}: a course cannot be emulated without sideslip truth")
-        record, beta = log.record, log.truth["beta"]
-        rows, late = self._compute_rows(record.dt), round(self.delay / record.dt)
+        record, motion, fast = log.record, LoggedMotion(log), log.record.fast.copy()
+        fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
+        biased = dataclasses.replace(record, fast=fast)
+        if seed is None:
+            return dataclasses.replace(log, record=biased)
+        beta = log.truth["beta"]
+        if self.course_rate * record.dt > 1.0 + 1e-6:
+            raise ValueError(
+                f"a course at {self.course_rate:g} Hz needs a log at least as fast; "
+                f"this one has {1.0 / record.dt:.4g} rows a second"
+            )
+        rows, late = round(1.0 / (self.course_rate * record.dt)), round(self.delay / record.dt)
         captured = np.arange(-record.first % rows, len(beta), rows)
         noise = np.random.default_rng(seed).standard_normal(len(captured))
-        exact = (beta + compute_heading(log))[captured] + math.radians(self.bias_deg)
+        exact = (beta + motion.heading)[captured] + math.radians(self.bias_deg)
         course = exact + math.radians(self.course_noise_deg) * noise
-        speed = compute_ground_speed(log)[captured]
         sent = np.isfinite(course) & (captured + late < len(beta))
         ticks = (record.first + captured[sent]).astype(np.float64)
         values = np.full((len(ticks), 4), np.nan)
         values[:, 0] = np.arctan2(np.sin(course[sent]), np.cos(course[sent]))
-        quality = (speed[sent] >= COURSE_SPEED).astype(np.float64)
+        quality = (motion.speed[captured][sent] >= COURSE_SPEED).astype(np.float64)
         packets = make_packet_rows("gps", ticks, ticks + late, values, quality)
         gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
-        quiet = dataclasses.replace(log, record=dataclasses.replace(record, packets=packets))
-        return self.add_gyro_bias(dataclasses.replace(quiet, slow={"gps": gps}))
+        biased = dataclasses.replace(biased, packets=packets)
+        return dataclasses.replace(log, record=biased, slow={"gps": gps})
 
 
-def compute_heading(log: Log) -> Array:
-    """Integrate the logged yaw rate to a heading, 0 at the first row.
+class LoggedMotion(NamedTuple):
+    """What a recorded drive says of the car's motion, shape (rows,) each."""
 
-    Args:
-        log: Recorded drive.
+    log: Log
 
-    Returns:
-        Heading (rad), shape (rows,).
-    """
-    gamma = log.record.fast[:, FAST.gyro]
-    steps = 0.5 * (gamma[1:] + gamma[:-1]) * log.record.dt
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    @property
+    def heading(self) -> Array:
+        """The integral of the logged yaw rate (rad), 0 at the first row."""
+        gamma = self.log.record.fast[:, FAST.gyro]
+        steps = 0.5 * (gamma[1:] + gamma[:-1]) * self.log.record.dt
+        return np.concatenate([[0.0], np.cumsum(steps)])
 
+    @property
+    def speed(self) -> Array:
+        """The mean speed of the front wheels (m/s)."""
+        fast = self.log.record.fast
+        return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
 
-def compute_ground_speed(log: Log) -> Array:
-    """Compute the mean speed of the front wheels.
+    @property
+    def is_moving(self) -> npt.NDArray[np.bool_]:
+        """Whether it is fast enough to judge."""
+        return np.asarray(self.speed > MIN_SPEED)
 
-    Args:
-        log: Recorded drive.
-
-    Returns:
-        Speed (m/s), shape (rows,).
-    """
-    fast = log.record.fast
-    return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
-
-
-def find_moving(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows that are fast enough to judge.
-
-    Args:
-        log: Recorded drive.
-
-    Returns:
-        Mask, shape (rows,).
-    """
-    return np.asarray(compute_ground_speed(log) > MIN_SPEED)
-
-
-def find_backward(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows driven backward: at a negative speed, or with a truth about half a turn.
-
-    Args:
-        log: Recorded drive.
-
-    Returns:
-        Mask, shape (rows,).
-    """
-    turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
-    return np.asarray((compute_ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
-
-
-def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
-    """Compute a drive's path by dead reckoning.
-
-    Args:
-        log: Recorded drive.
-        beta: Sideslip angle (rad), shape (rows,).
-
-    Returns:
-        x and y (m), shape (rows,) each.
-    """
-    psi, v_x = compute_heading(log), compute_ground_speed(log)
-    v_y = v_x * np.tan(np.nan_to_num(beta))
-    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
-    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
-    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
+    @property
+    def is_backward(self) -> npt.NDArray[np.bool_]:
+        """Whether it is driven backward: the speed is negative, or the truth about half a turn."""
+        beta = self.log.truth.get("beta", np.zeros(len(self.log.time)))
+        turn = np.abs(np.nan_to_num(beta)) / math.pi
+        return np.asarray((self.speed < 0.0) | ((turn > 0.75) & (turn < 1.01)))
 
 
 def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
@@ -194,20 +130,31 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+def collect_fixes(
+    logs: Sequence[Log], value: int, slips: Sequence[Array] | None, times: Array
+) -> list[Array]:
     """Collect the differences of successive fixes, for a latency.
 
     Args:
-        log: Recorded drive with a GPS.
-        value: Place in the fix's values, 0 for the course, 1 for the speed.
-        signal: Signal that the values follow, shape (rows,).
-        part: Signal of which they have a share too, shape (rows,).
+        logs: Recorded drives; those without a GPS have no fixes.
+        value: Place in a fix's values, `COURSE` or `SPEED`.
+        slips: Sideslip angle (rad), shape (rows,), of which the value has a share; None: of none.
         times: Latencies (s), shape (times,).
 
     Returns:
-        Blocks of the log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
-        less the signal's so much earlier, p of those of `part`; none for too few fixes.
+        Blocks of each log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
+        less the logged motion's so much earlier, p of the slip's; none for too few fixes.
     """
+    blocks = []
+    for i, log in enumerate(logs):
+        if "gps" in log.slow:
+            part = np.zeros(len(log.time)) if slips is None else slips[i]
+            blocks += _collect_blocks(log, value, part, times)
+    return blocks
+
+
+def _collect_blocks(log: Log, value: int, part: Array, times: Array) -> list[Array]:
+    signal = LoggedMotion(log).heading if value == COURSE else LoggedMotion(log).speed
     packets = log.record.select_packets("gps")
     packets = packets[packets[:, PACKET.quality] > 0.0]
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
@@ -254,20 +201,11 @@ def find_latency(
     Returns:
         Latency and half of its 95 % interval (s).
     """
-    return jackknife(np.array(blocks), lambda sums: find_minimum(times, sums, share))
+    return jackknife(np.array(blocks), lambda sums: _find_minimum(times, sums, share))
 
 
-def find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
-    """Find the latency of the smallest remainder, between the samples by a parabola.
-
-    Args:
-        times: Latencies (s), shape (times,).
-        sums: Sums of `collect_fixes`, shape (4, times).
-        share: Share of the part in the values, None: the best one.
-
-    Returns:
-        Latency (s).
-    """
+def _find_minimum(times: Array, sums: Array, share: float | None) -> float:
+    """Find the latency (s) of the smallest remainder, between the samples by a parabola."""
     lefts = compute_remainder(sums, share)
     i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
     left, middle, right = lefts[i - 1 : i + 2]

@@ -16,9 +16,6 @@ HONESTY = (
     Column("log_score", "log score", form=".2f", interval=False),
 )
 """What `compute_honesty` computes."""
-_WIDTHS = np.array([0.126, 0.253, 0.385, 0.524, 0.674, 0.842, 1.036, 1.282, 1.645, 1.96])
-"""Half-widths of intervals in deviations, which should hold `SHARES` of the errors."""
-SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 
 
 def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float]:
@@ -38,20 +35,6 @@ def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float
     return float(np.mean(squares)), float(np.mean(squares < _Z95**2)), float(np.mean(score))
 
 
-def compute_held_shares(error: Array, deviation: Array) -> Array:
-    """Compute which share of the errors intervals hold.
-
-    Args:
-        error: Errors of an estimate, shape (n,).
-        deviation: Its standard deviations in the same unit, shape (n,).
-
-    Returns:
-        Shares of intervals that should hold `SHARES`, shape (10,).
-    """
-    ratios = np.sort(np.abs(error / deviation))
-    return np.asarray(np.searchsorted(ratios, _WIDTHS) / len(ratios))
-
-
 def describe_innovations(nis: Mapping[str, float]) -> str:
     """Describe whether slow samples surprise each filter as much as it expects.
 
@@ -66,17 +49,3 @@ def describe_innovations(nis: Mapping[str, float]) -> str:
         return ""
     judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"
     return f"By squared innovations over their variance, which should be 1: {judged}."
-
-
-def rank_by_score(honesty: Mapping[str, Array]) -> list[tuple[str, float]]:
-    """Rank filters by their median log score.
-
-    Args:
-        honesty: Rows of `compute_honesty` by filter, shape (seeds, 3).
-
-    Returns:
-        Names, the best first, with the median share that their 95 % intervals hold.
-    """
-    medians = {name: np.median(rows, axis=0) for name, rows in honesty.items()}
-    ranked = sorted(medians.items(), key=lambda item: -float(item[1][2]))
-    return [(name, float(row[1])) for name, row in ranked]

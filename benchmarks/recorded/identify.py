@@ -11,28 +11,17 @@ from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ...estimators.wires import NOISES, SignalCalibration, apply_wires
-from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict
+from . import quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, compute_residual, fit, make_windows
 from .emulate import (
     BLOCKS,
     COURSE,
     SPEED,
+    LoggedMotion,
     collect_fixes,
-    compute_ground_speed,
-    compute_heading,
     compute_remainder,
     find_latency,
-    find_minimum,
-    find_moving,
     jackknife,
-)
-from .quality import (
-    MIN_CORRELATION,
-    MIN_TURNING,
-    estimate_steering_gain,
-    find_saturated,
-    find_swapped,
 )
 from .suite import GYRO_ONLY
 
@@ -53,15 +42,6 @@ _WIDE = "its interval is too wide"
 _LATE = (-0.2, 1.2)  # s, of the GPS
 _LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
-_NOTE = (
-    "Intervals by a jackknife over 40 stretches of the log (20 for sensors), and by priors around "
-    "what is stated, to which numbers that this log does not tell are drawn. Latencies of steering "
-    "and acceleration are applied only where they lower the error on stretches that the fit has "
-    "not seen: the lag of tyres looks like one."
-)
-
-
-_NO_WIRES = SignalCalibration()
 
 
 class Finding(NamedTuple):
@@ -115,7 +95,7 @@ def identify(
     """
     if tyres not in (None, *TYRES):
         raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")
-    if what := find_swapped(logs):
+    if what := quality.find_swapped(logs):
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
     stated = wires or SignalCalibration()
@@ -123,14 +103,12 @@ def identify(
     if "gps" in stated.at:
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
     result = IdentificationResult(car, stated)
-    w = make_windows(logs, [find_saturated(log) for log in logs])
-    gain, related = estimate_steering_gain(logs, car)
+    w = make_windows(logs, [quality.find_saturated(log) for log in logs])
+    gain, related = quality.estimate_steering_gain(logs, car)
     if reason := _find_reason(w, related):
         result.reason = reason
-        result.findings = [
-            Finding(label, value, unit=unit, remark=reason)
-            for _, label, value, unit in _list_parameters(car, stated)
-        ]
+        for _, label, value, unit in _list_parameters(car, stated):
+            result.findings.append(Finding(label, value, unit=unit, remark=reason))
     else:
         near = 1.0 / _MAX_RATIO_FACTOR < gain / stated.gain < _MAX_RATIO_FACTOR
         start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
@@ -151,9 +129,9 @@ def _find_reason(w: Windows, related: float) -> str:
     if len(w.starts) < _MIN_WINDOWS:
         return f"{len(w.starts)} of {_MIN_WINDOWS} windows of 5 s are fast enough and whole"
     turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
-    if np.std(turns) < MIN_TURNING:
+    if np.std(turns) < quality.MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
-    if abs(related) < MIN_CORRELATION:
+    if abs(related) < quality.MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
     return ""
 
@@ -198,9 +176,8 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     elif not any(row.is_determined for row in result.findings[:3]):
         result.reason = "it tells neither the stiffnesses nor the yaw inertia"
     if result.reason:
-        result.findings = [
-            row._replace(is_determined=False, remark=result.reason) for row in result.findings
-        ]
+        reason, findings = result.reason, result.findings
+        result.findings = [x._replace(is_determined=False, remark=reason) for x in findings]
         return
     result.car, result.theta, result.tyres = fitted, theta, w.tyres
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
@@ -228,7 +205,7 @@ def _fit_latencies(
     usual, pays, rows = np.linalg.norm(_evaluate_folds(car, w, base) / base.scale), [], []
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
     for name in names:
-        half, value = free.half(name), float(getattr(free.theta, name))
+        half, value = free.halves[name], float(getattr(free.theta, name))
         is_determined, remark = half < _LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
             single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
@@ -267,7 +244,7 @@ def _make_car_findings(
     findings, (best, free) = [], fits
     for name, label, value, unit in _list_parameters(car, stated):
         at = float(getattr(best.theta, name))
-        half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
+        half = math.hypot(best.halves.get(name, math.inf), float(getattr(free.theta, name)) - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
         remark = "" if is_determined else _WIDE
         if name in _OF_CAR:
@@ -284,9 +261,7 @@ def _make_car_findings(
     return findings
 
 
-def estimate_slips(
-    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration = _NO_WIRES
-) -> list[Array]:
+def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
     """Estimate the sideslip angle of drives by the gyro alone.
 
     Args:
@@ -308,7 +283,7 @@ def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     errors = [np.zeros(0)]
     for log, slip in zip(logs, slips, strict=True):
         if "beta" in log.truth:
-            errors.append((slip - log.truth["beta"])[find_moving(log)])
+            errors.append((slip - log.truth["beta"])[LoggedMotion(log).is_moving])
     combined = np.concatenate(errors)
     combined = combined[np.isfinite(combined)]
     return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
@@ -347,16 +322,12 @@ def _make_sensor_findings(
             findings.append(row)
             noise |= {NOISES[channel]: sd} if is_determined else {}
     times = np.arange(*_LATE, max(logs[0].record.dt, 0.01))
-    pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses, speeds = list[Array](), list[Array]()
-    for log, slip in pairs:
-        courses += collect_fixes(log, COURSE, compute_heading(log), slip, times)
-        speed, none = compute_ground_speed(log), 0.0 * log.time
-        speeds += collect_fixes(log, SPEED, speed, none, times)
+    courses = collect_fixes(logs, COURSE, slips, times)
+    speeds = collect_fixes(logs, SPEED, None, times)
     if not courses:
         return findings, noise, {}
     late, half = find_latency(courses, times)
-    with_slip = find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
+    with_slip, _ = find_latency(courses, times, 1.0)  # had the slip its size
     half = math.hypot(half, late - with_slip)
     is_determined = half < _LATE_WITHIN
     pays = is_determined and late > half
@@ -367,69 +338,8 @@ def _make_sensor_findings(
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
         if blocks:  # a difference has twice the variance
-            sd, half = jackknife(
-                np.array(blocks), lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at])
-            )
+            left = np.array(blocks)
+            sd, half = jackknife(left, lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at]))
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
             findings, noise = [*findings, row], noise | {NOISES[name]: sd}
     return findings, noise, {"gps": late} if pays else {}
-
-
-def make_suite(result: IdentificationResult, name: str) -> Suite:
-    """Make a suite of the findings: a table with a verdict.
-
-    Args:
-        result: What the log shows.
-        name: Name of the log.
-
-    Returns:
-        The suite.
-    """
-    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
-    missing = [finding.name for finding in result.findings if not finding.is_determined]
-    if result.reason:
-        answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
-        answer += "It stays as stated."
-    else:
-        rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
-            *map(math.degrees, result.rates)
-        )
-        answer = f"The stated car leaves {rates}."
-    slip = ""
-    if not any(map(math.isnan, result.slips)):
-        slip = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg.".format(
-            *map(math.degrees, result.slips)
-        )
-    suite.verdict = format_verdict(
-        answer,
-        slip,
-        f"Not told by this log: {', '.join(missing) or 'nothing'}.",
-        "Not covered: the mass, which scales all; drives beside the part that was used.",
-    )
-    suite.tables = [make_findings_table(result.findings, _NOTE)]
-    return suite
-
-
-def make_findings_table(findings: Sequence[Finding], note: str) -> ResultTable:
-    """Make the table of findings.
-
-    Args:
-        findings: What a log shows.
-        note: Note below the table.
-
-    Returns:
-        The table.
-    """
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, findings))
-    return ResultTable("What the log shows", header, cells, note, keyed=False)
-
-
-def _format_cells(row: Finding) -> list[str]:
-    """Texts of a finding's cells."""
-    stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
-    ends = "-"
-    if math.isfinite(row.half):
-        ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
-    remark = ": ".join(filter(None, ["yes" if row.is_determined else "no", row.remark]))
-    return [row.name, stated, value, ends, row.unit or "-", remark]

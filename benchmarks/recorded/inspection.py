@@ -21,8 +21,8 @@ from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
-from .checks import InspectedDrive, check_drive
-from .emulate import find_moving
+from .checks import CHECKS, InspectedDrive
+from .emulate import LoggedMotion
 from .honesty import LOST, describe_innovations
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
 
@@ -80,17 +80,16 @@ def inspect_file(
         Suite with the verdict, channels, findings, and what can be estimated.
 
     Raises:
-        FileNotFoundError: There is no such file.
         ValueError: A column's name or calibration is none, or it is a receiver's log (NMEA).
     """
     if isinstance(source, str | Path) and is_nmea(source):
         text = "a receiver's log (NMEA) has no gyro and no steering; `sideslip replay` filters it"
         raise ValueError(f"{source}: {text}")
     names, car = parse_mapping(mapping), make_vehicle(vehicle)
-    values, drive, remarks, findings = read_drive(source, names, car, wires)
+    values, drive, remarks, findings = _read_drive(source, names, car, wires)
     prediction = None
     if drive is not None:
-        findings += check_drive(drive)
+        findings += [finding for check in CHECKS.values() for finding in check(drive)]
         if drive.logs and not any(finding.level == BLOCKER for finding in findings):
             try:
                 prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
@@ -109,23 +108,10 @@ def inspect_file(
     return suite
 
 
-def read_drive(
-    source: "LogSource",
-    names: dict[str, str],
-    car: Vehicle,
-    wires: SignalCalibration | None = None,
+def _read_drive(
+    source: "LogSource", names: dict[str, str], car: Vehicle, wires: SignalCalibration | None = None
 ) -> tuple[dict[str, Array], InspectedDrive | None, list[str], list[LogFinding]]:
-    """Read a drive as it stands and as estimators get it; a file that is refused is a finding.
-
-    Args:
-        source: Table, or its file.
-        names: Our column names to the log's.
-        car: Car that is assumed.
-        wires: Calibration of the signals.
-
-    Returns:
-        Columns, the drive (None for a refused file), the reader's remarks, and refusals.
-    """
+    """Columns, the drive as estimators get it, remarks; a file that is refused is a finding."""
     wires, values, remarks = wires or SignalCalibration(), dict[str, Array](), list[str]()
     try:
         values, kinds, _ = read_columns(source, names, ("time",))
@@ -143,14 +129,12 @@ def read_drive(
 
 
 def _predict(log: Log, car: Vehicle) -> Prediction:
-    """Run the filter over a part and take its own deviation."""
-    facts = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt}
-    facts |= {"present": log.record.present}
-    filter_ = call_quietly(make_estimator, FILTER, **facts)
+    facts = {"sensors": log.slow, "dt": log.record.dt, "present": log.record.present}
+    filter_ = call_quietly(make_estimator, FILTER, vehicle=car, **facts)
     estimates = filter_.run(log)
     place = estimates.names.index("beta")
     deviation = estimates.std[:, place]
-    moving = find_moving(log) & (log.time >= log.time[0] + SETTLED)
+    moving = LoggedMotion(log).is_moving & (log.time >= log.time[0] + SETTLED)
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
     has_nis = np.isfinite(estimates.nis).any()
     learnt = {
@@ -170,7 +154,6 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
 def _compose_verdict(
     findings: Sequence[LogFinding], prediction: Prediction | None, car: Vehicle
 ) -> str:
-    """Compose the verdict: what can be estimated, how well, and what stands against it."""
     counts = Counter(finding.level for finding in findings)
     blockers = [finding for finding in findings if finding.level == BLOCKER]
     tally = f"{counts[BLOCKER]} BLOCKER, {counts[WARNING]} WARNING, {counts[OK]} OK."
@@ -178,11 +161,8 @@ def _compose_verdict(
         first = blockers[0] if blockers else findings[0]
         cure = f" ({first.cure})" if first.cure and first.cure not in first.text else ""
         what = f"{first.channel}: " if first.channel else ""
-        return format_verdict(
-            "Do not estimate from this log before it is mended.",
-            f"First: {what}{first.text}{cure}.",
-            tally,
-        )
+        stop = "Do not estimate from this log before it is mended."
+        return format_verdict(stop, f"First: {what}{first.text}{cure}.", tally)
     if math.isnan(prediction.usual):
         slow = "The car is never fast enough for a sideslip angle: nothing is estimated."
         return format_verdict(slow, tally)
@@ -207,7 +187,6 @@ def _compose_verdict(
 
 
 def _make_channels(values: dict[str, Array]) -> ResultTable:
-    """Make the table of channels: unit, rate, longest step, resolution, range."""
     rows, time = [], values.get("time", np.zeros(0))
     for name, column in values.items():
         known = np.isfinite(column)
@@ -234,26 +213,22 @@ def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
     """Make the table of what is not OK, and one of all for the report."""
     columns = ("level", "channel", "what, and what mends it")
     bad = [finding for finding in findings if finding.level != OK]
-    cells = [_format_finding(finding) for finding in bad[:_SCREEN_ROWS]]
+    cells = []
+    for finding in bad[:_SCREEN_ROWS]:
+        stop = "" if finding.text.endswith("?") else "."
+        text = f"{finding.check}: {finding.text}{stop} -> {finding.cure}"
+        cells.append([finding.level, finding.channel, text])
     more = len(bad) - len(cells)
     note = f"{more} more are in the report (--html). " if more > 0 else ""
     note += f"{len(findings) - len(bad)} findings are OK."
-    rows = [[*dataclasses.astuple(finding)] for finding in findings]
     heads = ("check", "level", "channel", "what", "what mends it")
+    rows = list(map(dataclasses.astuple, findings))
     complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
     shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
     return [*([shown] if bad else []), complete]
 
 
-def _format_finding(finding: LogFinding) -> list[str]:
-    """Texts of a finding's cells on the screen."""
-    stop = "" if finding.text.endswith("?") else "."
-    text = f"{finding.text}{stop} -> {finding.cure}"
-    return [finding.level, finding.channel, f"{finding.check}: {text}"]
-
-
 def _make_learnt(prediction: Prediction) -> ResultTable:
-    """Make the table of constants and of how much the log tells of them."""
     rows = []
     for name, (first, last) in prediction.learnt.items():
         scale = 1.0 if name in _RELATIVE or name == "accel_bias" else _DEGREES

@@ -15,7 +15,7 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from .emulate import compute_ground_speed, compute_heading, find_backward, find_moving
+from .emulate import LoggedMotion
 
 BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
 """Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
@@ -76,17 +76,16 @@ _GUESSES = {  # a ratio of steering angles, and what it looks like from there on
 
 
 def _get_columns(log: Log) -> dict[str, Array]:
-    """Columns of a log by name, shape (rows,) each."""
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
     columns = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
     columns |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
-    return {"speed": compute_ground_speed(log), **columns}
+    return {"speed": LoggedMotion(log).speed, **columns}
 
 
 def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
     """Mask of a column's rows beside a jump that no car makes, or between two."""
-    x = _get_columns(log)[name]
-    known = np.isfinite(x) & (find_moving(log) | (name == "speed")) & ~find_backward(log)
+    x, motion = _get_columns(log)[name], LoggedMotion(log)
+    known = np.isfinite(x) & (motion.is_moving | (name == "speed")) & ~motion.is_backward
     if known.sum() < _FEW:
         return np.zeros(len(x), np.bool_)
     x = np.interp(log.time, log.time[known], x[known])
@@ -114,9 +113,9 @@ def smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
     """
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
-        dt, raw = log.record.dt, _get_columns(log)
+        dt, raw, motion = log.record.dt, _get_columns(log), LoggedMotion(log)
         width, none = max(round(_SMOOTH / dt), 1), np.zeros(len(log.time))
-        bad = ~find_moving(log) | find_backward(log)
+        bad = ~motion.is_moving | motion.is_backward
         for name in _JUMPS.keys() & raw.keys():
             bad |= _find_jumps(log, name) | ~np.isfinite(raw[name])
         used = uniform_filter1d(bad.astype(float), width + 2, mode="nearest") < 1e-9
@@ -251,11 +250,11 @@ def find_swapped(logs: Sequence[Log]) -> str:
 
 def _describe_zeros(logs: Sequence[Log], name: str) -> list[LogFinding]:
     """A finding if a column is filled with zeros where the car turns."""
-    x, moves = [np.zeros(0)], sum(find_moving(log).sum() for log in logs)
+    x, moves = [np.zeros(0)], sum(LoggedMotion(log).is_moving.sum() for log in logs)
     for log in (log for log in logs if name in _get_columns(log)):
         columns = _get_columns(log)
         turns = np.hypot(columns["speed"] * columns["gyro"], columns.get("accel_y", 0.0)) > 1.0
-        x.append(columns[name][turns & find_moving(log)])
+        x.append(columns[name][turns & LoggedMotion(log).is_moving])
     values, counts = np.unique(np.concatenate(x), return_counts=True)
     zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
     if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
@@ -277,17 +276,17 @@ def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
     """
     parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
-        fixes = log.record.select_packets("gps")
+        fixes, motion = log.record.select_packets("gps"), LoggedMotion(log)
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
-        good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
+        good[good] &= (motion.is_moving & ~motion.is_backward)[place[good]]
         place, course = place[good], fixes[good, PACKET.value]
         if len(place) < 2:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
         n = max(math.ceil(lag / (usual * log.record.dt) - 1e-9), 1)
         slip = log.truth.get("beta", np.zeros(len(log.time)))
-        columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
+        columns = np.stack([np.unwrap(course), motion.heading[place], slip[place]])
         steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
         parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
     return np.concatenate(parts, axis=1)
@@ -334,7 +333,6 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
 
 
 def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
-    """Findings on the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0
@@ -345,32 +343,6 @@ def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
         text = f"the course turns against the gyro (correlation {related:.2f}): {COMPASS}"
         return [_make_finding("sign", "course", text, "--map course_degnorth=COLUMN")]
     return _describe_contradiction(line, "the change of the course", "the integral of the gyro")
-
-
-def make_remarks(logs: Sequence[Log]) -> list[str]:
-    """Make remarks on what is no fault of a drive, but good to know: a gyro of coarse steps.
-
-    Args:
-        logs: Parts of the log.
-
-    Returns:
-        Sentences.
-    """
-    step = math.degrees(max(estimate_resolution(log.record.fast[:, FAST.gyro]) for log in logs))
-    return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
-
-
-def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
-    """Make warnings of what does not fit together in a drive.
-
-    Args:
-        logs: Parts of the log.
-        car: The car that is assumed.
-
-    Returns:
-        A sentence each.
-    """
-    return [finding.text for finding in find_contradictions(logs, car)]
 
 
 def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:

@@ -1,8 +1,7 @@
 """Receivers' logs (NMEA): does noise that follows HDOP filter fixes better than one for all?
 
-The filter has a constant rate between fixes, disturbed by white noise of density q, on each axis:
-of position (east and north) and, where the car moves, of course. A log without a gyro bears no more
-at 0.5 to 1 Hz.
+The filter's rate is constant but for white noise of density q, on each axis of position and, where
+the car moves, of course: a log without a gyro bears no more at 0.5 to 1 Hz.
 """
 
 import itertools
@@ -53,10 +52,6 @@ class _Track(NamedTuple):
     hdop: Array
     satellites: Array
 
-    def select(self, shown: Mask) -> "_Track":
-        """Select some of the fixes."""
-        return _Track(self.origin, *(column[shown] for column in self[1:]))
-
 
 def _make_track(epochs: Sequence[Epoch]) -> _Track:
     """Make the track of fixes around the first one, without those that lack HDOP or are late.
@@ -80,8 +75,8 @@ def _make_track(epochs: Sequence[Epoch]) -> _Track:
 class _Signal(NamedTuple):
     """A filtered quantity of a receiver's fixes."""
 
-    name: str  # name of the signal
-    unit: str  # unit of the values
+    name: str
+    unit: str  # of the values
     axes: int  # number of axes; two are real and imaginary part
     z: npt.NDArray[np.complex128]  # values, shape (n,)
     base_size: Array  # size of the noise beside HDOP, shape (n,)
@@ -107,7 +102,8 @@ def _make_signals(track: _Track) -> list[_Signal]:
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     positions = np.asarray(track.east + 1j * track.north, np.complex128)
     position = _Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
-    part = track.select((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
+    has_course = (track.speed >= COURSE_SPEED) & np.isfinite(track.course)
+    part = _Track(track.origin, *(column[has_course] for column in track[1:]))
     all_fixes: Mask = np.ones(len(part.t), bool)
     angle = np.asarray(part.course, np.complex128)
     course = _Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
@@ -278,7 +274,6 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
 
 
 def _compose_verdict(replay: ReceiverReplay) -> str:
-    """Compose the verdict."""
     tuned, fixed = (replay.outcomes[0][1][law] for law in (_TUNED, _FIXED))
     rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
     pairs = [(np.median(x.error), np.percentile(x.error, 95)) for x in (tuned, fixed)]
@@ -293,7 +288,6 @@ def _compose_verdict(replay: ReceiverReplay) -> str:
 
 
 def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
-    """Sentence on whether noise that follows HDOP predicts a signal better."""
     number = _compute_gain(results[_TUNED], results[_FIXED])
     what, (value, low, high) = f"Tuning the noise of {name} by HDOP", number
     if max(abs(low), abs(high)) < _NEGLIGIBLE:
@@ -305,7 +299,6 @@ def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
 def _add_table(
     suite: Suite, replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
 ) -> None:
-    """Add rows and a table of the laws of a signal's noise."""
     scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
     records = []
     for law, result in results.items():

@@ -20,29 +20,20 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import describe_leader, format_verdict
-from .emulate import Emulation, compute_path, find_backward
-from .honesty import (
-    HONESTY,
-    SHARES,
-    compute_held_shares,
-    compute_honesty,
-    describe_innovations,
-    rank_by_score,
-)
+from .emulate import Emulation, LoggedMotion
+from .honesty import HONESTY, compute_honesty, describe_innovations
 
 GYRO_ONLY = "bicycle-kf"
+_BOTH, _GPS = ("gps", "camera"), ("gps",)
 ESTIMATORS: dict[str, tuple[str, ...]] = {
-    GYRO_ONLY: (),
-    "single-rate-kf": ("gps", "camera"),
-    "multirate-kf": ("gps", "camera"),
-    "multirate-residual-kf": ("gps", "camera"),
-    "course-kf": ("gps",),
-    "dakf": ("gps",),
-    "exact-kf": ("gps", "camera"),
-    "joint": ("gps", "camera"),
-}
+    GYRO_ONLY: (), "single-rate-kf": _BOTH, "multirate-kf": _BOTH, "multirate-residual-kf": _BOTH,
+    "course-kf": _GPS, "dakf": _GPS, "exact-kf": _BOTH, "joint": _BOTH,
+}  # fmt: skip
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
+_WIDTHS = np.array([0.126, 0.253, 0.385, 0.524, 0.674, 0.842, 1.036, 1.282, 1.645, 1.96])
+"""Half-widths of intervals in deviations, which should hold `SHARES` of the errors."""
+SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 _OWN_NOISE = "joint"  # brings its levels along and finds the accelerometer's as it drives
 _MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
 _MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
@@ -51,50 +42,31 @@ _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(Emulation):
-    """How a drive is replayed, on top of `Emulation`; its course noise is what estimators assume.
+    """How a drive is replayed; estimators assume the course noise of its `Emulation`."""
 
-    Attributes:
-        estimators: Names in `ESTIMATORS`, None for all. The gyro-only one always runs along.
-        q_beta: Process noise of sideslip (rad2/s).
-        q_gamma: Process noise of the yaw rate ((rad/s)2/s).
-        q_psi: Process noise of the heading (rad2/s).
-        seeds: Number of noises of the emulated course.
-        seed: The first of their seeds.
-        stiffness_factor: Factor of both tyre stiffnesses of the estimators.
-        figures: Whether to draw.
-        emulated: Whether a log with truth and no slow sensor gets a course.
-        options: More options of estimators by name.
-        noise: Standard deviations that estimators assume by option.
-
-    Raises:
-        ValueError: A value out of range, or an unknown estimator.
-    """
-
-    estimators: Sequence[str] | None = None
-    q_beta: float = 1e-3
-    q_gamma: float = 0.1
-    q_psi: float = 0.0
-    seeds: int = 5
-    seed: int = 0
-    stiffness_factor: float = 1.0
+    estimators: Sequence[str] | None = None  # in `ESTIMATORS`, None: all; gyro-only always runs
+    q_beta: float = 1e-3  # process noise of sideslip (rad2/s)
+    q_gamma: float = 0.1  # process noise of the yaw rate ((rad/s)2/s)
+    q_psi: float = 0.0  # process noise of the heading (rad2/s)
+    seeds: int = 5  # number of noises of the emulated course
+    seed: int = 0  # the first of their seeds
+    stiffness_factor: float = 1.0  # of both tyre stiffnesses of the estimators
     figures: bool = True
-    emulated: bool = True
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    noise: Mapping[str, float] = field(default_factory=dict)
+    emulated: bool = True  # whether a log with truth and no slow sensor gets a course
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by estimator
+    noise: Mapping[str, float] = field(default_factory=dict)  # deviations assumed, by option
 
     def __post_init__(self) -> None:
         super().__post_init__()
         requested = (*(self.estimators or ()), *self.options)
         unknown = [name for name in requested if name not in ESTIMATORS]
         if unknown:
-            raise ValueError(
-                f"unknown estimator {', '.join(unknown)}; known here: {', '.join(ESTIMATORS)}"
-            )
+            names = ", ".join(unknown)
+            raise ValueError(f"unknown estimator {names}; known here: {', '.join(ESTIMATORS)}")
         if self.seeds < 1 or self.seed < 0:
             raise ValueError(f"expected seeds >= 1 and seed >= 0, got {self.seeds}, {self.seed}")
         for name in ("q_beta", "q_gamma", "q_psi"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
+            if not 0.0 <= (value := getattr(self, name)) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
 
 
@@ -119,9 +91,14 @@ class ReplayResult:
         ranges = {name: _compute_range(np.sqrt(x)) for name, x in self.squares.items()}
         return dict(sorted(ranges.items(), key=lambda item: item[1].value))
 
+    def rank_by_score(self) -> dict[str, float]:
+        """Rank by the median log score, best first: medians of the share that intervals hold."""
+        medians = {name: np.median(rows, axis=0) for name, rows in self.honesty.items()}
+        ranked = sorted(medians, key=lambda name: -float(medians[name][2]))
+        return {name: float(medians[name][1]) for name in ranked}
+
 
 def _compute_range(values: Array) -> Estimate:
-    """Compute the median, smallest and largest number."""
     return Estimate(*(float(function(values)) for function in (np.median, np.min, np.max)))
 
 
@@ -130,27 +107,31 @@ def _compute_ratio(result: ReplayResult, name: str, other: str = GYRO_ONLY) -> E
     return _compute_range(np.sqrt(result.squares[name] / result.squares[other]))
 
 
+def _compute_held_shares(error: Array, deviation: Array) -> Array:
+    """Compute the shares of errors that intervals hold which should hold `SHARES`."""
+    ratios = np.sort(np.abs(error / deviation))
+    return np.asarray(np.searchsorted(ratios, _WIDTHS) / len(ratios))
+
+
 def _make_drives(log: Log, settings: Settings) -> list[Log]:
     """A drive for each noise of the course, or the logged one; ValueError if it is too short."""
     duration = log.time[-1] - log.time[0]
     if duration < SETTLED:
-        raise ValueError(
-            f"{log.name}: the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
-        )
+        text = f"the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
+        raise ValueError(f"{log.name}: {text}")
     if log.slow or "beta" not in log.truth or not settings.emulated:
-        return [settings.add_gyro_bias(log)]
-    return [settings.add_course(log, settings.seed + i) for i in range(settings.seeds)]
+        return [settings.apply(log, None)]
+    return [settings.apply(log, settings.seed + i) for i in range(settings.seeds)]
 
 
 def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
     """Run every wanted estimator that the drives' slow sensors serve over every drive."""
     log, result = drives[0], ReplayResult()
-    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log)
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~LoggedMotion(log).is_backward
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
-        raise ValueError(
-            f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
-        )
+        text = f"the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
+        raise ValueError(f"{log.name}: {text}")
     for name, serves in ESTIMATORS.items():
         if settings.estimators is not None and name not in (GYRO_ONLY, *settings.estimators):
             continue
@@ -172,7 +153,7 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
             continue
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
-        squares, honesty = [], []
+        numbers = []
         for drive in (log, *drives):  # the first run designs the gains
             start = time.process_time()
             estimates = estimator.run(drive)
@@ -184,18 +165,16 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
                 values = len(MEASUREMENTS[slow].rows)  # of a packet, each of which adds 1
                 result.nis.setdefault(name, float(np.nanmean(estimates.nis)) / values)
             ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
-            result.outcomes[name] = [
-                (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
-            ]
+            others = [(state, float(x), float(sd)) for state, x, sd in ends]
+            result.outcomes[name] = [end for end in others if end[0] not in _MOTION]
             if truth is not None:
                 wrong = (beta - truth)[counts]
-                squares.append(np.mean(wrong**2))
                 deviation = estimates.std[counts, estimates.names.index("beta")]
-                honesty.append(compute_honesty(wrong, deviation))
-                result.held.setdefault(name, compute_held_shares(wrong, deviation))
+                numbers.append((np.mean(wrong**2), *compute_honesty(wrong, deviation)))
+                result.held.setdefault(name, _compute_held_shares(wrong, deviation))
         if truth is not None:
-            result.squares[name] = np.array(squares[1:])
-            result.honesty[name] = np.array(honesty[1:])
+            result.squares[name] = np.array(numbers[1:])[:, 0]
+            result.honesty[name] = np.array(numbers[1:])[:, 1:]
     return result
 
 
@@ -208,14 +187,14 @@ def _make_estimator(
         options |= {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
         options |= {} if slow is None else {"q_psi": settings.q_psi}
     if slow == "gps":
-        options["course_noise"] = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
-        options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
+        emulated = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
+        options["course_noise"] = settings.noise.get("course_noise", emulated)
     if "gyro_noise" in settings.noise and name != _OWN_NOISE:
         options["gyro_noise"] = max(settings.noise["gyro_noise"], _MIN_GYRO_NOISE)
     options |= settings.options.get(name, {})
-    facts = {"vehicle": vehicle, "sensors": sensors}
-    facts |= {"dt": log.record.dt, "present": log.record.present}
-    return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
+    facts = {"sensors": sensors, "dt": log.record.dt, "present": log.record.present}
+    # quietly: the result names what is unseen
+    return call_quietly(make_estimator, name, vehicle=vehicle, **facts, **options)
 
 
 _CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
@@ -271,10 +250,7 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
             describe_innovations(result.nis),
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
-    held = "".join(
-        f" By the log score {name} is best; its 95 % interval holds {100.0 * share:.0f} %."
-        for name, share in rank_by_score(result.honesty)[:1]
-    )
+    best, share = next(iter(result.rank_by_score().items()))
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: _compute_ratio(result, first, name) for name in rest}
@@ -283,7 +259,8 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         f"From the recorded angle {describe_leader(first, over, 'stray')}.",
-        f"Its error: {rmse[first]:.2f} deg.{held}",
+        f"Its error: {rmse[first]:.2f} deg. By the log score {best} is best; its 95 % interval "
+        f"holds {100.0 * share:.0f} %.",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"
         + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
@@ -302,7 +279,7 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
         Suite of one table and the rows of every corner, without figures.
 
     Raises:
-        ValueError: For a log without truth, and for all that `replay` refuses.
+        ValueError: The log has no truth, or `replay` refuses it.
     """
     how = Settings(**settings)
     if "beta" not in log.truth:
@@ -325,7 +302,6 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 
 def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings) -> str:
-    """Text of the report: the drive, the design of the estimators, and what was emulated."""
     duration, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
     text = [f"{duration:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
     if settings.stiffness_factor != 1.0:
@@ -349,7 +325,7 @@ def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings
         text.append(f"{settings.gyro_bias_degps:g} deg/s are added to the gyro.")
     if "beta" in log.truth:
         text.append(f"Errors count from {SETTLED:g} s on.")
-        if count := int(find_backward(log).sum()):
+        if count := int(LoggedMotion(log).is_backward.sum()):
             text.append(f"{count} rows are driven backward, and not scored.")
     else:
         text.append("The log has no sideslip truth, so nothing is scored.")
@@ -376,13 +352,12 @@ def _add_rows(
         records[name] = record | {"us_per_tick": cost}
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
-    return [records[name] for name in dict(rank_by_score(result.honesty)) or records]
+    return [records[name] for name in result.rank_by_score() or records]
 
 
 def _make_table(
     result: ReplayResult, records: Sequence[Any], name: str, car: Vehicle, noises: int
 ) -> ResultTable:
-    """Make the table of the estimators; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     cost = Column("us_per_tick", "us per tick", form=".3f")
     surprise = Column("nis", "NIS of a value", form=".2f")
@@ -409,8 +384,8 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
     near = np.abs(log.time - peak_time) <= _WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
-    paths = {name: compute_path(log, beta) for name, beta in traces.items()}
     overview = _select_traces(draw_time_series(log.time, slips, label), result)
+    paths = {name: _compute_path(log, beta) for name, beta in traces.items()}
     shown = [
         ("the sideslip angle and its estimates", overview, _HIDDEN),
         ("where the car slips most", draw_time_series(log.time[near], close, label),
@@ -425,9 +400,8 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         figure = _select_traces(over_time, result)
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
         held = {"truth": SHARES} | result.held
-        curves = draw_curves(
-            SHARES, held, "fraction that intervals should hold", "fraction they hold"
-        )
+        labels = "fraction that intervals should hold", "fraction they hold"
+        curves = draw_curves(SHARES, held, *labels)
         text = f"Below the line of truth an estimator is surer than it may be. {_HIDDEN}"
         shown.insert(3, ("whether intervals hold", _select_traces(curves, result), text))
         groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}
@@ -435,6 +409,15 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
         shown.insert(0, ("error of each estimator", bars, text))
     return [(f"{log.name}: {title}", *more) for title, *more in shown]
+
+
+def _compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
+    """Compute a drive's path, x and y (m), by dead reckoning from a sideslip angle (rad)."""
+    psi, v_x = LoggedMotion(log).heading, LoggedMotion(log).speed
+    v_y = v_x * np.tan(np.nan_to_num(beta))
+    x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
+    y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
+    return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
 
 
 def _select_traces(figure: Any, result: ReplayResult) -> Any:

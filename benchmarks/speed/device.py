@@ -5,7 +5,6 @@
 
 import itertools
 import shlex
-import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +19,8 @@ from ...envs.engine.layout import PARAMS_WIDTH
 from ...envs.numerics.torch_backend import torch
 from ..harness.parallel import report_user_errors
 from ..harness.results import check_writable, write_text
+from ..harness.stats import Estimate
+from .timing import Taken
 
 _COUNTS = (1024, 16384, 65536, 262144, 1048576)
 _ROUNDS = 5
@@ -31,9 +32,7 @@ class _DeviceTiming(NamedTuple):
 
     size: int
     dtype: str
-    rate: float  # env-steps a second of wall time: median, smallest and largest of the rounds
-    min_rate: float
-    max_rate: float
+    rate: Estimate  # env-steps a second of wall time: median, smallest and largest of the rounds
     bytes_a_step: float  # of one row, each number moved once
     bandwidth: float  # bytes a second of a copy on the same device, read and written
 
@@ -72,27 +71,23 @@ def _measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
             env.step(actions)
 
     taken = [_measure_seconds(run_steps, env.device) for _ in range(rounds + 1)][1:]
-    rates = [env.num_envs * steps / seconds for seconds in taken]
-    middle, dtype = statistics.median(rates), str(env.dtype).removeprefix("torch.")
-    return _DeviceTiming(
-        env.num_envs, dtype, middle, min(rates), max(rates), _count_bytes(env), copied
-    )
+    rates, dtype = Taken(env.num_envs * steps / x for x in taken), str(env.dtype)
+    kind = dtype.removeprefix("torch.")
+    return _DeviceTiming(env.num_envs, kind, rates.range, _count_bytes(env), copied)
 
 
 def _format_table(timings: Sequence[_DeviceTiming]) -> str:
-    """Format the measurements as a Markdown table."""
     lines = [
         "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
         "| of a copy's bandwidth |",
         "|---|---|---|---|---|---|---|",
     ]
     for timing in timings:
-        share = timing.rate * timing.bytes_a_step / timing.bandwidth
-        microseconds = 1e6 * timing.size / timing.rate
+        (rate, low, high), size = timing.rate, timing.size
+        share = rate * timing.bytes_a_step / timing.bandwidth
         lines.append(
-            f"| {timing.size} | {timing.dtype} | {timing.rate:.3g} "
-            f"| {timing.min_rate:.3g} .. {timing.max_rate:.3g} | {microseconds:.4g} "
-            f"| {timing.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
+            f"| {size} | {timing.dtype} | {rate:.3g} | {low:.3g} .. {high:.3g} "
+            f"| {1e6 * size / rate:.4g} | {timing.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
         )
     return "\n".join(lines)
 
@@ -112,14 +107,13 @@ def _main(
     check_writable(out)
     console, timings, copied = Console(), [], 0.0
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
-    options: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
+    options: dict[str, Any] = {"engine": engine, "on_bad_action": "fail"}
+    options |= {"compile": True} if compiled else {}
     for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
-        batch = make_device_env(
-            env, size, device=device, dtype=kind, on_bad_action="fail", **options
-        )
+        batch = make_device_env(env, size, device=device, dtype=kind, **options)
         copied = copied or _measure_bandwidth(batch.device)
         timings.append(_measure(batch, copied, rounds, steps))
-        console.print(f"{size}, {kind}: {timings[-1].rate:.3g} env-steps/s", highlight=False)
+        console.print(f"{size}, {kind}: {timings[-1].rate.value:.3g} env-steps/s", highlight=False)
         del batch
     hardware = f"CPU, {torch.get_num_threads()} threads of torch"
     if device.startswith("cuda"):

@@ -148,10 +148,8 @@ def add_filters(suite: Suite, effort: Effort) -> None:
         suite: Suite that gets the results.
         effort: Rounds and time of each.
     """
-    envs = {
-        "one": _make_episode(gym.make(_FUSION_ID)),
-        "many": _make_batch(gym.make_vec(_FUSION_ID, FEWER)),
-    }
+    bare_one, bare_batch = gym.make(_FUSION_ID), gym.make_vec(_FUSION_ID, FEWER)
+    envs = {"one": _make_episode(bare_one), "many": _make_batch(bare_batch)}
     header = ("", "one", "range", f"of {FEWER}", "range")
     fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
     for name in FILTERS:

@@ -25,13 +25,11 @@ _ARITHMETIC = "add|sub|mul|fma|div|rcp|sqrt"
 
 
 def _count_opcodes(text: str) -> Counter[str]:
-    """Count the instructions of a PTX text by name."""
     opcode = r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]"
     return Counter(re.findall(opcode, text, re.M))
 
 
 def _count_by_kind(text: str) -> dict[str, Any]:
-    """Count the instructions of a PTX text by kind."""
     totals = _count_opcodes(text)
 
     def count_matching(pattern: str) -> int:
@@ -70,16 +68,14 @@ def _main(
 ) -> None:
     """Count the kernel's instructions for an H200 (sm_90), in float64 and float32."""
     check_writable(out)
-    options = make_constants(
-        StabilityVectorEnv(1, **gym.spec(env).kwargs).config, "NextStep", record=False
-    )
+    config = StabilityVectorEnv(1, **gym.spec(env).kwargs).config
+    options = make_constants(config, "NextStep", record=False)
     columns: list[dict[str, Any]] = []
     for real in (np.float64, np.float32):
         text = get_ptx(options, real, (9, 0))
         columns.append({"": real.__name__} | _count_by_kind(text) | _assemble_kernel(text, (9, 0)))
-    lines = [
-        f"| {name} | {' | '.join(str(column[name]) for column in columns)} |" for name in columns[0]
-    ]
+    cells = [[name, *(str(column[name]) for column in columns)] for name in columns[0]]
+    lines = [f"| {' | '.join(line)} |" for line in cells]
     table = "\n".join([lines[0], "|---|---|---|", *lines[1:]]) + "\n"
     Console().print(table, highlight=False, markup=False, soft_wrap=True)
     if out is not None:

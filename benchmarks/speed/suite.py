@@ -37,16 +37,12 @@ TARGETS = (
     _SpeedTarget("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.1),
     _SpeedTarget("plant, C over ours", plant.C, plant.PLANT, 0.85),
     _SpeedTarget("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, max_value=1.1),
-    _SpeedTarget(
-        "full-covariance filter in the loop, 1024 at once, Pendulum over ours",
-        env_steps.PENDULUMS,
-        env_steps.FILTERED,
-        4.5,
-    ),
+    _SpeedTarget("full-covariance filter in the loop, 1024 at once, Pendulum over ours",
+        env_steps.PENDULUMS, env_steps.FILTERED, 4.5),
     _SpeedTarget("PPO, 256 at once, Pendulum over ours", learning.PENDULUM, learning.PPO_YAW, 1.7),
     _SpeedTarget(first_use.FIRST, "", first_use.FIRST, max_value=0.5),
     _SpeedTarget(first_use.KERNEL, "", first_use.KERNEL, max_value=5.0),
-)
+)  # fmt: skip
 
 
 def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, str]) -> None:
@@ -103,12 +99,7 @@ def _add_tables(suite: Suite, results: _SpeedResults) -> None:
     suite.tables += results.measured.tables
 
 
-def _compose_verdict(results: _SpeedResults) -> str:
-    return _make_verdict(results.taken, results.measured.tables[0])
-
-
 def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    """Make the verdict of the CPU times a unit (us) and the table of targets."""
     us = {name: times.range.value for name, times in taken.items()}
     step_time, batch_time = us[env_steps.FUSION_V1], us[env_steps.V1_AT_ONCE]
     over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in _RIVALS if x in us]
@@ -127,12 +118,10 @@ def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
 
 
 STUDY = Study(
-    "speed",
-    "What a step costs",
+    "speed", "What a step costs",
     "CPU time on one thread, median and range of rounds in which the entries of a table "
     "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
     (0, 0),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-)
+    _measure, _add_tables,
+    lambda results: _make_verdict(results.taken, results.measured.tables[0]),
+)  # fmt: skip

@@ -76,9 +76,7 @@ def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> di
         CPU time a unit (us) in each round, by name.
     """
     with limit_threads():
-        calls = {
-            name: _count_calls(workload, effort.seconds) for name, workload in workloads.items()
-        }
+        calls = {name: _count_calls(x, effort.seconds) for name, x in workloads.items()}
         taken = {name: Taken() for name in workloads}
         for _ in range(effort.rounds):
             for name, workload in workloads.items():

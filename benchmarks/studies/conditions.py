@@ -74,8 +74,7 @@ def _apply_edit(edit: Edit, log: Log, seed: int) -> Log:
         places = np.flatnonzero(packets[:, PACKET.sensor] == SLOW_NAMES.index(edit.sensor))
         values = record.packets[places[: -edit.packets], PACKET.value :]
         packets[places[edit.packets :], PACKET.value :] = values
-    wrong = replace(record, fast=fast, packets=packets)
-    return replace(log, record=wrong)
+    return replace(log, record=replace(record, fast=fast, packets=packets))
 
 
 _GPS, _CAMERA, _BOTH = (f"sideslip/Yaw{name}-v1" for name in ("Gps", "Vision", "Fusion"))
@@ -109,6 +108,7 @@ _RAMP = {"bank": 0.07, "curve_start": 60.0, "curve_ramp": 20.0}
 _GUST = {"wind_force": (1500.0, 2500.0), "wind_arm": 0.3, "wind_start": 7.0, "wind_length": 3.0}
 _STOP = {"speed_change": -5.2, "change_start": 5.0, "change_length": 4.0}
 _STAND = _STOP | {"speed_change": -6.5}
+_DRIFT = Edit(("gyro",), drift=_DEGREE / 600.0)
 _IN_V1 = (
     Condition(BASE, _BOTH, _LANE, fault=np.inf),
     Condition("GPS", fault=np.inf),
@@ -123,9 +123,7 @@ _IN_V1 = (
     Condition("bank of 4 deg", _GPS, {"bank": 0.07, "curve_start": -1.0}),
     Condition("bank of 4 deg from 60 m on", _GPS, _RAMP, fault=2.3),
     Condition("gust of 1.5 to 2.5 kN", _GPS, _GUST, fault=7.0),
-    Condition(
-        "gyro drifts to 0.1 deg/s", edit=Edit(("gyro",), drift=_DEGREE / 600.0), duration=60.0
-    ),
+    Condition("gyro drifts to 0.1 deg/s", edit=_DRIFT, duration=60.0),
     Condition("gyro drifts to 1 deg/s", edit=Edit(("gyro",), drift=_DEGREE / 20.0)),
     Condition("gyro's scale + 2 %", edit=Edit(("gyro",), scale=1.02)),
     Condition("accelerometer askew by 2 deg", edit=Edit(("accel_y",), offset=0.34, accel_x=0.035)),
@@ -147,12 +145,8 @@ _IDEAL = (  # a camera that errs cannot see a road from which the car turns away
     Condition("camera and GPS, straight road", _BOTH, fault=np.inf),
     *_IN_V1[1:],
 )
-CONDITIONS = (
-    *_IN_V1,
-    *(
-        replace(x, name=x.name + IDEAL_SUFFIX, env_id=x.env_id.replace("-v1", "-v0"))
-        for x in _IDEAL
-    ),
+CONDITIONS = _IN_V1 + tuple(
+    replace(x, name=x.name + IDEAL_SUFFIX, env_id=f"{x.env_id[:-1]}0") for x in _IDEAL
 )
 
 
@@ -247,8 +241,8 @@ def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     clean = healthy[time <= condition.fault]
     alarms = float(np.mean(~clean)) if len(clean) else np.nan
     after = float(said[0]) if len(said) else np.inf
-    numbers = square, informed, by_gyro, nees, coverage, after, alarms
-    return Outcome(*numbers, spins=float(not driven.all()))
+    spins = float(not driven.all())
+    return Outcome(square, informed, by_gyro, nees, coverage, after, alarms, spins)
 
 
 def _measure_seeds(case: tuple[Condition, Sequence[int]]) -> list[Outcome | None]:
@@ -271,7 +265,6 @@ def _measure(request: Request) -> Results:
 
 
 def _summarise_outcomes(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Cells of a condition's line by column."""
     square, informed, gyro, nees, coverage, after, alarms, spins = np.array(outcomes, float).T
     lost = nees > _LOST
     return {
@@ -349,15 +342,11 @@ def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
 
 
 STUDY = Study(
-    "conditions",
-    "How far is a filter without options from one that is told everything?",
+    "conditions", "How far is a filter without options from one that is told everything?",
     f"RMSE of the sideslip angle from 2 s on, of {NAME} over the same filter that is told: the "
     "true car, tyres and friction to a tenth, sensors' errors, and in an ideal world the "
     "levels of noise and disturbances. No level was found in these drives. NEES: the mean square "
     "of the error over its deviation, 1 where that is honest. Intervals are 95 % over seeds.",
     (64, 4),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-    _add_figures,
-)
+    _measure, _add_tables, _compose_verdict, _add_figures,
+)  # fmt: skip

@@ -55,24 +55,18 @@ def _make_filters(*names: str) -> tuple[PaperFilter, ...]:
 
 EXPERIMENTS = (
     Experiment(
-        "Late camera",
-        "tie-vision-fig7",
-        "sideslip/YawVision-v0",
-        "tie-vision Fig. 7",
+        "Late camera", "tie-vision-fig7", "sideslip/YawVision-v0", "tie-vision Fig. 7",
         "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe; camera every "
         "33 ms, 30 ms late.",
         _make_filters("bicycle-kf", "single-rate-kf", "multirate-kf", "multirate-residual-kf"),
     ),
     Experiment(
-        "GPS, side wind",
-        "dakf-fig6",
-        "sideslip/YawGps-v0",
-        "dakf-stability Fig. 6",
+        "GPS, side wind", "dakf-fig6", "sideslip/YawGps-v0", "dakf-stability Fig. 6",
         "Lane change at 25 km/h with a side wind from 4 to 8 s and no GPS from 4 to 6 s; the "
         "filters believe in tyres 1.4 times stiffer than they are.",
         _make_filters("bicycle-kf", "single-rate-kf", "course-kf", "dakf"),
     ),
-)
+)  # fmt: skip
 
 
 def _make_env(experiment: Experiment) -> Any:
@@ -108,19 +102,15 @@ def _measure(request: Request) -> Results:
 
 def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:
     bound = numbers[BOUND][:, 0]
-    return [
-        {
-            "estimator": label,
-            "rmse": interval(squares, root_mean),
-            "rmse_over_bound": interval(squares, ratio_of_roots, bound),
-            "us_per_tick": float(np.median(us)),
-        }
-        for label, (squares, us) in ((label, columns.T) for label, columns in numbers.items())
-    ]
+    records = []
+    for label, (squares, us) in ((label, columns.T) for label, columns in numbers.items()):
+        record = {"estimator": label, "rmse": interval(squares, root_mean)}
+        record |= {"rmse_over_bound": interval(squares, ratio_of_roots, bound)}
+        records.append(record | {"us_per_tick": float(np.median(us))})
+    return records
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
-    """Add rows and a table of each experiment, the best estimator first."""
     for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
         *records, bound = _make_records(numbers)
         spec, n = _make_env(experiment).spec.to_json(), len(numbers[BOUND])
@@ -154,7 +144,6 @@ def _compose_verdict(results: Results) -> str:
 
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
-    """Add the errors of every experiment's estimators, and one drive of each."""
     groups, angle = {}, "sideslip angle / mrad"
     for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
         records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)
@@ -185,8 +174,7 @@ def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
 
 
 STUDY = Study(
-    "estimation",
-    "Which estimator comes closest to the sideslip angle",
+    "estimation", "Which estimator comes closest to the sideslip angle",
     "Root mean square error of the sideslip angle from 2 s on. The bound is the standard "
     "deviation that the optimal filter of the true linear model has on the same arrivals, the "
     "wind included; no estimator can do better on average. exact-kf is exact about delays and "
@@ -197,8 +185,5 @@ STUDY = Study(
     "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
     "are 95 % over seeds.",
     (100, 10),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-    _add_figures,
-)
+    _measure, _add_tables, _compose_verdict, _add_figures,
+)  # fmt: skip

@@ -18,7 +18,7 @@ from ...estimators.wires import apply_wires, read_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
-from ..recorded.emulate import find_backward, find_moving
+from ..recorded.emulate import LoggedMotion
 from ..recorded.honesty import HONESTY, compute_honesty
 from ..report.study import Request, Study
 
@@ -34,7 +34,6 @@ _COLUMNS = (
 
 
 def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
-    """Records of all drives in the folder, and a line for what is not there or not scored."""
     records, absent = list[dict[str, Any]](), list[str]()
     if request.data is not None and not request.data.is_dir():
         raise FileNotFoundError(f"{request.data}: there is no such folder")
@@ -65,11 +64,9 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
-    """Mark the rows that count: moving forward, settled, with a truth."""
-    truth = log.truth.get("beta", np.full(len(log.time), np.nan))
+    truth, motion = log.truth.get("beta", np.full(len(log.time), np.nan)), LoggedMotion(log)
     is_settled = log.time >= log.time[0] + SETTLED - 1e-9
-    is_scored = is_settled & find_moving(log) & ~find_backward(log) & np.isfinite(truth)
-    return np.asarray(is_scored, np.bool_)
+    return np.asarray(is_settled & motion.is_moving & ~motion.is_backward & np.isfinite(truth))
 
 
 def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
@@ -93,7 +90,6 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
 
 
 def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -> None:
-    """Add rows and the table, and the instructions above the verdict."""
     records, absent = results
     for record in records:
         numbers = {key: value for key, value in record.items() if key != "drive"}
@@ -105,7 +101,6 @@ def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -
 
 
 def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
-    """Say the medians over the drives, or that there is none."""
     records, absent = results
     if not records:
         return format_verdict("No drive was read: the lines above say where to get each.")
@@ -119,11 +114,8 @@ def _compose_verdict(results: tuple[list[dict[str, Any]], list[str]]) -> str:
 
 
 STUDY = Study(
-    "logs",
-    "How far off is one setting on recorded drives?",
+    "logs", "How far off is one setting on recorded drives?",
     "`joint` without options, its car from the preset or from vehicle.toml beside the drive.",
     (1, 1),
-    _measure,
-    _add_tables,
-    _compose_verdict,
-)
+    _measure, _add_tables, _compose_verdict,
+)  # fmt: skip

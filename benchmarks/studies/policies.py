@@ -57,13 +57,13 @@ _COLUMNS = (
 class PolicyEvaluation:
     """Episodes on the same seeds by entry, the policy's first."""
 
-    policy: Policy  # the policy
-    salt: str  # salt of the seeds, "" where the caller chose them
-    seeds: list[int]  # seeds of the episodes
-    reference: str  # reference of the env
-    task: ControlTask  # task that they drive
-    entries: dict[str, Entry]  # entries by name
-    drives: dict[str, DriveResult]  # episodes by name
+    policy: Policy
+    salt: str  # of the seeds, "" where the caller chose them
+    seeds: list[int]
+    reference: str  # of the env
+    task: ControlTask  # that they drive
+    entries: dict[str, Entry]
+    drives: dict[str, DriveResult]
     left_out: dict[str, str]  # why an entry is not among them, by name
 
     def make_suite(self) -> Suite:
@@ -100,18 +100,15 @@ class PolicyEvaluation:
             f"better: on how many of the seeds {name} costs less. step: the largest between two "
             "decisions."
         )
-        left_out = [f"{x} was not driven: {error}." for x, error in self.left_out.items()]
-        note = " ".join([note, *left_out])
+        note += "".join(f" {x} was not driven: {error}." for x, error in self.left_out.items())
         suite.tables.append(ResultTable("What it costs", _COLUMNS, lines, note))
         driven = {(label,): drive.series for label, drive in self.drives.items()}
         series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
         explorer = make_time_explorer("The first seed, side by side", (), series, name)
         suite.explorers.append(explorer)
-        fails = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes."
-        suite.verdict = format_verdict(
-            *verdict,
-            f"{fails} Not said: other cars, scenarios and seeds than these {len(self.seeds)}.",
-        )
+        last = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes. Not said: other "
+        last += f"cars, scenarios and seeds than these {len(self.seeds)}."
+        suite.verdict = format_verdict(*verdict, last)
         return suite
 
 
@@ -143,10 +140,9 @@ def evaluate_policy(
     options = dict(card.env_options) if env_id in (None, card.env_id) else {}
     options |= {} if scenario is None else {"scenario": scenario}
     base: Any = gym.make(home, **options).unwrapped
-    salt = loaded.salt if seed is None else ""
-    seeds = (
-        make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
-    )
+    salt, seeds = loaded.salt, make_salted_seeds(loaded.salt, episodes)
+    if seed is not None:
+        salt, seeds = "", list(range(seed, seed + episodes))
     rivals = {f"{_CLASSICAL} on {FILTER}": Entry(_CLASSICAL, FILTER), "none": Entry("none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
@@ -333,11 +329,8 @@ def prepare_start(
             tasks, rng = _list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
-            fields["scenarios"] = [
-                _vary_scenario(task, change) if change else task.scenario
-                for task in tasks
-                for change in _draw_changes(varied, rng)
-            ]
+            pairs = ((task, x) for task in tasks for x in _draw_changes(varied, rng))
+            fields["scenarios"] = [_vary_scenario(t, x) if x else t.scenario for t, x in pairs]
         return make_finetune_task(policy, **fields)
 
     return policy, make_task
@@ -347,26 +340,20 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     """Cost in % of nominal's and win rates, with intervals, and the fraction of failures."""
     policy = load_policy(path)
     seeds = tuple(make_salted_seeds(policy.salt, episodes, task.seed_text))
-    entries = {
-        "policy": Entry(str(path), policy.card.estimator),
-        NOMINAL: Entry(NOMINAL),
-        _RIVAL: Entry(_RIVAL, JOINT),
-        PARAMETERS: Entry(PARAMETERS),
-    }
+    entries = {"policy": Entry(str(path), policy.card.estimator), NOMINAL: Entry(NOMINAL)}
+    entries |= {_RIVAL: Entry(_RIVAL, JOINT), PARAMETERS: Entry(PARAMETERS)}
     results = {name: run_chunk(Chunk(task, entry, seeds)) for name, entry in entries.items()}
     for name, result in results.items():
         if result.error:
             raise ValueError(f"{name} cannot drive {task.name}: {result.error}")
-    costs = results[NOMINAL].costs
-    shown: JsonMap = {
-        name: _list_rounded(geometric_mean(-compute_log_ratios(costs, result)), 100.0)
-        for name, result in results.items()
-        if name != NOMINAL
-    }
-    policy_costs, rivals = results["policy"].costs, (NOMINAL, _RIVAL)
-    beaten = {name: compute_win_rate(policy_costs, results[name].costs) for name in rivals}
-    better = {f"better than {name}": _list_rounded(result, 1.0) for name, result in beaten.items()}
-    return shown | better | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
+    nominal, policy_costs, shown = results[NOMINAL].costs, results["policy"].costs, JsonMap()
+    for name in ("policy", _RIVAL, PARAMETERS):
+        ratio = geometric_mean(-compute_log_ratios(nominal, results[name]))
+        shown[name] = _list_rounded(ratio, 100.0)
+    for name in (NOMINAL, _RIVAL):
+        rate = compute_win_rate(policy_costs, results[name].costs)
+        shown[f"better than {name}"] = _list_rounded(rate, 1.0)
+    return shown | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
 
 
 def _list_rounded(numbers: Estimate, unit: float) -> Sequence[float]:

@@ -111,7 +111,6 @@ def _compose_verdict(results: Results) -> str:
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
-    """Add rows and tables of the swerves, and of the lane keeping."""
     records, (swerves, lanes) = list[Line](), results
     free = swerves["none"]
     for controller, numbers in swerves.items():
@@ -158,16 +157,13 @@ _LANE_COLUMNS = (
     Column("offset", "off the centre / m", form=".2f"),
 )
 STUDY = Study(
-    "highway",
-    "Swerving among other vehicles, on highway-env's roads",
+    "highway", "Swerving among other vehicles, on highway-env's roads",
     "A vehicle ahead brakes hard on a wet road (friction 0.4 to 0.7), and a startled driver "
     "swerves around it and back, late. The yaw moment is the controller's; nobody but the oracle "
     "knows state, tyres and friction. Others are highway-env's IDM vehicles.\n\n"
     "highway-env's own lane keeping: our record (gyro, camera 30 ms late) built from its car, our "
     "filters and `lane-keeping` on it, beside the noisy state that highway-env observes itself.",
     _SEEDS,
-    _measure,
-    _add_tables,
-    _compose_verdict,
+    _measure, _add_tables, _compose_verdict,
     needs=("highway_env", 'Not driven: it needs highway-env, pip install "sideslip[highway]".'),
-)
+)  # fmt: skip

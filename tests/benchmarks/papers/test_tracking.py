@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.manoeuvres import measure_tracking, run_episode
+from sideslip.agents.rollout import Rollout
+from sideslip.benchmarks.papers.manoeuvres import FollowingSimulation
 
 FIG7: dict[str, Any] = {
     "base": "dakf-fig6",
@@ -29,31 +30,35 @@ FIG7: dict[str, Any] = {
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 
+def drive(seed: int, scenario: Any, **options: Any) -> tuple[Rollout, dict[str, float]]:
+    return FollowingSimulation("f", scenario, {"a": options})._run_episode("a", seed)
+
+
 def compared(seeds: Iterable[int], scenario: Any, **options: Any) -> dict[str, Any]:
     """With control over without it, (seeds,) each: RMS errors of beta and gamma, peak of beta.
 
-    `saturated` and `failed` are those with control. options: of `run_episode`.
+    `saturated` and `failed` are those with control. options: of the controller.
     """
     rows = []
     for seed in seeds:
-        none = measure_tracking(run_episode(seed, scenario, "none"))
-        ours = measure_tracking(run_episode(seed, scenario, **options))
+        _, none = drive(seed, scenario, agent="none")
+        episode, ours = drive(seed, scenario, **options)
+        ours["failed"] = episode.failed
         ratios = {x: ours[x] / none[x] for x in ("rms_beta", "rms_gamma", "peak_beta")}
         rows.append(ours | ratios)
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def test_the_numbers_are_those_of_the_episode() -> None:
-    episode = run_episode(0, FIG7 | {"duration": 2.0})
-    found = measure_tracking(episode)
+    episode, found = drive(0, FIG7 | {"duration": 2.0})
     assert found["rms_beta"] == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
     assert found["rms_gamma"] == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
     assert found["peak_beta"] == np.max(np.abs(episode["beta"]))
-    assert not found["failed"]
+    assert not episode.failed
     assert episode["t"][-1] == 2.0
     assert len(episode["t"]) == 2001
     assert 0.0 < np.abs(episode["action_1"]).max() < 1.0
-    none = measure_tracking(run_episode(0, FIG7 | {"duration": 2.0}, "none"))
+    _, none = drive(0, FIG7 | {"duration": 2.0}, agent="none")
     assert none["saturated"] == 0.0
 
 

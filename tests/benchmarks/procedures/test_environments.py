@@ -11,7 +11,6 @@ from sideslip.benchmarks.procedures.drive import (
     CARS,
     ENTRIES,
     DriveFunction,
-    Series,
 )
 from sideslip.benchmarks.procedures.outside import _make_steering_profile
 from sideslip.envs import Scenario
@@ -32,7 +31,7 @@ def linear(name: str) -> DriveFunction:
 def slow(name: str) -> float:
     """The steering angle in rad of 0.1 g, slowly."""
     car = CARS[name]
-    per = car.vehicle.wheelbase / car.speed**2 + iso4138.compute_understeer_gradient(car.vehicle)
+    per = car.vehicle.wheelbase / car.speed**2 + car.understeer_gradient
     return 0.1 * GRAVITY * per
 
 
@@ -96,7 +95,8 @@ def test_uncontrolled_cars_pass_small_amplitudes_and_fail_large_ones(
 @pytest.mark.parametrize("track", iso3888.TRACKS)
 def test_a_slow_driver_touches_no_cone(name: str, track: str) -> None:
     car = CARS[name]
-    runs = iso3888.run(ENTRIES[0].drive(name), car, track, [0.45 * car.speed, 1.1 * car.speed])
+    drive = ENTRIES[0].drive(name)
+    runs = [iso3888.run(drive, car, track, share * car.speed) for share in (0.45, 1.1)]
     assert [run.passed for run in runs] == [True, False]
 
 
@@ -106,22 +106,3 @@ def test_a_failed_episode_is_told_and_ends_early() -> None:
     )
     assert spun.failed
     assert spun.t[-1] < 5.0
-
-
-def test_a_procedure_leaves_nothing_to_the_seed() -> None:
-    scenario = Scenario(name="drawn", speed=(10.0, 20.0))
-    with pytest.raises(ValueError, match="'drawn' draws; a procedure gives numbers"):
-        _make_steering_profile(scenario)
-
-
-def test_a_series_is_one_value_a_time() -> None:
-    t = np.arange(3.0)
-    with pytest.raises(ValueError, match=r"gamma has shape \(2,\), the times \(3,\)"):
-        Series(t, t, t, t, t[:2], t, t, t, t)
-
-
-def test_a_signal_after_the_end_is_no_number() -> None:
-    t = np.arange(3.0)
-    series = Series(t, t, t, t, 2.0 * t, t, t, t, t)
-    assert series.interpolate("gamma", 1.5) == pytest.approx(3.0)
-    assert math.isnan(series.interpolate("gamma", 2.5))

@@ -74,7 +74,7 @@ def test_a_lane_that_was_not_driven_through_has_no_margin() -> None:
 
 def test_a_path_down_the_lanes_centres_passes_and_straight_on_does_not() -> None:
     speed = 20.0
-    lanes = iso3888.make_lanes(CAR, "iso-3888-1", speed)
+    lanes = iso3888._make_lanes(CAR, "iso-3888-1", speed)
     X = np.arange(0.0, lanes[-1].start + lanes[-1].length + 10.0, 0.1)
     knots = [[lane.start - 6.0, lane.start + lane.length + 4.0] for lane in lanes]
     Y = np.interp(X, np.ravel(knots), np.repeat([lane.offset for lane in lanes], 2))
@@ -90,14 +90,14 @@ def test_the_highest_speed_is_that_of_a_clean_run_of_any_driver(track: str) -> N
 
     def drive(fields: Fields) -> Series:
         driven.append((fields["speed"], fields["driver_gain"]))
-        lanes = iso3888.make_lanes(CAR, track, fields["speed"])
+        lanes = iso3888._make_lanes(CAR, track, fields["speed"])
         X = np.arange(0.0, lanes[-1].start + lanes[-1].length + 10.0, 0.1)
         knots = [[lane.start - 5.0, lane.start + lane.length + 4.0] for lane in lanes]
         Y = np.interp(X, np.ravel(knots), np.repeat([lane.offset for lane in lanes], 2))
         skilled = fields["speed"] < 11.5 or (fields["speed"] < 12.5 and fields["driver_gain"] > 0.9)
         return series(X, Y if skilled else 0.0 * Y, 0.0 * X)
 
-    runs = iso3888.run(drive, CAR, track, [11.0, 12.0, 13.0])
+    runs = [iso3888.run(drive, CAR, track, speed) for speed in (11.0, 12.0, 13.0)]
     assert [speed for speed, _ in driven] == [11.0] + 3 * [12.0] + len(iso3888.DRIVERS) * [13.0]
     assert [run.passed for run in runs] == [True, True, False]
     assert suite._find_highest_speed(runs) == 12.0

@@ -15,16 +15,15 @@ from rich.console import Console
 
 import sideslip
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.recorded.emulate import compute_heading, find_backward
+from sideslip.benchmarks.recorded.emulate import LoggedMotion
 from sideslip.benchmarks.recorded.quality import (
     COMPASS,
     TRUTH,
     estimate_resolution,
+    find_contradictions,
     find_saturated,
-    make_remarks,
-    make_warnings,
 )
-from sideslip.benchmarks.recorded.replay import TRUTH_WARNING, replay_file
+from sideslip.benchmarks.recorded.replay import TRUTH_WARNING, _sort_remarks, replay_file
 from sideslip.benchmarks.report.html import write_report
 from sideslip.benchmarks.report.terminal import print_suite
 from sideslip.envs.record import FAST, PACKET, Array, Log
@@ -122,7 +121,11 @@ def filled(log: Log, value: float) -> Log:
 def of_heading(log: Log) -> Log:
     noise = np.random.default_rng(0).normal(0.0, 0.002, len(log.record.packets))
     rows = (log.record.packets[:, PACKET.captured] - log.record.first).astype(int)
-    return changed(log, course=lambda x: compute_heading(log)[rows] + noise)
+    return changed(log, course=lambda x: LoggedMotion(log).heading[rows] + noise)
+
+
+def make_warnings(logs: list[Log], car: Vehicle) -> list[str]:
+    return [finding.text for finding in find_contradictions(logs, car)]
 
 
 @pytest.mark.parametrize("every", [1, 10, 50])
@@ -140,7 +143,7 @@ def test_fifty_clean_drives_have_no_warning(seed: int) -> None:
         short = decimated(log, every)
         assert make_warnings([short], car) == []
         assert make_warnings([dataclasses.replace(short, truth={})], car) == []
-        assert make_remarks([short]) == []
+        assert _sort_remarks([], [short], PASSENGER_CAR)[1] == []
 
 
 @pytest.mark.parametrize(
@@ -205,10 +208,10 @@ def test_a_gyro_of_coarse_steps_is_not_at_its_limit() -> None:
     step = 1.28 * DEG
     coarse = changed(clean(), {"gyro": lambda x: step * np.rint(x / step)})
     assert not find_saturated(coarse).any() and make_warnings([coarse], PASSENGER_CAR) == []
-    assert make_remarks([coarse]) == ["The gyro's resolution is 1.28 deg/s."]
+    assert _sort_remarks([], [coarse], PASSENGER_CAR)[1] == ["The gyro's resolution is 1.28 deg/s."]
     assert (
         estimate_resolution(clean().record.fast[:, FAST.gyro]) == 0.0
-        and make_remarks([clean()]) == []
+        and _sort_remarks([], [clean()], PASSENGER_CAR)[1] == []
     )
     held = changed(clean(), {"gyro": lambda x: x[::10].repeat(10)[: len(x)]})
     assert not find_saturated(held).any()
@@ -237,7 +240,7 @@ def test_rows_driven_backward_are_not_scored(tmp_path: Path, signed: bool) -> No
     (row,) = (r for r in suite.rows if r.metric == "rmse" and "front" not in r.scenario)
     assert row.value < 1.0 * DEG
     assert "450 rows are driven backward, and not scored" in suite.text
-    assert not find_backward(clean()).any()
+    assert not LoggedMotion(clean()).is_backward.any()
 
 
 def test_warnings_stand_over_the_verdict(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading, compute_path
+from sideslip.benchmarks.recorded.emulate import Emulation, LoggedMotion
+from sideslip.benchmarks.recorded.suite import _compute_path
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from tests.envs.recordings.drives import read_log
 
@@ -21,7 +22,7 @@ def log(tmp_path: Path) -> Log:
 
 
 def test_a_noiseless_course_is_truth_plus_the_integral_of_the_yaw_rate(log: Log) -> None:
-    seen = Emulation(course_noise_deg=0.0, bias_deg=1.0).add_course(log, 0)
+    seen = Emulation(course_noise_deg=0.0, bias_deg=1.0).apply(log, 0)
     packets = seen.record.select_packets("gps")
     captured = packets[:, PACKET.captured].astype(int)
     np.testing.assert_array_equal(captured, np.arange(10_000, 11_001, 10))
@@ -35,8 +36,8 @@ def test_a_noiseless_course_is_truth_plus_the_integral_of_the_yaw_rate(log: Log)
 
 
 def test_a_late_course_arrives_so_many_rows_later(log: Log) -> None:
-    fresh = Emulation().add_course(log, 3).record.packets
-    late = Emulation(delay=0.2).add_course(log, 3)
+    fresh = Emulation().apply(log, 3).record.packets
+    late = Emulation(delay=0.2).apply(log, 3)
     packets = late.record.packets
     np.testing.assert_array_equal(packets[:, PACKET.arrived], packets[:, PACKET.captured] + 20)
     np.testing.assert_array_equal(packets[:, PACKET.value], fresh[: len(packets), PACKET.value])
@@ -46,16 +47,16 @@ def test_a_late_course_arrives_so_many_rows_later(log: Log) -> None:
 
 def test_the_noise_has_its_seed_and_size(log: Log) -> None:
     how = Emulation(course_rate=100.0, course_noise_deg=0.5)
-    one, same, other = (how.add_course(log, seed).record.packets for seed in (1, 1, 2))
+    one, same, other = (how.apply(log, seed).record.packets for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
-    noise = one[:, PACKET.value] - (log.truth["beta"] + compute_heading(log))
+    noise = one[:, PACKET.value] - (log.truth["beta"] + LoggedMotion(log).heading)
     assert np.std(noise) == pytest.approx(0.5 * DEG, rel=0.1)
     assert not np.array_equal(one, other)
 
 
 def test_a_gyro_bias_reaches_the_estimators_but_not_the_heading(log: Log) -> None:
     plain, biased = Emulation(), Emulation(gyro_bias_degps=0.2)
-    one, two = plain.add_course(log, 0).record, biased.add_course(log, 0).record
+    one, two = plain.apply(log, 0).record, biased.apply(log, 0).record
     np.testing.assert_allclose(two.fast[:, FAST.gyro] - one.fast[:, FAST.gyro], 0.2 * DEG)
     np.testing.assert_array_equal(two.packets, one.packets)
 
@@ -67,7 +68,7 @@ def test_no_course_where_the_truth_is_unknown_and_none_to_use_at_a_standstill(
     beta[95:105] = np.nan
     speed[:50] = 0.5
     log = read_log(saved(tmp_path, sideslip_rad=beta, speed_x_mps=speed))
-    packets = Emulation().add_course(log, 0).record.packets
+    packets = Emulation().apply(log, 0).record.packets
     assert 10_100 not in packets[:, PACKET.captured]
     np.testing.assert_array_equal(packets[:6, PACKET.quality], [0, 0, 0, 0, 0, 1])
 
@@ -78,6 +79,6 @@ def test_a_path_of_a_circle() -> None:
     fast[:, FAST.gyro] = 0.1
     fast[:, [FAST.wheel_left, FAST.wheel_right]] = 10.0
     drive = Log(Record(fast, np.zeros((0, PACKET_WIDTH))), {})
-    x, y = compute_path(drive, np.zeros(20_001))
+    x, y = _compute_path(drive, np.zeros(20_001))
     radius = np.hypot(x, y - 100.0)
     np.testing.assert_allclose(radius, 100.0, atol=0.01)

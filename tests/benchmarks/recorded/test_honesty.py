@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from sideslip.benchmarks.recorded.honesty import (
-    SHARES,
-    compute_held_shares,
-    compute_honesty,
-    describe_innovations,
-)
+from sideslip.benchmarks.recorded.honesty import compute_honesty, describe_innovations
+from sideslip.benchmarks.recorded.suite import SHARES, _compute_held_shares
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
@@ -24,7 +20,7 @@ def test_nees_coverage_and_score_of_normal_errors(factor: float) -> None:
     assert held == pytest.approx(2.0 * norm.cdf(1.96 * factor) - 1.0, abs=0.01)
     assert score == pytest.approx(np.mean(norm.logpdf(error, 0.0, deviation)))
     shares = 2.0 * norm.cdf(factor * norm.ppf(0.5 + SHARES / 2.0)) - 1.0
-    assert compute_held_shares(error, deviation) == pytest.approx(shares, abs=0.02)
+    assert _compute_held_shares(error, deviation) == pytest.approx(shares, abs=0.02)
 
 
 def test_the_score_is_best_at_the_true_deviation() -> None:

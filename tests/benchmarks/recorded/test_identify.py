@@ -15,9 +15,9 @@ from sideslip.benchmarks.recorded.identify import (
     IdentificationResult,
     _estimate_white_noise,
     identify,
-    make_suite,
 )
-from sideslip.benchmarks.recorded.quality import find_saturated, find_swapped, make_warnings
+from sideslip.benchmarks.recorded.quality import find_contradictions, find_saturated, find_swapped
+from sideslip.benchmarks.recorded.replay import _make_suite
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR
 from sideslip.estimators.wires import SignalCalibration
@@ -126,7 +126,7 @@ def test_what_is_not_there_is_not_told(spoil: Callable[[Log], Log], reason: str)
     found = identify([spoil(drive(1)[0])], PASSENGER_CAR)
     assert reason in found.reason and found.car == PASSENGER_CAR and found.wires.gain == 1.0
     assert not any(each.is_determined for each in found.findings[:8])
-    assert "shows nothing of the car" in make_suite(found, "x").verdict
+    assert "shows nothing of the car" in _make_suite(found, "x").verdict
 
 
 def test_a_stated_ratio_stays_where_hard_turns_hide_it() -> None:
@@ -145,7 +145,9 @@ def test_swapped_columns_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=f"columns are swapped, {message}"):
             identify([spoilt], PASSENGER_CAR)
-        assert any("swapped" in text for text in make_warnings([spoilt], PASSENGER_CAR))
+        assert any(
+            "swapped" in finding.text for finding in find_contradictions([spoilt], PASSENGER_CAR)
+        )
     assert find_swapped([log]) == ""
 
 
@@ -156,7 +158,7 @@ def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
     out = find_saturated(clipped)
     assert (gyro[out] >= 0.9 * gyro.max() - 1e-12).sum() + (gyro[out] <= -0.3).sum() > 0
     assert not find_saturated(log).any()
-    assert any(f"limit in {out.sum()} rows" in t for t in make_warnings([clipped], car))
+    assert any(f"limit in {out.sum()} rows" in x.text for x in find_contradictions([clipped], car))
     whole, less = (
         len(make_windows([each], [find_saturated(each)]).starts) for each in (log, clipped)
     )
@@ -174,6 +176,6 @@ def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
     ],
 )
 def test_steering_of_another_sign_or_size_is_warned_of(ratio: float, message: str) -> None:
-    (text,) = make_warnings([drive(1, ratio)[0]], PASSENGER_CAR)
-    assert re.search(message, text), text
-    assert make_warnings([drive(1)[0]], PASSENGER_CAR) == []
+    (found,) = find_contradictions([drive(1, ratio)[0]], PASSENGER_CAR)
+    assert re.search(message, found.text), found.text
+    assert find_contradictions([drive(1)[0]], PASSENGER_CAR) == []

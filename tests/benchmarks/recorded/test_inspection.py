@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 import sideslip
-from sideslip.benchmarks.recorded.checks import CHECKS, InspectedDrive, check_drive
-from sideslip.benchmarks.recorded.inspection import inspect_file, read_drive
+from sideslip.benchmarks.recorded.checks import CHECKS, InspectedDrive
+from sideslip.benchmarks.recorded.inspection import _read_drive, inspect_file
 from sideslip.benchmarks.recorded.quality import BLOCKER, OK, WARNING, LogFinding
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from tests.benchmarks.conftest import Run
@@ -27,8 +27,9 @@ CASES = SHARED / "cases"
 
 def look(table: pd.DataFrame | Path, car: str | Path = "passenger-car") -> list[LogFinding]:
     """The findings on a table that are not OK."""
-    _, checked, _, findings = read_drive(table, {}, make_vehicle(car))
-    findings += check_drive(checked) if checked is not None else []
+    _, checked, _, findings = _read_drive(table, {}, make_vehicle(car))
+    if checked is not None:
+        findings += [finding for check in CHECKS.values() for finding in check(checked)]
     return [finding for finding in findings if finding.level != OK]
 
 
@@ -62,7 +63,7 @@ def test_a_check_that_finds_nothing_is_counted() -> None:
 
 
 def _read_clean() -> InspectedDrive:
-    checked = read_drive(drive(CLEAN + 1)[0], {}, PASSENGER_CAR)[1]
+    checked = _read_drive(drive(CLEAN + 1)[0], {}, PASSENGER_CAR)[1]
     assert checked is not None
     return checked
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.recorded.identify import identify
-from sideslip.benchmarks.recorded.validate import make_validation_table, split_blocks
+from sideslip.benchmarks.recorded.replay import _make_validation_table, _split_blocks
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies.logs import STUDY
 from sideslip.envs.record import FAST
@@ -48,17 +48,17 @@ def test_each_drive_has_a_row_and_a_smoother_beside_it(tmp_path: Path) -> None:
 
 def test_a_found_car_stays_within_the_corridors_and_a_wrong_one_does_not() -> None:
     log = copy.deepcopy(drive(1, duration=100.0)[0])
-    odd, even = split_blocks([log])
+    odd, even = _split_blocks([log])
     rows = sum(len(block.time) for block in (*odd, *even))
     assert rows == len(log.time) and odd[0].time[-1] < even[0].time[0]
-    found = make_validation_table([log], PASSENGER_CAR, None, None)
+    found = _make_validation_table([log], PASSENGER_CAR, None, None)
     assert "assumptions" in found.note and len(found.cells) == 2
     assert [cell[-1] for cell in found.cells] == ["yes", "yes"]
     for block in even:  # another car drives them: it turns 1.3 times as much
         start = block.record.first - log.record.first
         part = slice(start, start + len(block.time))
         log.record.fast[part, [FAST.gyro, FAST.accel_y]] *= 1.3
-    other = make_validation_table([log], PASSENGER_CAR, None, None)
+    other = _make_validation_table([log], PASSENGER_CAR, None, None)
     assert [cell[-1] for cell in other.cells] == ["no", "no"]
 
 
@@ -79,5 +79,5 @@ def test_an_antenna_ahead_is_moved_before_the_car_is_sought() -> None:
 
 def test_a_log_without_excitation_is_not_validated() -> None:
     log, _ = drive(1)
-    table = make_validation_table([split_blocks([log])[0][0]], PASSENGER_CAR, None, None)
+    table = _make_validation_table([_split_blocks([log])[0][0]], PASSENGER_CAR, None, None)
     assert not table.cells and table.note.startswith("Not validated")

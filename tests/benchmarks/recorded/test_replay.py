@@ -10,7 +10,7 @@ import pytest
 from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
-from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
+from sideslip.benchmarks.recorded.emulate import Emulation, LoggedMotion
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, corners, replay
 from sideslip.envs.record import Log
@@ -71,7 +71,7 @@ def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
     options = {"q_beta": 1e-3, "q_gamma": 0.1, "q_psi": 0.0, "course_noise": 0.5 * DEG}
     errors = []
     for seed in (5, 6, 7):
-        seen = Emulation().add_course(log, seed)
+        seen = Emulation().apply(log, seed)
         facts: dict[str, Any] = {"vehicle": soft, "sensors": seen.slow, "dt": log.record.dt}
         estimator = make_estimator("multirate-kf", **facts, **options)
         error = estimator.run(seen)["beta"][200:] - log.truth["beta"][200:]
@@ -128,7 +128,7 @@ def test_a_log_without_truth_or_slow_sensors_runs_and_says_what_it_leaves_out(
 def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
     course = np.full(ROWS, np.nan)
     plain = read_log(saved(tmp_path))
-    heading = plain.truth["beta"] + compute_heading(plain) + 0.7  # another zero of heading
+    heading = plain.truth["beta"] + LoggedMotion(plain).heading + 0.7  # another zero of heading
     course[::20] = heading[::20]
     log = read_log(saved(tmp_path, course_rad=course))
     suite = replay(log, PASSENGER_CAR, figures=False)

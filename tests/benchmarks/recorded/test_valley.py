@@ -91,7 +91,7 @@ def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
     w = dataclasses.replace(make_windows([log], [find_saturated(log)]), tyres="fiala")
     found = fit(NEUTRAL, w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
     for name, sd in (("front", 0.4), ("rear", 0.4), ("inertia", 0.2)):
-        assert abs(getattr(found.theta, name)) < sd and found.half(name) < 2.3 * sd, name
+        assert abs(getattr(found.theta, name)) < sd and found.halves[name] < 2.3 * sd, name
 
 
 def test_the_course_tells_what_the_yaw_rate_leaves_open() -> None:
@@ -110,7 +110,7 @@ def test_an_interval_without_data_is_that_of_the_prior() -> None:
     """And a prior belongs to no stretch: it stays when one is left out."""
     arrays = np.ones(1), np.zeros((20, 1, 1)), np.zeros((20, 1)), np.array([0.4**-2]), np.zeros(1)
     nothing = BicycleFit(Theta(front=0.1), ("front",), *arrays)
-    assert nothing.half("front") == pytest.approx(student.ppf(0.975, 19) * 0.4)
+    assert nothing.halves["front"] == pytest.approx(student.ppf(0.975, 19) * 0.4)
     pulled = dataclasses.replace(nothing, H=nothing.H + 1.0, pull=np.array([0.3 * 0.4**-2]))
     gone = np.arange(20) < 15
     assert pulled.estimate_shift(gone)[0] == pytest.approx(-0.3 * 0.4**-2 / (5.0 + 0.4**-2))
