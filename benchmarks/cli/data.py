@@ -117,8 +117,7 @@ class _Replay:
         wires = _read_wires(self, self.latency)
         with use_shared_bar(console, f"replay {log}"):
             suite = replay_file(
-                log,
-                self.vehicle,
+                *(log, self.vehicle),
                 mapping=self.mapping,
                 wires=wires,
                 nominal=self.nominal,
@@ -168,15 +167,8 @@ class _Identify:
 
         console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            result, suite = identify_file(
-                self.log,
-                self.vehicle,
-                self.mapping or (),
-                wires,
-                self.tyres,
-                self.until,
-                self.validate,
-            )
+            known = self.log, self.vehicle, self.mapping or ()
+            result, suite = identify_file(*known, wires, self.tyres, self.until, self.validate)
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)
@@ -207,10 +199,10 @@ class _Inspect:
         from ..recorded.inspection import inspect_file
 
         console, wires = Console(), _read_wires(self, self.latency)
-        drawn = self.html is not None
         with use_shared_bar(console, f"inspect {self.log}"):
-            suite = inspect_file(self.log, self.vehicle, self.mapping or (), wires, drawn)
-        write_output(console, [suite], vars(self) | {"json": None, "parquet": None})
+            known = self.log, self.vehicle, self.mapping or ()
+            suite = inspect_file(*known, wires, drawn=self.html is not None)
+        write_output(console, [suite], {"html": self.html, "json": None, "parquet": None})
         if suite.verdict.startswith("Do not"):
             raise Exit(1)
 
@@ -251,9 +243,8 @@ class _Lane:
             try:
                 picture = read_picture(source)
             except cv2.error:
-                raise ValueError(
-                    f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
-                ) from None
+                text = f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
+                raise ValueError(text) from None
             finder = self._make_finder([picture], source)
             lanes, seconds = _process_picture(picture, finder, out)
         else:
@@ -302,10 +293,9 @@ class _Lane:
             except OverflowError as error:
                 raise ValueError(f"{file}: {error}") from None
         if camera.size != (width, height):
-            raise ValueError(
-                f"{file}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
-                f"those of {source} {width} x {height}"
-            )
+            expected, got = ("{} x {}".format(*size) for size in (camera.size, (width, height)))
+            text = f"{file}: the camera's pictures are {expected} pixels, those of {source} {got}"
+            raise ValueError(text)
         failed = None
         for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
             try:

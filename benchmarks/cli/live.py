@@ -125,12 +125,10 @@ class _Live:
         if drive is not None:
             lines.append(_compare_offline(drive, setup, self.trust, numbers))
         console.print(f"[bold]{escape(format_verdict(*lines))}[/]")
-        if self.record is not None:
-            print_written(console, self.record)
+        print_written(console, self.record)
         self._write(numbers)
 
     def _simulate(self, setup: dict[str, Any], target: Any) -> None:
-        """Run the simulated car alone and print its episode."""
         from ...agents.live.loop import Port
         from ...agents.live.simulate import simulate
 
@@ -199,7 +197,6 @@ def _parse_address(text: str) -> tuple[str, int]:
 
 
 def _watch_signals() -> list[int]:
-    """Make a list that fills when the process is asked to end."""
     signals: list[int] = []
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda number, _: signals.append(number))

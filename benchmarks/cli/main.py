@@ -122,8 +122,8 @@ class _Run:
 
         check_film(self.video)
         if self.beside is not None and self.video is None:
-            text = "can only drive beside in a film: --video names its file"
-            raise ValueError(f"{self.beside!r} {text}")
+            raise ValueError(f"{self.beside!r} can only drive beside in a film: --video names its "
+                             "file")  # fmt: skip
         driver = FilmDriver(self.agent, *make_driver(make_setup(vars(self)), self.trust))
         if self.env is None and driver.env.spec is not None:
             console.print(f"on {driver.env.spec.id}", highlight=False)
@@ -134,9 +134,8 @@ class _Run:
             if self.beside is not None:
                 env = copy.deepcopy(driver.env)
                 name = "no control" if self.beside == "none" else self.beside
-                drivers.append(
-                    FilmDriver(name, env, make_agent(self.beside, env, trust=self.trust))
-                )
+                ghost = make_agent(self.beside, env, trust=self.trust)
+                drivers.append(FilmDriver(name, env, ghost))
             write_film(self.video, drivers, self.seed, console)
             print_written(console, self.video)
 

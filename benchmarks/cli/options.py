@@ -128,16 +128,13 @@ def check_file(path: Path | None, ends: str) -> None:
 
 
 def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Parse options.
+    """Parse options; ValueError for a text of another form.
 
     Args:
         texts: Texts such as NAME=VALUE, None for none; a value is JSON or a word.
 
     Returns:
         Values by name.
-
-    Raises:
-        ValueError: A text has another form.
     """
     options: dict[str, Any] = {}
     for text in texts or ():

@@ -70,9 +70,8 @@ class _TuneEstimator:
         files = [*([self.out] if self.out else []), *([options.FILE] if self.write else [])]
         check_writable(*files)
         ranges, noises = (dict(map(_parse_range, x or [])) for x in (self.search, self.noise))
-        held, env = parse_options(self.option), self.env or None
-        chosen = self.name, self.scenario, env, self.target, held, ranges or None, noises
-        task = make_estimator_tuning(*chosen, self.seeds)
+        chosen = self.name, self.scenario, self.env or None, self.target, parse_options(self.option)
+        task = make_estimator_tuning(*chosen, ranges or None, noises, self.seeds)
         if self.write and not all(key.startswith("q_") for key in task.search):
             raise ValueError("shipped tunings hold process noise alone: --out writes the others")
         console, where = Console(), (self.storage or STORAGE, self.sampler, self.seed, self.jobs)
@@ -121,8 +120,9 @@ class _TuneController:
 
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
         check_writable(*filter(None, (self.out, shipped[0])))
-        where = self.storage or STORAGE, "tpe", self.seed, self.jobs, console
-        search = SearchOptions(self.trials, *where)
+        search = SearchOptions(
+            self.trials, self.storage or STORAGE, "tpe", self.seed, self.jobs, console
+        )
         for kind in self.kind or controllers.KINDS:
             seeds = make_tuning_seeds(self.seeds)
             task = controllers.make_controller_tuning(self.name, kind, seeds)
@@ -171,11 +171,8 @@ class _Calibrate:
         tasks = [known[name] for name in self.contest or known]
         console, folder = Console(), Path(f".{path.name}.cases").absolute()
         calibration = Calibration(tasks, folder, seeds)
-        cases = calibration.cases
-        remaining = sum(not item.path.exists() for item in cases)
-        text = (
-            f"{remaining} of {len(cases)} episodes are left; the same command goes on if stopped."
-        )
+        total, left = len(calibration.cases), sum(not x.path.exists() for x in calibration.cases)
+        text = f"{left} of {total} episodes are left; the same command goes on if stopped."
         console.print(text, highlight=False)
         how = "run the same command in the same folder"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):

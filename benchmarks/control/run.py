@@ -1,7 +1,6 @@
 """Episodes of the control benchmark: driven, reduced to metrics, timed, kept as finished cases.
 
-A chunk drives all its seeds at once in a vector env. A folder keeps finished chunks, by a hash of
-everything that their numbers depend on.
+A chunk drives all its seeds at once in a vector env; a folder keeps finished ones by their hash.
 """
 
 import hashlib
@@ -214,7 +213,6 @@ def measure_decision_time(case: ControlCase) -> float:
 
 CHUNK = 64
 """Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
-_LENGTH = 24  # hexadecimal digits of a finished case's file name
 
 
 Results = dict[tuple[ControlTask, Entry], DriveResult]
@@ -311,13 +309,12 @@ def _hash_chunk(chunk: Chunk) -> str:
     """Hash a chunk, a policy's weights, and all sources that its numbers depend on."""
     weights, driver = hash_policy(chunk.entry.agent), chunk.case.driver
     key = json.dumps([hash_sources(), weights, driver, asdict(chunk)], sort_keys=True)
-    return hashlib.sha256(key.encode()).hexdigest()[:_LENGTH]
+    return hashlib.sha256(key.encode()).hexdigest()[:24]
 
 
 def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array]) -> DriveResult:
     """Make a chunk's result; ValueError for numbers that are not finite or another's."""
-    shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
-    shapes["seconds"] = ()
+    shapes = {"numbers": (len(chunk.seeds), len(NUMBERS)), "seconds": ()}
     if chunk.keep:
         shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
     for name, shape in shapes.items():

@@ -64,7 +64,7 @@ class _EntryServer:
         env: Any = view
         agent = make_agent(source, env, **options)
         self._shape = view.num_envs, view.facts.width
-        self._agent = check_agent(agent, *self._shape)
+        self._agent = check_agent(agent, self._shape)
         return b""
 
     def predict(self, observation: Array, start: Array) -> bytes:
