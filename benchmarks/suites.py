@@ -62,7 +62,7 @@ def run_suites(
     """
     with use_shared_bar(request.console, f"bench {' '.join(names)}"):
         if comparison is not None:
-            from .entrants.score import run as run_comparison
+            from .entrants.score import run
 
-            return [run_comparison(comparison, request.jobs, request.console, request.keep)]
+            return [run(comparison, request)]
         return [import_module(SUITES[name], __package__).STUDY.run(request) for name in names]

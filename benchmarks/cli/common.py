@@ -178,12 +178,12 @@ def _make_driver(setup: Mapping[str, Any], env_id: str, trust: bool) -> "tuple[C
     from ..control.entries import Entry
     from ..harness.drives import call_quietly
 
-    agent, estimator, filter_options = map(setup.get, ("agent", "estimator", "estimator_options"))
+    agent, estimator, options = setup["agent"], setup["estimator"], setup["estimator_options"]
     env = make_env(env_id, setup["options"])
     if estimator is not None:
         arguments = env, estimator, Entry(agent, estimator).outputs
-        env = call_quietly(EstimateObservation, *arguments, options=filter_options or None)
-    elif filter_options:
+        env = call_quietly(EstimateObservation, *arguments, options=options or None)
+    elif options:
         raise ValueError("--estimator-option needs --estimator")
     try:
         return env, make_agent(agent, env, trust=trust, **setup["agent_options"])

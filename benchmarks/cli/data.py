@@ -201,7 +201,7 @@ class _Inspect:
         console, wires = Console(), _read_wires(self, self.latency)
         with use_shared_bar(console, f"inspect {self.log}"):
             known = self.log, self.vehicle, self.mapping or ()
-            suite = inspect_file(*known, wires, drawn=self.html is not None)
+            suite = inspect_file(*known, wires, figures=self.html is not None)
         write_output(console, [suite], {"html": self.html, "json": None, "parquet": None})
         if suite.verdict.startswith("Do not"):
             raise Exit(1)
