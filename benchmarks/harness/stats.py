@@ -1,8 +1,7 @@
 """Statistics over seeds with 95 % intervals, paired where two columns share their seeds.
 
-Intervals are Student's, from each episode's contribution to the error (`margin_of_error`), on a
-logarithmic scale for positive numbers; those of fractions are Wilson's. No interval of a mean holds
-for rare failures that did not occur: failures are counted, and `share` bounds their rate.
+Intervals are Student's, on a logarithmic scale for positive numbers; those of fractions Wilson's.
+No interval of a mean holds for rare failures that did not occur: `share` bounds their rate.
 """
 
 import math

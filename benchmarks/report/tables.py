@@ -23,16 +23,13 @@ class TextColumn(NamedTuple):
 
 
 def format_columns(table: ResultTable) -> list[TextColumn]:
-    """Format the columns of a table.
+    """Format the columns of a table; ValueError for a line that is not as long.
 
     Args:
         table: Table.
 
     Returns:
         Texts and numbers of each column.
-
-    Raises:
-        ValueError: A line is not as long as the columns.
     """
     columns = []
     for column, cells in table.split():

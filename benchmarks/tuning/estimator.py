@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def make_estimator_tuning(
     noises: Mapping[str, Range | None] | None = None,
     seeds: int = 12,
 ) -> EstimatorTuning:
-    """Make a tuning of what a user asks for: check it, and fill in the rest.
+    """Make a tuning of what a user asks for: check it, or ValueError, and fill in the rest.
 
     Args:
         estimator: Name of the estimator.
@@ -98,16 +99,13 @@ def make_estimator_tuning(
         env_id: Id of the env; default: the first whose scenarios have the estimator's sensors.
         target: State whose error counts.
         options: Options that are held.
-        search: Options to be found, with their range or None for the default one; default: process
-            noise `q_...` of every state that `options` does not hold.
+        search: Options to be found, with range or None for the default one; default: `q_...` of
+            every state that `options` does not hold.
         noises: Measurement noises, searched as well.
         seeds: Number of training drives in each scenario.
 
     Returns:
         Tuning.
-
-    Raises:
-        ValueError: A name is unknown, a scenario lacks the sensors, or a range or seeds are none.
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
@@ -163,13 +161,12 @@ def _has_option(
     estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> bool:
     """Check whether the estimator has an option, whatever number suits it."""
+    options = {**_make_unstable_option(estimator), **held, option: 1e-3}
     try:
-        options = {**_make_unstable_option(estimator), **held, option: 1e-3}
-        call_quietly(make_estimator, estimator, **facts, **options)
+        with suppress(ValueError):
+            call_quietly(make_estimator, estimator, **facts, **options)
     except TypeError:
         return False
-    except ValueError:
-        return True
     return True
 
 
@@ -233,9 +230,7 @@ def simulate(
 
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
-_TUNED = """\
-# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.
-"""
+_TUNED = "# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.\n"
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
 # searched too. Each entry is the output of its command; `sensors` are the slow ones.

@@ -66,16 +66,15 @@ def main(
     for i, name in enumerate(names):
         rmse, nees, held, score = numbers[:, i].T
         lead = average(numbers[:, 0, 3] - score)
-        rows.append(
-            {
-                "filter": name,
-                "rms / deg": math.degrees(float(np.sqrt(np.mean(rmse**2)))),
-                "median NEES": float(np.median(nees)),
-                "in 95 % / %": 100.0 * float(np.mean(held)),
-                "log score lost": [float(lead.value), float(lead.low), float(lead.high)],
-            }
-        )
-        console.print(rows[-1], highlight=False)
+        row = {
+            "filter": name,
+            "rms / deg": math.degrees(float(np.sqrt(np.mean(rmse**2)))),
+            "median NEES": float(np.median(nees)),
+            "in 95 % / %": 100.0 * float(np.mean(held)),
+            "log score lost": [float(lead.value), float(lead.low), float(lead.high)],
+        }
+        rows.append(row)
+        console.print(row, highlight=False)
     if out is not None:
         write_text(out, json.dumps({"n": len(numbers), "rows": rows}, indent=1) + "\n")
 
