@@ -20,7 +20,6 @@ from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
 from .common import print_written, write_output
-from .names import complete
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
@@ -68,8 +67,7 @@ class _Replay:
 
     log: Path = take_argument("A recorded drive: a table, CAN trace, bag or NMEA.", ...)
     vehicle: Text = take(
-        "A name, a TOML or JSON file, or `identify`: found in the log itself.",
-        autocompletion=complete("vehicles"),
+        "A name, a TOML or JSON file, or `identify`: found in the log itself.", kinds="vehicles"
     )
     nominal: str = take("The car whose mass and arms `--vehicle identify` takes.", "passenger-car")
     mapping: Texts
@@ -143,7 +141,7 @@ class _Identify:
     vehicle: str = take(
         "The car that is stated: its mass and arms stay, the search starts there.",
         "passenger-car",
-        autocompletion=complete("vehicles"),
+        kinds="vehicles",
     )
     mapping: Texts
     out: File = take("Write the car and its wires as TOML.", ends=".toml")
@@ -184,9 +182,7 @@ class _Inspect:
 
     log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).", ...)
     vehicle: str = take(
-        "The car that is assumed: a name or a TOML or JSON file.",
-        "passenger-car",
-        autocompletion=complete("vehicles"),
+        "The car that is assumed: a name or a TOML or JSON file.", "passenger-car", kinds="vehicles"
     )
     mapping: Texts
     steering_ratio: float | None

@@ -20,7 +20,7 @@ from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.verdict import format_verdict
 from .common import make_driver, make_setup, print_written, show_episode
-from .names import check_env, complete
+from .names import check_env
 from .options import File, Text, Texts, register, take, take_argument
 
 console = Console(soft_wrap=True, highlight=False)
@@ -34,7 +34,7 @@ class _Live:
     """
 
     estimator: Text = take_argument(
-        "A name, FILE.py:Class or module:Name.", None, autocompletion=complete("estimators")
+        "A name, FILE.py:Class or module:Name.", None, kinds="estimators"
     )
     agent: str = take("What answers with controls.", "none")
     env: Text = take("The id whose sensors the car has; default: one that fits.")

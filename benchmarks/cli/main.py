@@ -13,16 +13,8 @@ from ...envs.validation import check_choice
 from ..harness.parallel import report_user_errors, use_engine
 from ..report.html import check_page, write_page
 from ..suites import SUITES, Request, check_salt, run_suites
-from . import data, live, policies, train  # noqa: F401  # they register their commands
-from .common import (
-    handle_interrupt,
-    make_driver,
-    make_setup,
-    print_written,
-    show_episode,
-    write_output,
-)
-from .names import KINDS, complete
+from . import common, data, live, policies, train  # noqa: F401  # they register their commands
+from .names import KINDS
 from .options import File, Text, Texts, app, register, take, take_argument
 from .search import tune_app
 
@@ -88,20 +80,16 @@ class _Run:
         "An environment's id; default: the first of YawVision and AfsYawFusion that fits.",
         None,
         metavar="env_id",
-        autocompletion=complete("environments"),
+        kinds="environments",
     )
     agent: str = take(
-        "A name, a policy's path, FILE.py:Class or module:Name.",
-        "none",
-        autocompletion=complete("agents", "policies"),
+        "A name, a policy's path, FILE.py:Class or module:Name.", "none", kinds="agents policies"
     )
-    estimator: Text = take(
-        "A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
-    )
+    estimator: Text = take("A name, FILE.py:Class or module:Name.", kinds="estimators")
     vehicle: Text
     scenario: Text = take(
         "A name, a TOML or JSON file, or a recorded drive (CSV, Parquet) to steer as.",
-        autocompletion=complete("scenarios"),
+        kinds="scenarios",
     )
     option: Texts = take("NAME=VALUE of the environment (reference=model); repeatable.")
     agent_option: Texts = take("NAME=VALUE of the agent (grip=0.6); repeatable.")
@@ -124,11 +112,12 @@ class _Run:
         if self.beside is not None and self.video is None:
             raise ValueError(f"{self.beside!r} can only drive beside in a film: --video names its "
                              "file")  # fmt: skip
-        driver = FilmDriver(self.agent, *make_driver(make_setup(vars(self)), self.trust))
+        setup = common.make_setup(vars(self))
+        driver = FilmDriver(self.agent, *common.make_driver(setup, self.trust))
         if self.env is None and driver.env.spec is not None:
             console.print(f"on {driver.env.spec.id}", highlight=False)
         drive = rollout(driver.env, driver.agent, self.seed)
-        show_episode(console, drive, self.agent, vars(self))
+        common.show_episode(console, drive, self.agent, vars(self))
         if self.video is not None:
             drivers = [driver]
             if self.beside is not None:
@@ -137,7 +126,7 @@ class _Run:
                 ghost = make_agent(self.beside, env, trust=self.trust)
                 drivers.append(FilmDriver(name, env, ghost))
             write_film(self.video, drivers, self.seed, console)
-            print_written(console, self.video)
+            common.print_written(console, self.video)
 
 
 _FIXED = {"highway", "procedures", "speed"}  # suites whose number of drives is fixed
@@ -148,7 +137,7 @@ class _Bench:
     """Compare estimators and controllers; with --agent and --estimator your own beside some of
     the package's."""
 
-    suites: Texts = take_argument("Suites; default: all.", None, autocompletion=complete("suites"))
+    suites: Texts = take_argument("Suites; default: all.", None, kinds="suites")
     quick: bool = take("Few seeds: a first look in minutes.", False, "--quick")
     data: File = take("The folder of downloaded drives, for the suite logs.")
     vehicle: Text
@@ -161,8 +150,7 @@ class _Bench:
     keep: File = take("A folder for finished cases: a stopped run goes on.")
     clairvoyant: File = take("A file of `sideslip calibrate`; default: the package's.")
     agent: Texts = take(
-        "Your own: FILE.py:Class, a policy's path, a name; repeatable.",
-        autocompletion=complete("agents", "policies"),
+        "Your own: FILE.py:Class, a policy's path, a name; repeatable.", kinds="agents policies"
     )
     estimator: Texts = take("FILE.py:Class, a name, none; repeatable.")
     scenario: Texts = take("A name or a file; repeatable.")
@@ -204,12 +192,12 @@ class _Bench:
         how = "the same command" if self.keep else "the same command, from the start"
         if "control" in names and not self.keep:
             how = "add --keep FOLDER, which keeps finished cases of control"
-        with use_engine(self.engine_name, self.address), handle_interrupt(how):
+        with use_engine(self.engine_name, self.address), common.handle_interrupt(how):
             done = run_suites(names, request, comparison)
-        write_output(console, done, vars(self), brief=True)
+        common.write_output(console, done, vars(self), brief=True)
         if self.page is not None:
             write_page(self.page, done)
-        print_written(console, self.page)
+        common.print_written(console, self.page)
 
     def _make_comparison(self, agents: list[str], filters: list[str]) -> "ComparisonRequest":
         """Make the request of a user's own entries."""

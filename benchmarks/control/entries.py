@@ -21,17 +21,7 @@ from ...estimators.vector import estimate, truth
 from ...estimators.wrappers.estimate import EstimateObservation
 from ...estimators.wrappers.truth import TruthObservation
 from ..harness.drives import call_quietly
-from .tasks import (
-    NOMINAL,
-    ORACLES,
-    PARAMETERS,
-    STATE,
-    STEERING,
-    TIERS,
-    YAW,
-    ControlTask,
-    find_oracle,
-)
+from .tasks import NOMINAL, ORACLES, STEERING, TIERS, YAW, ControlTask, find_oracle
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER, JOINT = "exact-kf, all sensors", "joint"
@@ -54,9 +44,9 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
 }
 """Besides the reference controller, on the reference filter."""
-ORACLE_NAMES = (NOMINAL, PARAMETERS, STATE)
+ORACLE_NAMES = (NOMINAL, *ORACLES)
 _CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
-_SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
+_SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", *(names[1] for names in ORACLES.values()))
 
 _PUSHES = ("force_sd", "moment_sd")
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}

@@ -12,14 +12,7 @@ from ..harness.results import Suite
 from ..report.study import Request, Study
 from .baseline_gaps import DELAY_TASK, DELAYS, measure_delay_cost
 from .calibration import measure_regrets, read_current
-from .entries import (
-    EPISODES,
-    QUICK_EPISODES,
-    ControlCase,
-    Entry,
-    make_cases,
-    select_quick_tasks,
-)
+from .entries import EPISODES, QUICK_EPISODES, ControlCase, Entry, make_cases, select_quick_tasks
 from .report import add_figures, compose_verdict, make_tracks
 from .run import measure, measure_decision_time
 from .score import rank_entries

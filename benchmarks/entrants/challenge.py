@@ -26,14 +26,7 @@ from ..control.entries import (
     Entry,
     select_quick_tasks,
 )
-from ..control.tasks import (
-    STEERING,
-    TIERS,
-    YAW,
-    ControlTask,
-    list_scored_tasks,
-    make_salted_seeds,
-)
+from ..control.tasks import STEERING, TIERS, YAW, ControlTask, list_scored_tasks, make_salted_seeds
 from .worker import LIMIT
 
 EPISODES = 64

@@ -100,10 +100,7 @@ def draw_time_series(
 
 
 def draw_curves(
-    x: Array,
-    series: Mapping[str, Array | tuple[Array, Array, Array]],
-    x_label: str,
-    y_label: str,
+    x: Array, series: Mapping[str, Array | tuple[Array, Array, Array]], x_label: str, y_label: str
 ) -> go.Figure:
     """Draw lines with dots; ValueError for a line that is not as long as `x`.
 
