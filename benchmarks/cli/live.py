@@ -33,9 +33,7 @@ class _Live:
     With --simulate a simulated car is at the other end; without an ESTIMATOR it is alone.
     """
 
-    estimator: Text = take_argument(
-        "A name, FILE.py:Class or module:Name.", None, kinds="estimators"
-    )
+    estimator: Text = take_argument("A name, FILE.py:Class or module:Name.", kinds="estimators")
     agent: str = take("What answers with controls.", "none")
     env: Text = take("The id whose sensors the car has; default: one that fits.")
     vehicle: Text = take("The car: a name or a file.")

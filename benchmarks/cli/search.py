@@ -120,9 +120,8 @@ class _TuneController:
 
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
         check_writable(*filter(None, (self.out, shipped[0])))
-        search = SearchOptions(
-            self.trials, self.storage or STORAGE, "tpe", self.seed, self.jobs, console
-        )
+        where = self.storage or STORAGE, "tpe", self.seed, self.jobs, console
+        search = SearchOptions(self.trials, *where)
         for kind in self.kind or controllers.KINDS:
             seeds = make_tuning_seeds(self.seeds)
             task = controllers.make_controller_tuning(self.name, kind, seeds)

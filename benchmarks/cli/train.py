@@ -115,9 +115,8 @@ class _Train:
         console = Console()
         with use_shared_bar(console if self.progress else None, "train", "steps", steps) as bar:
             project, show = self.wandb_project_name if self.track else "", partial(_show, bar)
-            run_options = RunOptions(
-                eval_freq, self.device, self.tensorboard_log, show, command, project
-            )
+            logged = self.tensorboard_log, show, command, project
+            run_options = RunOptions(eval_freq, self.device, *logged)
             if logs is not None:
                 _describe_for_zoo(task, folder, steps, eval_freq)
             try:

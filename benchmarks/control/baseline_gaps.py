@@ -109,9 +109,8 @@ def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
 def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) -> str:
     """Describe whether a candidate demands enough, and whether a baseline meets the demand."""
     if tier != tasks.LIMIT:
-        return (
-            "scored" if peak > MIN_PEAK else f"the slip angle peaks at {peak:.1f} deg uncontrolled"
-        )
+        low = f"the slip angle peaks at {peak:.1f} deg uncontrolled"
+        return "scored" if peak > MIN_PEAK else low
     if lost < MIN_LOST:
         return f"{100.0 * lost:.0f} % of the cars are lost uncontrolled"
     if lost_by_best > MAX_SHARE * lost:

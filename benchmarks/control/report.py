@@ -99,10 +99,7 @@ class _Ranking:
         losses = {name: sum(x.value > 1.0 for x in ratios[name].values()) for name in self.gains}
         gained = {name: np.mean([r.mean() for r in x.values()]) for name, x in self.gains.items()}
         order = sorted(self.gains, key=lambda x: (x in self.below, losses[x], -gained[x]))
-        return {
-            name: dict(sorted(ratios[name].items(), key=lambda rival: -rival[1].value))
-            for name in order
-        }
+        return {x: dict(sorted(ratios[x].items(), key=lambda y: -y[1].value)) for x in order}
 
     @property
     def costs(self) -> dict[str, Estimate]:
@@ -151,10 +148,8 @@ def _describe_resolution(matrix: Matrix) -> str:
         close += not (slip > 0.2 or yaw > 1.0 or lost > 0.1)  # deg, deg/s, of the cars
     if 2 * close <= len(pairs):
         return ""
-    return (
-        f"In {close} of {len(pairs)} tasks knowing everything saves less than 0.2 deg, 1 deg/s "
-        "and 10 % of the cars. "
-    )
+    saved = f"In {close} of {len(pairs)} tasks knowing everything saves less than"
+    return f"{saved} 0.2 deg, 1 deg/s and 10 % of the cars. "
 
 
 def _describe_exceptions(matrix: Matrix) -> str:
@@ -250,11 +245,8 @@ def _group_costs(by_tier: _ByTier, name: Callable[[Entry], str]) -> dict[str, di
     """Group costs over nominal's (%) by tier and name(entry), "" left out; the best is first."""
     groups = {}
     for tier, standings in by_tier.items():
-        costs = {
-            name(item.entry): _compute_cost(item.scores)
-            for item in standings
-            if name(item.entry) and item.scores
-        }
+        named = [(name(item.entry), item.scores) for item in standings if item.scores]
+        costs = {label: _compute_cost(scores) for label, scores in named if label}
         title = f"Tier {tier}: {TITLES[tier]}"
         groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
     return {title: costs for title, costs in groups.items() if costs}

@@ -198,11 +198,8 @@ def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
 def _describe_findings(standings: Sequence[Standing]) -> list[str]:
     """Describe the entries whose score is above oracle-state's over their tier, Holm-corrected."""
     best = next((item.scores for item in standings if item.entry == Entry(STATE)), {})
-    others = [
-        item
-        for item in standings
-        if item.entry.agent not in ORACLE_NAMES and item.scores.keys() & best.keys()
-    ]
+    rivals = [item for item in standings if item.entry.agent not in ORACLE_NAMES]
+    others = [item for item in rivals if item.scores.keys() & best.keys()]
     excess = [  # below 0 where the entry is better
         np.concatenate([_subtract(best[task], r) for task, r in x.scores.items() if task in best])
         for x in others
@@ -245,9 +242,8 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
 
 
 def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
-    none, nominal, parameters, state = (
-        matrix.results[task, Entry(name)] for name in ("none", NOMINAL, PARAMETERS, STATE)
-    )
+    names = ("none", NOMINAL, PARAMETERS, STATE)
+    none, nominal, parameters, state = (matrix.results[task, Entry(name)] for name in names)
     errors = [drive.error for drive in (none, nominal, state) if drive.error]
     if errors:
         return {"task": task.name, "falls": "; ".join(errors)}

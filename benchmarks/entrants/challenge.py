@@ -149,12 +149,8 @@ class ComparisonRequest:
     @property
     def files(self) -> list[Path]:
         """The user's files without repetition."""
-        texts = [
-            getattr(entry, part)
-            for entry in self.entries
-            for part in ("agent", "estimator")
-            if part not in entry.objects
-        ]
+        parts = [(entry, part) for entry in self.entries for part in ("agent", "estimator")]
+        texts = [getattr(entry, part) for entry, part in parts if part not in entry.objects]
         paths = [find_class(text)[0] if is_user_file(text) else Path(text) for text in texts]
         return list(dict.fromkeys(path for path in paths if path.is_file()))
 

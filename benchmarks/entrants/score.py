@@ -114,9 +114,8 @@ def _make_sentence(standing: Standing) -> str:
     score = standing.overall.get("score")
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
     if score is None:
-        return (
-            f"{standing.label}: {f'not driven: {errors[0]}' if errors else 'nominal is not driven'}"
-        )
+        why = f"not driven: {errors[0]}" if errors else "nominal is not driven"
+        return f"{standing.label}: {why}"
     tiers = []
     for tier in dict.fromkeys(task.tier for task in standing.scores if task.tier):
         scores = [r for task, r in standing.scores.items() if task.tier == tier]
@@ -269,9 +268,8 @@ def score(
     if estimator is None:
         estimator = choose_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
     entry = make_user_entry(agent, estimator, trust)
-    request = ComparisonRequest(
-        (entry,), vehicle, scenario_list, env_id, episodes, chosen, fresh=fresh, limit=limit
-    )
+    where = vehicle, scenario_list, env_id, episodes, chosen
+    request = ComparisonRequest((entry,), *where, fresh=fresh, limit=limit)
     comparison = _compare(request, Request(jobs=jobs))
     standing = next(item for item in comparison.overall if item.entry == entry)
     rows = []

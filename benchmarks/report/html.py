@@ -290,10 +290,8 @@ def _hash(script: str) -> str:
 
 def _download(name: str, media: str, text: str) -> str:
     data = base64.b64encode(text.encode()).decode()
-    return (
-        f'<p class="file"><a download="{escape(name)}" href="data:{media};base64,{data}">'
-        f"{escape(name)}</a></p>"
-    )
+    link = f'<a download="{escape(name)}" href="data:{media};base64,{data}">{escape(name)}</a>'
+    return f'<p class="file">{link}</p>'
 
 
 def _read_asset(name: str) -> str:

@@ -140,9 +140,8 @@ def make_estimator_tuning(
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
-    return EstimatorTuning(
-        estimator, scenarios, env_id, target, unit, sensors, held, ranges, numbers
-    )
+    subject = estimator, scenarios, env_id, target, unit, sensors
+    return EstimatorTuning(*subject, held, ranges, numbers)
 
 
 def _check_range(option: str, limits: Range | None) -> Range:
@@ -198,10 +197,8 @@ def _simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode
     """Simulate the drives of an env id, a scenario and seeds."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
-    return [
-        LoggedEpisode(rollout(env, seed=seed).log, make_filter_arguments(env.unwrapped))
-        for seed in seeds
-    ]
+    base = env.unwrapped
+    return [LoggedEpisode(rollout(env, seed=x).log, make_filter_arguments(base)) for x in seeds]
 
 
 def simulate(

@@ -103,9 +103,8 @@ def _reduce_rate(log: Log, every: int, sensors: Iterable[str]) -> Log:
         if name in sensors
     }
     fast = np.ascontiguousarray(record.fast[::every])
-    thinned = dataclasses.replace(
-        record, fast=fast, packets=packets, first=record.first // every, dt=step
-    )
+    first = record.first // every
+    thinned = dataclasses.replace(record, fast=fast, packets=packets, first=first, dt=step)
     return Log(thinned, slow, {name: truth[::every] for name, truth in log.truth.items()})
 
 
