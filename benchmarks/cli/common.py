@@ -16,7 +16,7 @@ from typer import Exit
 from ... import __version__
 from ...envs.io import atomic_file
 from ..harness.results import Suite, write_json, write_parquet, write_text
-from ..report.terminal import print_run, print_suite
+from ..report.tables import print_run, print_suite
 from .names import check_env
 from .options import parse_options
 

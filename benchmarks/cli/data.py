@@ -18,7 +18,7 @@ from typer import Exit
 from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
-from ..report.terminal import print_suite
+from ..report.tables import print_suite
 from .common import print_written, write_output
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 

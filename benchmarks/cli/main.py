@@ -12,7 +12,7 @@ from ... import __version__
 from ...envs.validation import check_choice
 from ..harness.parallel import report_user_errors, use_engine
 from ..report.html import check_page, write_page
-from ..suites import SUITES, Request, check_salt, run_suites
+from ..suites import SALTED, SUITES, Request, run_suites
 from . import common, data, live, policies, train  # noqa: F401  # they register their commands
 from .names import KINDS
 from .options import File, Text, Texts, app, register, take, take_argument
@@ -176,7 +176,12 @@ class _Bench:
         names = self.suites or (["control"] if comparison else everything)
         for name in names:
             check_choice("suite", name, SUITES)
-        check_salt(self.salt, names)
+        if self.salt:
+            from ..control.tasks import make_salted_seeds
+
+            if not {*SALTED} & {*names}:
+                raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
+            make_salted_seeds(self.salt, 1)  # or ValueError
         check_page(self.page, names)
         for option, suite in (("keep", "control"), ("clairvoyant", "control"), ("data", "logs")):
             fits = suite in names and not (comparison and option != "keep")

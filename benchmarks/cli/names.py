@@ -137,8 +137,7 @@ KINDS: dict[str, Callable[[], dict[str, str]]] = {
     "agents": _list_agents,
     "policies": _list_policies,
     "suites": _list_suites,
-}
-"""Functions that list the names of a kind with a line on each."""
+}  # functions that list the names of a kind with a line on each
 
 
 def complete(*kinds: str) -> Callable[[str], Iterable[tuple[str, str]]]:

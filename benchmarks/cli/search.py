@@ -11,7 +11,7 @@ from typer import Typer
 from ...envs.validation import check_choice
 from ..harness.parallel import use_engine
 from ..harness.results import check_writable
-from ..report.terminal import print_suite
+from ..report.tables import print_suite
 from .common import get_command_line, handle_interrupt, print_written
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 

@@ -34,16 +34,13 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
     "multirate-kf, camera and gps": ("multirate-kf", _BOTH),
     JOINT: (JOINT, {}),
-}
-"""Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
-ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")
-"""Controllers that follow the tyres of `JOINT`."""
+}  # filters by name in the tables: a name of `make_estimator`, and options over the tuned ones
+ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")  # controllers that follow the tyres of `JOINT`
 ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
-}
-"""Besides the reference controller, on the reference filter."""
+}  # besides the reference controller, on the reference filter
 ORACLE_NAMES = (NOMINAL, *ORACLES)
 _CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
 _SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", *(names[1] for names in ORACLES.values()))
@@ -256,8 +253,7 @@ LEARNED: dict[str, tuple[Entry, ...]] = {
     "car-yaw": (Entry("distill-car-yaw", JOINT),),
     "coms-model": (Entry("distill-coms-steering", JOINT), Entry("raw-coms-steering", "")),
     "coms-zero-slip": (Entry("distill-coms-yaw", JOINT),),
-}
-"""Policies by the class of their tasks; verdicts speak of the first."""
+}  # policies by the class of their tasks; verdicts speak of the first
 _POLICIES = {entry for entries in LEARNED.values() for entry in entries}
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64

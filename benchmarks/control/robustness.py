@@ -26,8 +26,7 @@ ENTRIES = (
     Entry("adaptive-lqr", JOINT),
     Entry("adaptive-nmpc", JOINT),
     *(Entry(REFERENCE_CONTROLLER, name) for name in _FILTERS),
-)
-"""The entries whose order is checked."""
+)  # the entries whose order is checked
 FACTORS = (0.0, 2.0)  # of a group's ranges about the ideal
 EPISODES, TASKS = 16, 12
 

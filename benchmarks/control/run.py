@@ -211,12 +211,10 @@ def measure_decision_time(case: ControlCase) -> float:
     return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))
 
 
-CHUNK = 64
-"""Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
+CHUNK = 64  # episodes of a finished case at most: a longer run takes up the cases of a shorter one
 
 
-Results = dict[tuple[ControlTask, Entry], DriveResult]
-"""Episodes by task and entry."""
+Results = dict[tuple[ControlTask, Entry], DriveResult]  # episodes by task and entry
 
 
 def measure(

@@ -30,8 +30,7 @@ CONSTANTS = {
     "a loss: 3": (3.0, 1.0),
     "half of J_0": (LOSS, 0.5),
     "twice J_0": (LOSS, 2.0),
-}
-"""Other constants of the score: r of a loss, and the factor on J_0."""
+}  # other constants of the score: r of a loss, and the factor on J_0
 _CLIP = 3.0
 FAILURE_RATIO = 20.0  # times nominal's cost, of a failure in `compute_log_ratios`
 _RATES = {"spin": "spin_rate", "off-road": "departure_rate", "not-finite": "not_finite_rate"}

@@ -37,8 +37,7 @@ TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "small car": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
     "road": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
     "limit": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
-}
-"""The (env id, vehicle, reference) with which a tier's scenarios are driven."""
+}  # the (env id, vehicle, reference) with which a tier's scenarios are driven
 TITLES = {
     "small car": "the COMS at 18 to 28 km/h",
     "road": "the passenger car at 60 to 90 km/h, friction unknown",

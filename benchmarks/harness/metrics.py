@@ -133,8 +133,7 @@ _OTHERS = {
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()
-}
-"""Unit of every metric that a row may have."""
+}  # unit of every metric that a row may have
 
 
 def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:

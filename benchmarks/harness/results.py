@@ -54,9 +54,8 @@ class ResultRow:
 
 _COLUMNS = {item.name for item in fields(ResultRow)} - {"suite", "metric", "value", "low", "high"}
 
-
-Cell = Any
-"""A text, a number, an `Estimate`, several numbers of one template, or nothing (NaN too)."""
+Cell = Any  # a text, a number, an `Estimate`, several numbers of one template, or nothing (NaN too)
+Line = Mapping[str, Cell]  # cells of a line by key, of which metrics become rows
 
 
 @dataclass(frozen=True)
@@ -68,10 +67,6 @@ class Column:
     scale: float = 1.0  # factor of the numbers
     form: str = "g"  # format of each number, or template of several: "{:.3g} ({:.3g})"
     interval: bool = True  # whether intervals are shown
-
-
-Line = Mapping[str, Cell]
-"""Cells of a line by key, of which metrics become rows."""
 
 
 @dataclass

@@ -160,10 +160,8 @@ def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:
     return ratio
 
 
-ratio_of_means = _make_ratio(np.mean)
-"""Mean over that of a reference."""
-ratio_of_roots = _make_ratio(root_mean)
-"""RMSE over that of a reference, from squared errors."""
+ratio_of_means = _make_ratio(np.mean)  # mean over that of a reference
+ratio_of_roots = _make_ratio(root_mean)  # RMSE over that of a reference, from squared errors
 
 
 def average(*strata: Array) -> Estimate:

@@ -19,8 +19,7 @@ with require_extra("report", "figures need plotly"):
 
 SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
 """Colours from bad to good, safe for the colour-blind."""
-POINTS = 1000
-"""Maximum of points of a line: a figure is no wider in pixels."""
+POINTS = 1000  # maximum of points of a line: a figure is no wider in pixels
 _DASHES = {"reference": "dash", "bound": "dot"}
 _DASH_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...

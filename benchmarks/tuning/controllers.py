@@ -31,8 +31,7 @@ from ..harness.results import Suite, write_text
 from .estimator import SearchOptions
 from .study import create_study, make_result_table, run_search
 
-KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")
-"""Classes of tasks."""
+KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")  # classes of tasks
 STEERING = ("coms-model", "car-steering")  # the action steers too
 
 
@@ -83,8 +82,7 @@ SPACES: dict[str, tuple[SearchNumber, ...]] = {
 tuning makes of nominal."""
 _SLOW = ("mpc", "nmpc", "adaptive-nmpc")
 _STAGES = (2, 4, 8)  # seeds after which the better half of a slow controller's trials goes on
-LOGS = Path(__file__).with_name("logs")
-"""Studies whose options the package ships."""
+LOGS = Path(__file__).with_name("logs")  # studies whose options the package ships
 
 
 @dataclass(frozen=True)

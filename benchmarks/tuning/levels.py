@@ -44,8 +44,7 @@ _SEARCHED = (
     *("steer_offset_sd", "bank_time", "course_noise"),
     *("psi_noise", "y_l_noise"),
     *("map_heading_sd", "map_heading_time", "map_lag_sd"),
-)
-"""Options whose factors are searched; how roads and cameras lean is no matter of search."""
+)  # options whose factors are searched; how roads and cameras lean is no matter of search
 _KINDS = ("camera", "gps", "camera and gps", "gps, 100 Hz", "nothing, 100 Hz")
 _WORST = 100.0  # squared error over its variance, of which more counts as much
 _POPULATION = 12

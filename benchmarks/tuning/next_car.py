@@ -38,8 +38,7 @@ PARTS: dict[str, Mapping[str, object]] = {
     "without the map's heading": {"map_heading_sd": 0.0},
     "without friction": {"inverse_friction_sd": 0.0},
     "without tyres": _NO_TYRES | {"accel_scale_sd": 0.0},
-}
-"""Filters by name, as options over the defaults."""
+}  # filters by name, as options over the defaults
 
 
 def _measure(seed: int, names: tuple[str, ...]) -> list[tuple[float, ...]]:
