@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -126,8 +125,7 @@ def _group_filters(standings: Sequence[Standing]) -> _Ranking:
 
 def _group_agents(standings: Sequence[Standing]) -> _Ranking:
     """Rank the agents on their default filters, the oracles left out."""
-    return _rank(standings, lambda entry: (
-        entry.agent if entry.agent not in ORACLE_NAMES and entry.is_default else ""))  # fmt: skip
+    return _rank(standings, lambda x: x.agent * (x.is_default and x.agent not in ORACLE_NAMES))
 
 
 def _rank(standings: Sequence[Standing], name_entry: Callable[[Entry], str]) -> _Ranking:
@@ -163,13 +161,11 @@ def _describe_exceptions(matrix: Matrix) -> str:
             if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
     agents = _group_agents(matrix.overall)
-    if overall_best := agents.find_best():
-        partial = agents.gains.keys() - agents.complete.gains.keys()
-        best_gains = agents.gains[overall_best]
-        ratios = {name: _compute_cost_ratio(agents.gains[name], best_gains) for name in partial}
-        cheaper = (name for name in ratios if ratios[name].high < 1.0)
-        ordered = sorted(cheaper, key=lambda label: ratios[label].value)
-        parts += [f"{name} on its own manoeuvres" for name in ordered]
+    best_gains = agents.gains.get(agents.find_best(), {})
+    partial = {x: y for x, y in agents.gains.items() if x not in agents.complete.gains}
+    ratios = {name: _compute_cost_ratio(gains, best_gains) for name, gains in partial.items()}
+    cheaper = sorted((ratio.value, name) for name, ratio in ratios.items() if ratio.high < 1.0)
+    parts += [f"{name} on its own manoeuvres" for _, name in cheaper]
     return f"It costs less with {summarise_names(parts)}. " if parts else ""
 
 
@@ -214,13 +210,11 @@ def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
         draw: `report.figures`.
     """
     by_tier = matrix.by_tier
+    filters = _group_costs(by_tier, lambda x: x.estimator * (x.agent == REFERENCE_CONTROLLER))
     questions = (
         ("Which controller holds the car?", {"All tasks": _group_agents(matrix.overall).costs}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _name_agent)),
-        (
-            "Which estimator does a controller drive best with?",
-            _group_costs(by_tier, lambda x: x.estimator if x.agent == REFERENCE_CONTROLLER else ""),
-        ),
+        ("Which estimator does a controller drive best with?", filters),
         ("What would knowing more save?", _group_oracles(matrix)),
     )
     suite.answers += [
@@ -259,15 +253,13 @@ def _name_agent(entry: Entry) -> str:
 
 def _group_oracles(matrix: Matrix) -> dict[str, dict[str, Estimate]]:
     """Group the oracles' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
-    by_tier = matrix.by_tier
-    groups = _group_costs(by_tier, lambda x: x.agent if x.agent in ORACLE_NAMES else "")
-    for tier in by_tier:
-        title = f"Tier {tier}: {TITLES[tier]}"
+    groups = _group_costs(matrix.by_tier, lambda x: x.agent * (x.agent in ORACLE_NAMES))
+    for tier in matrix.by_tier:
+        shown = groups.get(f"Tier {tier}: {TITLES[tier]}", {})
         logs = [value for task, value in matrix.foresight.items() if task.tier == tier]
-        if logs and "oracle-state" in groups.get(title, {}):
-            state = groups[title]["oracle-state"].value
+        if logs and STATE in shown:
             ratio = geometric_mean(*(-value for value in logs))
-            groups[title]["clairvoyant"] = ratio.rescale(state)
+            shown["clairvoyant"] = ratio.rescale(shown[STATE].value)
     return groups
 
 
@@ -276,15 +268,13 @@ def _draw_maps(
 ) -> list[tuple[str, "Figure", str]]:
     names = [standing.label for standing in standings]
     tasks = list(dict.fromkeys(c for standing in standings for c in standing.results))
-    figures = []
+    metrics = [[standing.by_task.get(task, {}) for task in tasks] for standing in standings]
+    figures, absent = [], Estimate(math.nan)
     for metric, good, text in (
         ("score", "high", "The mean r: 0 as nominal."),
         ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
     ):
-        values = np.full((len(standings), len(tasks)), np.nan)
-        for (i, standing), (j, task) in product(enumerate(standings), enumerate(tasks)):
-            if metric in standing.by_task.get(task, {}):
-                values[i, j] = standing.by_task[task][metric].value
+        values = np.array([[cell.get(metric, absent).value for cell in row] for row in metrics])
         if np.isfinite(values).any():
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every task"
             columns = [task.name for task in tasks]
@@ -298,12 +288,9 @@ def _draw_maps(
 
 def _compute_places(standings: Sequence[Standing], loss: float, floor_factor: float) -> Array:
     """Compute the places of entries by a score of other constants, 1 for the best, NaN for none."""
-    scores = [standing.compute_score(loss, floor_factor) for standing in standings]
-    keys = [
-        (standing.rank[0], math.inf if math.isnan(score) else -score)
-        for standing, score in zip(standings, scores, strict=True)
-    ]
-    order = sorted(range(len(keys)), key=keys.__getitem__)
+    scores = np.array([standing.compute_score(loss, floor_factor) for standing in standings])
+    below = [standing.rank[0] for standing in standings]
+    order = np.lexsort((np.nan_to_num(-scores, nan=np.inf), below))
     return np.where(np.isnan(scores), np.nan, np.argsort(order) + 1.0)
 
 
