@@ -296,12 +296,12 @@ class _Lane:
         for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
             try:
                 camera = calibration.estimate_mounting(camera, picture, lane_width)
-                failed = None
                 break
             except ValueError as error:
                 failed = error
-        if failed is not None:
-            raise ValueError(f"{source}: {failed}")
+        else:
+            if failed is not None:
+                raise ValueError(f"{source}: {failed}")
         view = FieldOfView(calibration.HEADING, 0.5 * lane_width)
         return LaneFinder(camera, lane_width, calibration.NEAR, calibration.FAR, view=view)
 

@@ -190,10 +190,8 @@ class _Bench:
                 raise ValueError(f"--{option} goes with the suite {suite}, got {got}")
         if self.episodes is not None and not {*names} - _FIXED:
             raise ValueError(f"--episodes: {', '.join(names)} has a number of its own")
-        request = Request(
-            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.data,
-            self.salt,
-        )  # fmt: skip
+        chosen = self.episodes, self.keep, self.clairvoyant, self.data, self.salt
+        request = Request(self.quick, self.jobs, console, *chosen)
         how = "the same command" if self.keep else "the same command, from the start"
         if "control" in names and not self.keep:
             how = "add --keep FOLDER, which keeps finished cases of control"
@@ -216,16 +214,10 @@ class _Bench:
         entries = tuple(make_user_entries(agents, estimators, self.trust))
         if not entries:
             raise ValueError("--estimator none goes with --agent")
-        return ComparisonRequest(
-            entries,
-            vehicle=self.vehicle,
-            scenarios=tuple(self.scenario or []),
-            env_id=self.env_id,
-            episodes=self.episodes or (QUICK_EPISODES if self.quick else EPISODES),
-            fresh=self.fresh,
-            salt=self.salt,
-            limit=LIMIT if self.limit is None else self.limit,
-        )
+        episodes = self.episodes or (QUICK_EPISODES if self.quick else EPISODES)
+        limit = LIMIT if self.limit is None else self.limit
+        where = self.vehicle, tuple(self.scenario or []), self.env_id, episodes
+        return ComparisonRequest(entries, *where, fresh=self.fresh, salt=self.salt, limit=limit)
 
 
 app.registered_commands.sort(key=lambda item: _ORDER.index(str(item.name)))

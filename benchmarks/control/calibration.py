@@ -158,12 +158,9 @@ class Calibration:
         self.folder.mkdir(parents=True, exist_ok=True)
         episodes = run_cases(_solve, self.cases, "calibration", jobs, console)
         rows = zip(*[iter(episodes)] * self.seeds, strict=True)
-        return [
-            CalibrationRecord(
-                **task.record, world_version=WORLD_VERSION, command=command, episodes=row
-            )
-            for task, row in zip(self.tasks, rows, strict=True)
-        ]
+        made: dict[str, Any] = {"world_version": WORLD_VERSION, "command": command}
+        pairs = zip(self.tasks, rows, strict=True)
+        return [CalibrationRecord(**made | task.record, episodes=row) for task, row in pairs]
 
     def remove_cases(self) -> None:
         """Remove finished cases once their entries are written; those of other runs stay."""

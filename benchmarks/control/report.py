@@ -87,14 +87,10 @@ class _Ranking:
     @cached_property
     def ranked(self) -> dict[str, dict[str, Estimate]]:
         """Names by fewest cheaper rivals, `below` last, with cost ratios over rivals by name."""
-        ratios = {
-            name: {
-                x: ratio
-                for x, y in self.gains.items()
-                if x != name and np.isfinite((ratio := _compute_cost_ratio(one, y)).value)
-            }
-            for name, one in self.gains.items()
-        }
+        ratios: dict[str, dict[str, Estimate]] = {}
+        for name, one in self.gains.items():
+            rivals = {x: _compute_cost_ratio(one, y) for x, y in self.gains.items() if x != name}
+            ratios[name] = {x: ratio for x, ratio in rivals.items() if np.isfinite(ratio.value)}
         losses = {name: sum(x.value > 1.0 for x in ratios[name].values()) for name in self.gains}
         gained = {name: np.mean([r.mean() for r in x.values()]) for name, x in self.gains.items()}
         order = sorted(self.gains, key=lambda x: (x in self.below, losses[x], -gained[x]))

@@ -191,13 +191,11 @@ class _TimedFunction:
 def measure_decision_time(case: ControlCase) -> float:
     """Measure the wall time of a decision of one car: predict, and the estimator's part.
 
-    Medians over _STEPS steps of an episode, the bare env stepped side by side.
-
     Args:
         case: Task and who drives it.
 
     Returns:
-        Wall time (us).
+        Wall time (us), of medians over _STEPS steps, the bare env stepped side by side.
     """
     env, agent = case.entry.make(case.task, 1)
     bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)

@@ -119,11 +119,8 @@ class Standing:
     @cached_property
     def pairs(self) -> dict[ControlTask, PairedDrives]:
         """Drives beside nominal's, where there are any."""
-        return {
-            task: PairedDrives(self.nominal[task], result, task.cost_floor)
-            for task, result in self.drives.items()
-            if task in self.nominal
-        }
+        both = {task: x for task, x in self.drives.items() if task in self.nominal}
+        return {t: PairedDrives(self.nominal[t], x, t.cost_floor) for t, x in both.items()}
 
     @cached_property
     def scores(self) -> dict[ControlTask, Array]:

@@ -40,11 +40,6 @@ class Matrix:
         """Tasks that were driven."""
         return list(dict.fromkeys(task for task, _ in self.results))
 
-    @property
-    def episodes(self) -> int:
-        """Episodes of a task, of slow entries at most."""
-        return max((len(drive.costs) for drive in self.results.values()), default=0)
-
     @cached_property
     def series(self) -> dict[tuple[ControlTask, Entry], Array]:
         """Time and `SIGNALS` of each case's first seed, where they were kept."""
@@ -140,10 +135,9 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
 def _make_main_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
     """Make the table of the entries, the best first."""
     lines: list[Line] = [
-        {"label": standing.label, "n": standing.n, "us": standing.us}
-        | {"tasks": (len(standing.pairs), len(standing.results))}
-        | standing.overall
-        for standing in ranked
+        {"label": x.label, "n": x.n, "us": x.us, **x.overall}
+        | {"tasks": (len(x.pairs), len(x.results))}
+        for x in ranked
     ]
     if below := sum(standing.loses_more for standing in ranked):
         lines.insert(len(lines) - below, {"label": _LINE})

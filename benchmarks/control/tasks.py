@@ -251,8 +251,7 @@ def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
 def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
     """Make the function from a task to its first n test seeds.
 
-    They differ between tasks: a seed draws the car as well, and tasks that share their cars would
-    not be independent strata of an interval.
+    They differ: tasks that share their cars would not be independent strata of an interval.
 
     Args:
         salt: Hexadecimal digits.

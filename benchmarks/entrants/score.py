@@ -148,8 +148,7 @@ def _describe_score(score: Estimate) -> str:
 def _describe_trust(comparison: Comparison) -> str:
     """Sentence on what the numbers rest, and what they do not say."""
     request = comparison.request
-    n = len(request.seeds or range(request.episodes))
-    count = len(request.tasks)
+    n, count = len(request.seeds or range(request.episodes)), len(request.tasks)
     where = f"{count} task{'s' if count > 1 else ''} x {n} episodes"
     if request.fresh:
         files = ", ".join(path.name for path in request.files)

@@ -291,11 +291,8 @@ class IsolatedDrive:
                     continue
                 child = _ChildProcess((entry.agent, entry.estimator), self)
                 children.append(child)
-                objects[part] = (
-                    partial(_make_remote_agent, child, source, entry.trust)
-                    if part == "agent"
-                    else _RemoteEstimators(child, source)
-                )
+                make_agent = partial(_make_remote_agent, child, source, entry.trust)
+                objects[part] = make_agent if part == "agent" else _RemoteEstimators(child, source)
             result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
             for child in children:
                 if not child.reason:

@@ -139,15 +139,13 @@ METRICS = {metric.name: metric.unit for metric in EPISODE} | {
 def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
     """Compute the power that N cars' tyres dissipate: -F_y times the sliding speed, both axles.
 
-    Drive slip is not modelled.
-
     Args:
         params: Packed parameters of the engine, one row for each car.
         states: Packed states of the engine, likewise.
         switches: Packed switches of the engine, likewise.
 
     Returns:
-        Power of each car (W), shape (N,).
+        Power of each car (W), shape (N,), without that of drive slip.
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

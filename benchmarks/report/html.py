@@ -250,19 +250,14 @@ def _format_figure(title: str, figure: "Figure", caption: str) -> str:
 
 def _format_explorer(explorer: Explorer) -> str:
     """Format two cells side by side; `explorer.js` makes the menus and draws."""
+    cells = ((list(key), signals.items()) for key, signals in explorer.cells.items())
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
         "panels": [{"label": p.label, "lines": list(map(list, p.lines))} for p in explorer.panels],
         "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
         "colours": {key[-1]: find_colour(key[-1]) for key in explorer.cells},
-        "cells": [
-            [
-                list(key),
-                {name: _encode_steps(_select_samples(values)) for name, values in signals.items()},
-            ]
-            for key, signals in explorer.cells.items()
-        ],
+        "cells": [[key, {x: _encode_steps(_select_samples(y)) for x, y in z}] for key, z in cells],
     }
     return (
         f'<figure class="explorer wide">\n<h3>{escape(explorer.title)}</h3>\n'

@@ -123,11 +123,8 @@ def make_estimator_tuning(
         known = ", ".join(state for state in states if state in drive.log.truth) or "none"
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
     if search is None:
-        search = {
-            f"q_{state}": None
-            for state in states
-            if f"q_{state}" not in held and _has_option(estimator, f"q_{state}", held, facts)
-        }
+        names = [f"q_{state}" for state in states if f"q_{state}" not in held]
+        search = {name: None for name in names if _has_option(estimator, name, held, facts)}
     searched = {**search, **(noises or {})}
     if not searched:
         raise ValueError(f"{estimator} has no process noise to search; name the options to search")

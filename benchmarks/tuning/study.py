@@ -113,11 +113,9 @@ def create_study(
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
     others = (RuntimeError, ImportError)  # another Optuna's tables, no driver
     with _silence_optuna(), _convert_storage_errors(storage, *others):
+        database = optuna.storages.RDBStorage(url, engine_kwargs=wait)
         study = optuna.create_study(
-            storage=optuna.storages.RDBStorage(url, engine_kwargs=wait),
-            study_name=task.study,
-            direction="minimize",
-            load_if_exists=True,
+            storage=database, study_name=task.study, direction="minimize", load_if_exists=True
         )
         study.sampler = _make_sampler(sampler, seed + len(study.trials), len(task.search))
         _list_finished(study, task)
