@@ -37,7 +37,7 @@ class Estimate(NamedTuple):
         Returns:
             Product.
         """
-        return Estimate(factor * self.value, factor * self.low, factor * self.high)
+        return Estimate(*(factor * number for number in self))
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
         """Format the number and, in brackets, its interval if there is one.
@@ -260,11 +260,10 @@ def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
     Returns:
         Whether the one-sided p value is at most 2.5 %.
     """
-    one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
-    larger = int((one & ~other).sum())
-    differing = int((one != other).sum())
     from scipy.special import bdtrc
 
+    one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
+    larger, differing = int((one & ~other).sum()), int((one != other).sum())
     return differing > 0 and float(bdtrc(larger - 1, differing, 0.5)) <= _TAIL
 
 

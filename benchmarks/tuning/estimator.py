@@ -131,9 +131,8 @@ def make_estimator_tuning(
     for option in searched:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
-        if not _has_option(estimator, option, held, facts):
-            wrong = {**facts, **held, option: 1.0}
-            call_quietly(make_estimator, estimator, **wrong)  # raises with what it has
+        if not _has_option(estimator, option, held, facts):  # it raises with what it has
+            call_quietly(make_estimator, estimator, **{**facts, **held, option: 1.0})
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
