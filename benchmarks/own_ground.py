@@ -14,19 +14,11 @@ from rich.console import Console
 
 from ..agents.baselines import FILTER
 from ..envs.record import Array
+from .control import tasks
 from .control.entries import JOINT, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .control.run import NUMBERS, measure
 from .control.score import rank_entries
-from .control.tasks import (
-    NOMINAL,
-    STEERING,
-    TIERS,
-    ControlTask,
-    list_scored_tasks,
-    make_salt,
-    make_salted_seeds,
-    make_task_seeds,
-)
+from .control.tasks import ControlTask
 from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 from .harness.stats import interval, ratio_of_roots
@@ -36,7 +28,7 @@ from .papers.manoeuvres import EstimationSimulation
 from .readme import EPISODES, check_driven, format_table, replace_table
 
 PAGE, ROWS = Path("docs/PAPERS.md"), Path("docs/own_ground.json")
-_TIER = next(iter(TIERS))  # of the papers' car
+_TIER = next(iter(tasks.TIERS))  # of the papers' car
 _HEADS = ("the paper's", "ours", "the paper's / %", "ours / %", "its cost / %", "our cost / %")
 _RATIO, _COST = "ratio", "cost_vs_nominal"
 _RECOMMENDED = PaperFilter(JOINT, JOINT)
@@ -45,36 +37,19 @@ _INFORMED = PaperFilter("informed", FILTER, vehicle="true")
 
 
 @dataclass(frozen=True)
-class System:
-    """A paper's system, where it was shown and what counts there.
+class _System:
+    """A paper's system, where it was shown and what counts there."""
 
-    Attributes:
-        paper: Short name of the paper.
-        entry: Its controller on its filter; LQR on the filter of a paper without a controller.
-        recommended: What this project recommends instead.
-        task: The paper's simulation, with its sensors and its reference.
-        metric: Metric of an episode, or estimate of the filter, whose root mean square counts.
-        criterion: The metric in words.
-        simulations: Drives of a paper without a controller, with its filters.
-        label: The paper's filter among them.
-        common_entry: Who drives the tasks where its own filter takes no lost or uneven frames.
-    """
-
-    paper: str
-    entry: Entry
-    recommended: Entry
-    task: ControlTask
-    metric: str
-    criterion: str
-    simulations: Sequence[EstimationSimulation] = ()
-    label: str = ""
+    paper: str  # short name of the paper
+    entry: Entry  # its controller on its filter; of a paper without a controller LQR on its filter
+    recommended: Entry  # what this project recommends instead
+    task: ControlTask  # the paper's simulation, with its sensors and its reference
+    metric: str  # metric of an episode, or estimate of the filter, whose root mean square counts
+    criterion: str  # the metric in words
+    simulations: Sequence[EstimationSimulation] = ()  # of a paper without a controller
+    label: str = ""  # the paper's filter among those of the simulations
+    # who drives the tasks where its own filter takes no lost or uneven frames
     common_entry: Entry | None = None
-
-    @property
-    def rival(self) -> Entry:
-        """Tuned LQG with the same sensors; a filter stands beside `_INFORMED` instead."""
-        sensor = "camera" if "Vision" in self.task.env_id else "gps"
-        return Entry(REFERENCE_CONTROLLER, f"{FILTER}, {sensor}")
 
     @property
     def scenario(self) -> str:
@@ -82,16 +57,13 @@ class System:
         return f"{self.task.scenario}, {self.criterion}"
 
     def measure(self, seeds: Sequence[int], jobs: int | None) -> tuple[Array, Array, Array]:
-        """Measure the paper's system, ours and the rival on the same seeds.
+        """Measure root mean squares (n,) of the paper's system, ours and a rival.
 
-        Args:
-            seeds: Seeds of the noise.
-            jobs: Processes.
-
-        Returns:
-            Root mean squares, shape (n,) each.
+        The rival is tuned LQG with the same sensors; a filter stands beside `_INFORMED` instead.
         """
-        entries = (self.entry, self.recommended, self.rival)
+        sensor = "camera" if "Vision" in self.task.env_id else "gps"
+        rival_entry = Entry(REFERENCE_CONTROLLER, f"{FILTER}, {sensor}")
+        entries = (self.entry, self.recommended, rival_entry)
         if self.metric in NUMBERS:
             driven = measure([(self.task, entry) for entry in entries], seeds, jobs=jobs)
             first, second, rival = (driven[self.task, entry][self.metric] for entry in entries)
@@ -123,7 +95,7 @@ _FILTERS = (
     (dual_rate, "dual-rate", "YawGps", _FIG4, dual_rate.PSEUDO, ("beta", _SLIP)),
 )
 SYSTEMS = (
-    System(
+    _System(
         "tie-vision",
         Entry("two-dof", "multirate-residual-kf"),
         _RECOMMENDED_ENTRY,
@@ -132,10 +104,10 @@ SYSTEMS = (
         "sideslip angle",
         common_entry=Entry("two-dof", REFERENCE_FILTER),
     ),
-    System(*_FOLLOWING, "rms_slip_error", _SLIP),
-    System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
+    _System(*_FOLLOWING, "rms_slip_error", _SLIP),
+    _System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
     *(
-        System(
+        _System(
             module.PAPER,
             Entry(REFERENCE_CONTROLLER, name),
             Entry(REFERENCE_CONTROLLER, JOINT),
@@ -151,24 +123,20 @@ SYSTEMS = (
 
 def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[ResultRow]:
     """Drive every system on its own ground and, beside nominal, in the small car's tasks."""
-    suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, EPISODES)
+    suite, seeds = Suite("own-ground", "", ""), tasks.make_salted_seeds(salt, EPISODES)
     for system in SYSTEMS:
         original, recommended, rival = (x**2 for x in system.measure(seeds, jobs))
         for entry, squares in ((system.entry, original), (system.recommended, recommended)):
-            suite.add_rows(
-                [{_RATIO: interval(squares, ratio_of_roots, rival)}],
-                system.task.env_id,
-                scenario=system.scenario,
-                estimator=entry.estimator,
-                controller=entry.agent,
-                n=EPISODES,
-                salt=salt,
-                paper=system.paper,
-            )
-    tasks = [x for x in list_scored_tasks() if (x.tier, x.env_id) == (_TIER, STEERING)]
+            labels = {"estimator": entry.estimator, "controller": entry.agent, "salt": salt}
+            labels |= {"scenario": system.scenario, "paper": system.paper}
+            ratio = {_RATIO: interval(squares, ratio_of_roots, rival)}
+            suite.add_rows([ratio], system.task.env_id, n=EPISODES, **labels)
+    scored = [x for x in tasks.list_scored_tasks() if (x.tier, x.env_id) == (_TIER, tasks.STEERING)]
     systems = [x for y in SYSTEMS for x in (y.common_entry or y.entry, y.recommended)]
-    pairs = [(task, entry) for task in tasks for entry in dict.fromkeys((Entry(NOMINAL), *systems))]
-    common = measure(pairs, make_task_seeds(salt, EPISODES), jobs=jobs, console=console)
+    drivers = dict.fromkeys((Entry(tasks.NOMINAL), *systems))
+    pairs = [(task, entry) for task in scored for entry in drivers]
+    seeds_by_task = tasks.make_task_seeds(salt, EPISODES)
+    common = measure(pairs, seeds_by_task, jobs=jobs, console=console)
     check_driven(common)
     for standing in rank_entries(common, _TIER):
         standing.add_rows(suite, salt)
@@ -176,15 +144,8 @@ def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[Resu
     return [row for row in suite.rows if row.scenario == names.get(row.metric, row.scenario)]
 
 
-def make_table(rows: Sequence[ResultRow]) -> str:
-    """Make the table: a line a system and criterion.
-
-    Args:
-        rows: Rows of the systems.
-
-    Returns:
-        Markdown.
-    """
+def _make_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table: a line a system and criterion."""
     cells = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
 
     def format_cell(scenario: str, entry: Entry, metric: str) -> str:
@@ -210,8 +171,9 @@ def _main(
 ) -> None:
     """Drive the systems and write their rows and their table."""
     console = Console(stderr=True)
-    rows = read_json(ROWS) if driven else _measure_systems(salt or make_salt(), jobs, console)
-    text = replace_table(PAGE.read_text(encoding="utf-8"), make_table(rows))
+    salt = salt or tasks.make_salt()
+    rows = read_json(ROWS) if driven else _measure_systems(salt, jobs, console)
+    text = replace_table(PAGE.read_text(encoding="utf-8"), _make_table(rows))
     write_json(ROWS, rows)
     write_text(PAGE, text)
 

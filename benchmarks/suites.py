@@ -11,7 +11,7 @@ from .report.study import Request
 if TYPE_CHECKING:
     from .entrants.challenge import ComparisonRequest
 
-__all__ = ["SALTED", "SUITES", "Request", "check_salt", "run_suites"]
+__all__ = ["SALTED", "SUITES", "Request", "run_suites"]
 
 SUITES = {
     "estimation": ".studies.estimation",
@@ -22,29 +22,9 @@ SUITES = {
     "procedures": ".procedures.suite",
     "speed": ".speed.suite",
     "logs": ".studies.logs",
-}
-"""The module of each suite, whose `STUDY` it is."""
+}  # the module of each suite, whose `STUDY` it is
 
-SALTED = ("control",)
-"""The suites whose test seeds follow the entries' sources."""
-
-
-def check_salt(salt: str, names: Sequence[str]) -> None:
-    """Check the salt of a request.
-
-    Args:
-        salt: Salt, "" for none.
-        names: Names of the suites.
-
-    Raises:
-        ValueError: It is not hexadecimal, or no suite takes it.
-    """
-    if salt and not {*SALTED} & {*names}:
-        raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
-    if salt:
-        from .control.tasks import make_salted_seeds
-
-        make_salted_seeds(salt, 1)
+SALTED = ("control",)  # the suites whose test seeds follow the entries' sources
 
 
 def run_suites(
@@ -62,7 +42,7 @@ def run_suites(
     """
     with use_shared_bar(request.console, f"bench {' '.join(names)}"):
         if comparison is not None:
-            from .entrants.score import run as run_comparison
+            from .entrants.score import run
 
-            return [run_comparison(comparison, request.jobs, request.console, request.keep)]
+            return [run(comparison, request)]
         return [import_module(SUITES[name], __package__).STUDY.run(request) for name in names]

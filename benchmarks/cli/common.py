@@ -16,7 +16,7 @@ from typer import Exit
 from ... import __version__
 from ...envs.io import atomic_file
 from ..harness.results import Suite, write_json, write_parquet, write_text
-from ..report.terminal import print_run, print_suite
+from ..report.tables import print_run, print_suite
 from .names import check_env
 from .options import parse_options
 
@@ -175,29 +175,24 @@ def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[CarEnv, Agent]"
 
 
 def _make_driver(setup: Mapping[str, Any], env_id: str, trust: bool) -> "tuple[CarEnv, Agent]":
-    """Make them in one env."""
     from ...agents import make_agent
     from ...agents.env_info import make_env
     from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
     from ..control.entries import Entry
     from ..harness.drives import call_quietly
 
-    agent, estimator, filter_options = (
-        setup[x] for x in ("agent", "estimator", "estimator_options")
-    )
+    agent, estimator, options = setup["agent"], setup["estimator"], setup["estimator_options"]
     env = make_env(env_id, setup["options"])
-    sensors = env.get_wrapper_attr("slow_sensors")
     if estimator is not None:
         arguments = env, estimator, Entry(agent, estimator).outputs
-        env = call_quietly(EstimateObservation, *arguments, options=filter_options or None)
-    elif filter_options:
+        env = call_quietly(EstimateObservation, *arguments, options=options or None)
+    elif options:
         raise ValueError("--estimator-option needs --estimator")
     try:
         return env, make_agent(agent, env, trust=trust, **setup["agent_options"])
     except ValueError as error:
         if estimator is None and "_hat" in str(error):
-            raise ValueError(
-                f"{agent} works on an estimate: add --estimator, for example "
-                f"--estimator {choose_estimator(sensors)}"
-            ) from None
+            example = f"--estimator {choose_estimator(env.get_wrapper_attr('slow_sensors'))}"
+            text = f"{agent} works on an estimate: add --estimator, for example {example}"
+            raise ValueError(text) from None
         raise

@@ -18,9 +18,8 @@ from typer import Exit
 from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
-from ..report.terminal import print_suite
+from ..report.tables import print_suite
 from .common import print_written, write_output
-from .names import complete
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
@@ -68,8 +67,7 @@ class _Replay:
 
     log: Path = take_argument("A recorded drive: a table, CAN trace, bag or NMEA.", ...)
     vehicle: Text = take(
-        "A name, a TOML or JSON file, or `identify`: found in the log itself.",
-        autocompletion=complete("vehicles"),
+        "A name, a TOML or JSON file, or `identify`: found in the log itself.", kinds="vehicles"
     )
     nominal: str = take("The car whose mass and arms `--vehicle identify` takes.", "passenger-car")
     mapping: Texts
@@ -117,8 +115,7 @@ class _Replay:
         wires = _read_wires(self, self.latency)
         with use_shared_bar(console, f"replay {log}"):
             suite = replay_file(
-                log,
-                self.vehicle,
+                *(log, self.vehicle),
                 mapping=self.mapping,
                 wires=wires,
                 nominal=self.nominal,
@@ -144,7 +141,7 @@ class _Identify:
     vehicle: str = take(
         "The car that is stated: its mass and arms stay, the search starts there.",
         "passenger-car",
-        autocompletion=complete("vehicles"),
+        kinds="vehicles",
     )
     mapping: Texts
     out: File = take("Write the car and its wires as TOML.", ends=".toml")
@@ -168,15 +165,8 @@ class _Identify:
 
         console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            result, suite = identify_file(
-                self.log,
-                self.vehicle,
-                self.mapping or (),
-                wires,
-                self.tyres,
-                self.until,
-                self.validate,
-            )
+            known = self.log, self.vehicle, self.mapping or ()
+            result, suite = identify_file(*known, wires, self.tyres, self.until, self.validate)
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)
@@ -192,9 +182,7 @@ class _Inspect:
 
     log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).", ...)
     vehicle: str = take(
-        "The car that is assumed: a name or a TOML or JSON file.",
-        "passenger-car",
-        autocompletion=complete("vehicles"),
+        "The car that is assumed: a name or a TOML or JSON file.", "passenger-car", kinds="vehicles"
     )
     mapping: Texts
     steering_ratio: float | None
@@ -207,10 +195,10 @@ class _Inspect:
         from ..recorded.inspection import inspect_file
 
         console, wires = Console(), _read_wires(self, self.latency)
-        drawn = self.html is not None
         with use_shared_bar(console, f"inspect {self.log}"):
-            suite = inspect_file(self.log, self.vehicle, self.mapping or (), wires, drawn)
-        write_output(console, [suite], vars(self) | {"json": None, "parquet": None})
+            known = self.log, self.vehicle, self.mapping or ()
+            suite = inspect_file(*known, wires, figures=self.html is not None)
+        write_output(console, [suite], {"html": self.html, "json": None, "parquet": None})
         if suite.verdict.startswith("Do not"):
             raise Exit(1)
 
@@ -251,9 +239,8 @@ class _Lane:
             try:
                 picture = read_picture(source)
             except cv2.error:
-                raise ValueError(
-                    f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
-                ) from None
+                text = f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
+                raise ValueError(text) from None
             finder = self._make_finder([picture], source)
             lanes, seconds = _process_picture(picture, finder, out)
         else:
@@ -302,20 +289,19 @@ class _Lane:
             except OverflowError as error:
                 raise ValueError(f"{file}: {error}") from None
         if camera.size != (width, height):
-            raise ValueError(
-                f"{file}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
-                f"those of {source} {width} x {height}"
-            )
+            expected, got = ("{} x {}".format(*size) for size in (camera.size, (width, height)))
+            text = f"{file}: the camera's pictures are {expected} pixels, those of {source} {got}"
+            raise ValueError(text)
         failed = None
         for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
             try:
                 camera = calibration.estimate_mounting(camera, picture, lane_width)
-                failed = None
                 break
             except ValueError as error:
                 failed = error
-        if failed is not None:
-            raise ValueError(f"{source}: {failed}")
+        else:
+            if failed is not None:
+                raise ValueError(f"{source}: {failed}")
         view = FieldOfView(calibration.HEADING, 0.5 * lane_width)
         return LaneFinder(camera, lane_width, calibration.NEAR, calibration.FAR, view=view)
 

@@ -20,7 +20,7 @@ from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.verdict import format_verdict
 from .common import make_driver, make_setup, print_written, show_episode
-from .names import check_env, complete
+from .names import check_env
 from .options import File, Text, Texts, register, take, take_argument
 
 console = Console(soft_wrap=True, highlight=False)
@@ -33,9 +33,7 @@ class _Live:
     With --simulate a simulated car is at the other end; without an ESTIMATOR it is alone.
     """
 
-    estimator: Text = take_argument(
-        "A name, FILE.py:Class or module:Name.", None, autocompletion=complete("estimators")
-    )
+    estimator: Text = take_argument("A name, FILE.py:Class or module:Name.", kinds="estimators")
     agent: str = take("What answers with controls.", "none")
     env: Text = take("The id whose sensors the car has; default: one that fits.")
     vehicle: Text = take("The car: a name or a file.")
@@ -125,12 +123,10 @@ class _Live:
         if drive is not None:
             lines.append(_compare_offline(drive, setup, self.trust, numbers))
         console.print(f"[bold]{escape(format_verdict(*lines))}[/]")
-        if self.record is not None:
-            print_written(console, self.record)
+        print_written(console, self.record)
         self._write(numbers)
 
     def _simulate(self, setup: dict[str, Any], target: Any) -> None:
-        """Run the simulated car alone and print its episode."""
         from ...agents.live.loop import Port
         from ...agents.live.simulate import simulate
 
@@ -199,7 +195,6 @@ def _parse_address(text: str) -> tuple[str, int]:
 
 
 def _watch_signals() -> list[int]:
-    """Make a list that fills when the process is asked to end."""
     signals: list[int] = []
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda number, _: signals.append(number))

@@ -12,17 +12,9 @@ from ... import __version__
 from ...envs.validation import check_choice
 from ..harness.parallel import report_user_errors, use_engine
 from ..report.html import check_page, write_page
-from ..suites import SUITES, Request, check_salt, run_suites
-from . import data, live, policies, train  # noqa: F401  # they register their commands
-from .common import (
-    handle_interrupt,
-    make_driver,
-    make_setup,
-    print_written,
-    show_episode,
-    write_output,
-)
-from .names import KINDS, complete
+from ..suites import SALTED, SUITES, Request, run_suites
+from . import common, data, live, policies, train  # noqa: F401  # they register their commands
+from .names import KINDS
 from .options import File, Text, Texts, app, register, take, take_argument
 from .search import tune_app
 
@@ -88,20 +80,16 @@ class _Run:
         "An environment's id; default: the first of YawVision and AfsYawFusion that fits.",
         None,
         metavar="env_id",
-        autocompletion=complete("environments"),
+        kinds="environments",
     )
     agent: str = take(
-        "A name, a policy's path, FILE.py:Class or module:Name.",
-        "none",
-        autocompletion=complete("agents", "policies"),
+        "A name, a policy's path, FILE.py:Class or module:Name.", "none", kinds="agents policies"
     )
-    estimator: Text = take(
-        "A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
-    )
+    estimator: Text = take("A name, FILE.py:Class or module:Name.", kinds="estimators")
     vehicle: Text
     scenario: Text = take(
         "A name, a TOML or JSON file, or a recorded drive (CSV, Parquet) to steer as.",
-        autocompletion=complete("scenarios"),
+        kinds="scenarios",
     )
     option: Texts = take("NAME=VALUE of the environment (reference=model); repeatable.")
     agent_option: Texts = take("NAME=VALUE of the agent (grip=0.6); repeatable.")
@@ -122,23 +110,23 @@ class _Run:
 
         check_film(self.video)
         if self.beside is not None and self.video is None:
-            text = "can only drive beside in a film: --video names its file"
-            raise ValueError(f"{self.beside!r} {text}")
-        driver = FilmDriver(self.agent, *make_driver(make_setup(vars(self)), self.trust))
+            raise ValueError(f"{self.beside!r} can only drive beside in a film: --video names its "
+                             "file")  # fmt: skip
+        setup = common.make_setup(vars(self))
+        driver = FilmDriver(self.agent, *common.make_driver(setup, self.trust))
         if self.env is None and driver.env.spec is not None:
             console.print(f"on {driver.env.spec.id}", highlight=False)
         drive = rollout(driver.env, driver.agent, self.seed)
-        show_episode(console, drive, self.agent, vars(self))
+        common.show_episode(console, drive, self.agent, vars(self))
         if self.video is not None:
             drivers = [driver]
             if self.beside is not None:
                 env = copy.deepcopy(driver.env)
                 name = "no control" if self.beside == "none" else self.beside
-                drivers.append(
-                    FilmDriver(name, env, make_agent(self.beside, env, trust=self.trust))
-                )
+                ghost = make_agent(self.beside, env, trust=self.trust)
+                drivers.append(FilmDriver(name, env, ghost))
             write_film(self.video, drivers, self.seed, console)
-            print_written(console, self.video)
+            common.print_written(console, self.video)
 
 
 _FIXED = {"highway", "procedures", "speed"}  # suites whose number of drives is fixed
@@ -149,7 +137,7 @@ class _Bench:
     """Compare estimators and controllers; with --agent and --estimator your own beside some of
     the package's."""
 
-    suites: Texts = take_argument("Suites; default: all.", None, autocompletion=complete("suites"))
+    suites: Texts = take_argument("Suites; default: all.", None, kinds="suites")
     quick: bool = take("Few seeds: a first look in minutes.", False, "--quick")
     data: File = take("The folder of downloaded drives, for the suite logs.")
     vehicle: Text
@@ -162,8 +150,7 @@ class _Bench:
     keep: File = take("A folder for finished cases: a stopped run goes on.")
     clairvoyant: File = take("A file of `sideslip calibrate`; default: the package's.")
     agent: Texts = take(
-        "Your own: FILE.py:Class, a policy's path, a name; repeatable.",
-        autocompletion=complete("agents", "policies"),
+        "Your own: FILE.py:Class, a policy's path, a name; repeatable.", kinds="agents policies"
     )
     estimator: Texts = take("FILE.py:Class, a name, none; repeatable.")
     scenario: Texts = take("A name or a file; repeatable.")
@@ -189,7 +176,12 @@ class _Bench:
         names = self.suites or (["control"] if comparison else everything)
         for name in names:
             check_choice("suite", name, SUITES)
-        check_salt(self.salt, names)
+        if self.salt:
+            from ..control.tasks import make_salted_seeds
+
+            if not {*SALTED} & {*names}:
+                raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
+            make_salted_seeds(self.salt, 1)  # or ValueError
         check_page(self.page, names)
         for option, suite in (("keep", "control"), ("clairvoyant", "control"), ("data", "logs")):
             fits = suite in names and not (comparison and option != "keep")
@@ -198,19 +190,17 @@ class _Bench:
                 raise ValueError(f"--{option} goes with the suite {suite}, got {got}")
         if self.episodes is not None and not {*names} - _FIXED:
             raise ValueError(f"--episodes: {', '.join(names)} has a number of its own")
-        request = Request(
-            self.quick, self.jobs, console, self.episodes, self.keep, self.clairvoyant, self.data,
-            self.salt,
-        )  # fmt: skip
+        chosen = self.episodes, self.keep, self.clairvoyant, self.data, self.salt
+        request = Request(self.quick, self.jobs, console, *chosen)
         how = "the same command" if self.keep else "the same command, from the start"
         if "control" in names and not self.keep:
             how = "add --keep FOLDER, which keeps finished cases of control"
-        with use_engine(self.engine_name, self.address), handle_interrupt(how):
+        with use_engine(self.engine_name, self.address), common.handle_interrupt(how):
             done = run_suites(names, request, comparison)
-        write_output(console, done, vars(self), brief=True)
+        common.write_output(console, done, vars(self), brief=True)
         if self.page is not None:
             write_page(self.page, done)
-        print_written(console, self.page)
+        common.print_written(console, self.page)
 
     def _make_comparison(self, agents: list[str], filters: list[str]) -> "ComparisonRequest":
         """Make the request of a user's own entries."""
@@ -224,16 +214,10 @@ class _Bench:
         entries = tuple(make_user_entries(agents, estimators, self.trust))
         if not entries:
             raise ValueError("--estimator none goes with --agent")
-        return ComparisonRequest(
-            entries,
-            vehicle=self.vehicle,
-            scenarios=tuple(self.scenario or []),
-            env_id=self.env_id,
-            episodes=self.episodes or (QUICK_EPISODES if self.quick else EPISODES),
-            fresh=self.fresh,
-            salt=self.salt,
-            limit=LIMIT if self.limit is None else self.limit,
-        )
+        episodes = self.episodes or (QUICK_EPISODES if self.quick else EPISODES)
+        limit = LIMIT if self.limit is None else self.limit
+        where = self.vehicle, tuple(self.scenario or []), self.env_id, episodes
+        return ComparisonRequest(entries, *where, fresh=self.fresh, salt=self.salt, limit=limit)
 
 
 app.registered_commands.sort(key=lambda item: _ORDER.index(str(item.name)))

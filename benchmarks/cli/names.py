@@ -25,7 +25,6 @@ _ENVIRONMENTS = {
 
 
 def _list_environments() -> dict[str, str]:
-    """List the package's ids with their slow sensors."""
     ids = [name for name in gym.registry if name.startswith("sideslip/")]
     texts = {name: _ENVIRONMENTS[name.rpartition("/")[2].partition("-v")[0]] for name in ids}
     errs = "; car and sensors err"
@@ -33,20 +32,16 @@ def _list_environments() -> dict[str, str]:
 
 
 def check_env(env_id: str) -> None:
-    """Check that an id is registered, or names a module that registers it (MODULE:ID).
+    """Check that an id is registered, or MODULE:ID of one that registers it; ValueError otherwise.
 
     Args:
         env_id: Id of the env.
-
-    Raises:
-        ValueError: There is no such id.
     """
     if env_id not in gym.registry and ":" not in env_id:
         check_choice("environment", env_id, _list_environments())
 
 
 def _list_scenarios() -> dict[str, str]:
-    """List the scenarios with steering, path, speed, friction, duration and particulars."""
     from ...envs.scenarios.manoeuvres import SCENARIOS
 
     lines = {}
@@ -79,7 +74,6 @@ def _format_range(ends: tuple[float, float], factor: float = 1.0) -> str:
 
 
 def _list_vehicles() -> dict[str, str]:
-    """List the cars with mass, wheelbase and critical speed."""
     from ...envs.vehicle.parameters import VEHICLES, critical_speed
 
     lines = {}
@@ -91,7 +85,6 @@ def _list_vehicles() -> dict[str, str]:
 
 
 def _list_estimators() -> dict[str, str]:
-    """List the estimators with their slow sensors and source."""
     from ...estimators.filters import FILTERS
     from ...estimators.make import ESTIMATORS
 
@@ -104,14 +97,12 @@ def _list_estimators() -> dict[str, str]:
 
 
 def _list_agents() -> dict[str, str]:
-    """List the agents with the first sentence of their docstrings."""
     from ...agents import AGENTS
 
     return {name: _extract_sentence(AGENTS.load(name).__doc__) for name in AGENTS}
 
 
 def _list_policies() -> dict[str, str]:
-    """List the shipped policies with algorithm and environment."""
     from ...agents.learned.policy import list_shipped, load_policy
 
     lines = {}
@@ -146,8 +137,7 @@ KINDS: dict[str, Callable[[], dict[str, str]]] = {
     "agents": _list_agents,
     "policies": _list_policies,
     "suites": _list_suites,
-}
-"""Functions that list the names of a kind with a line on each."""
+}  # functions that list the names of a kind with a line on each
 
 
 def complete(*kinds: str) -> Callable[[str], Iterable[tuple[str, str]]]:

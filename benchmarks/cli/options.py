@@ -29,6 +29,7 @@ def take(
     *names: str,
     declare: Callable[..., Any] = typer.Option,
     ends: str = "",
+    kinds: str = "",
     **more: Any,
 ) -> Any:
     """Make the dataclass field of a command's option.
@@ -39,11 +40,13 @@ def take(
         names: Options that replace the field's name, such as "--jobs" and "-j".
         declare: Typer's function that declares the option.
         ends: Suffixes of a file that is written, which is checked before the work: ".html .htm".
+        kinds: Kinds of the names that a shell completes: "agents policies".
         more: Other arguments of `declare`.
 
     Returns:
         Field whose metadata hold typer's declaration.
     """
+    more |= {"autocompletion": complete(*kinds.split())} if kinds else {}
     declared = {"typer": declare(default, *names, help=help, **more), "ends": ends}
     return field(default=MISSING if default is ... else default, metadata=declared)
 
@@ -73,9 +76,7 @@ _SHARED: dict[str, Callable[[], Any]] = {
     "trust": partial(
         take, "Read policies' zips, which may run code of their makers.", False, "--trust"
     ),
-    "vehicle": partial(
-        take, "The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")
-    ),
+    "vehicle": partial(take, "The car: a name or a TOML or JSON file.", kinds="vehicles"),
 }  # a command declares these fields without a value
 
 
@@ -128,16 +129,13 @@ def check_file(path: Path | None, ends: str) -> None:
 
 
 def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Parse options.
+    """Parse options; ValueError for a text of another form.
 
     Args:
         texts: Texts such as NAME=VALUE, None for none; a value is JSON or a word.
 
     Returns:
         Values by name.
-
-    Raises:
-        ValueError: A text has another form.
     """
     options: dict[str, Any] = {}
     for text in texts or ():

@@ -128,7 +128,6 @@ class _Enjoy:
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
-    """Print a policy's card and the sizes of its network."""
     network = policy.network
     unread = [name for (name, _), read in zip(policy.card.observation, network.reads, strict=True)
               if not read]  # fmt: skip

@@ -11,7 +11,7 @@ from typer import Typer
 from ...envs.validation import check_choice
 from ..harness.parallel import use_engine
 from ..harness.results import check_writable
-from ..report.terminal import print_suite
+from ..report.tables import print_suite
 from .common import get_command_line, handle_interrupt, print_written
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
@@ -70,9 +70,8 @@ class _TuneEstimator:
         files = [*([self.out] if self.out else []), *([options.FILE] if self.write else [])]
         check_writable(*files)
         ranges, noises = (dict(map(_parse_range, x or [])) for x in (self.search, self.noise))
-        held, env = parse_options(self.option), self.env or None
-        chosen = self.name, self.scenario, env, self.target, held, ranges or None, noises
-        task = make_estimator_tuning(*chosen, self.seeds)
+        chosen = self.name, self.scenario, self.env or None, self.target, parse_options(self.option)
+        task = make_estimator_tuning(*chosen, ranges or None, noises, self.seeds)
         if self.write and not all(key.startswith("q_") for key in task.search):
             raise ValueError("shipped tunings hold process noise alone: --out writes the others")
         console, where = Console(), (self.storage or STORAGE, self.sampler, self.seed, self.jobs)
@@ -171,11 +170,8 @@ class _Calibrate:
         tasks = [known[name] for name in self.contest or known]
         console, folder = Console(), Path(f".{path.name}.cases").absolute()
         calibration = Calibration(tasks, folder, seeds)
-        cases = calibration.cases
-        remaining = sum(not item.path.exists() for item in cases)
-        text = (
-            f"{remaining} of {len(cases)} episodes are left; the same command goes on if stopped."
-        )
+        total, left = len(calibration.cases), sum(not x.path.exists() for x in calibration.cases)
+        text = f"{left} of {total} episodes are left; the same command goes on if stopped."
         console.print(text, highlight=False)
         how = "run the same command in the same folder"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):

@@ -115,9 +115,8 @@ class _Train:
         console = Console()
         with use_shared_bar(console if self.progress else None, "train", "steps", steps) as bar:
             project, show = self.wandb_project_name if self.track else "", partial(_show, bar)
-            run_options = RunOptions(
-                eval_freq, self.device, self.tensorboard_log, show, command, project
-            )
+            logged = self.tensorboard_log, show, command, project
+            run_options = RunOptions(eval_freq, self.device, *logged)
             if logs is not None:
                 _describe_for_zoo(task, folder, steps, eval_freq)
             try:
@@ -174,15 +173,13 @@ def _make_command(
             words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
     words += [word for item in task.scenarios for word in ("--scenarios", str(item))]
     words += [word for item in task.reads for word in ("--reads", item)]
-    numbers = {"steps": steps, "seed": task.seed, "num_envs": task.num_envs}
-    numbers |= {"n_eval_envs": task.n_eval_envs}
-    rest = numbers | {name: value for name, value in (more or {}).items() if value}
+    numbers = {name: getattr(task, name) for name in ("seed", "num_envs", "n_eval_envs")}
+    rest = {"steps": steps} | numbers | {name: x for name, x in (more or {}).items() if x}
     options = {f"--{name.replace('_', '-')}": str(value) for name, value in rest.items()}
     return words + [word for pair in options.items() for word in pair]
 
 
 def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Path | None) -> Path:
-    """Choose a training's folder."""
     if logs is not None:
         if out is not None:
             raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")

@@ -18,29 +18,17 @@ from rich.table import Table
 from ...envs.scenarios.world import WORLD_VERSION
 from ..harness.results import write_text
 from ..harness.stats import Estimate, geometric_mean
+from . import tasks
 from .entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .run import Results, measure
 from .score import PairedDrives, compute_log_ratios
 from .tables import compute_gaps
-from .tasks import (
-    FILE,
-    LIMIT,
-    NOMINAL,
-    ORACLES,
-    PARAMETERS,
-    QUICK_LEAD_IN,
-    STATE,
-    YAW,
-    ControlTask,
-    TaskMeasurement,
-    list_candidates,
-    make_tuning_seeds,
-)
+from .tasks import NOMINAL, ORACLES, PARAMETERS, STATE, ControlTask, TaskMeasurement
 
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
 # s between the frames of a late camera: 0.3 s late, 7 are in flight of `link.MAX_IN_FLIGHT`
 _FRAME_PERIOD = 0.05
-DELAY_TASK = ControlTask("small car", YAW, "coms", "zero-slip", "small-car-random")
+DELAY_TASK = ControlTask("small car", tasks.YAW, "coms", "zero-slip", "small-car-random")
 _FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
 DELAY_ENTRIES = (
     *(Entry(name) for name in (NOMINAL, ORACLES[PARAMETERS][0], ORACLES[STATE][0])),
@@ -120,10 +108,9 @@ def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
 
 def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) -> str:
     """Describe whether a candidate demands enough, and whether a baseline meets the demand."""
-    if tier != LIMIT:
-        return (
-            "scored" if peak > MIN_PEAK else f"the slip angle peaks at {peak:.1f} deg uncontrolled"
-        )
+    if tier != tasks.LIMIT:
+        low = f"the slip angle peaks at {peak:.1f} deg uncontrolled"
+        return "scored" if peak > MIN_PEAK else low
     if lost < MIN_LOST:
         return f"{100.0 * lost:.0f} % of the cars are lost uncontrolled"
     if lost_by_best > MAX_SHARE * lost:
@@ -132,17 +119,15 @@ def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) 
 
 
 def _main(
-    write: bool = False,
-    episodes: int = EPISODES,
-    jobs: int | None = None,
-    keep: Path | None = None,
+    write: bool = False, episodes: int = EPISODES, jobs: int | None = None, keep: Path | None = None
 ) -> None:
     """Measure which tasks are scored: what they demand of a car, on tuning seeds (2 or more)."""
     console = Console()
-    short = {"lead_in": QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
-    candidates = [replace(task, changes=short) for task in list_candidates()]
+    short = {"lead_in": tasks.QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
+    candidates = [replace(task, changes=short) for task in tasks.list_candidates()]
     cases = [(task, entry) for task in candidates for entry in _BASELINES]
-    results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console, keep=keep)
+    seeds = tasks.make_tuning_seeds(episodes)
+    results = measure(cases, seeds, jobs=jobs, console=console, keep=keep)
     measurements = [_measure_task(results, task) for task in candidates]
     table = Table("task", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
     for m in measurements:
@@ -150,7 +135,7 @@ def _main(
         table.add_row(m.task.name, f"{m.peak_slip:.1f}", ", ".join(lost), m.verdict)
     console.print(table)
     if write:
-        write_text(FILE, json.dumps([asdict(m) for m in measurements], indent=1) + "\n")
+        write_text(tasks.FILE, json.dumps([asdict(m) for m in measurements], indent=1) + "\n")
 
 
 if __name__ == "__main__":

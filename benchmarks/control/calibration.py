@@ -1,8 +1,7 @@
 """The clairvoyant's costs of each task, on seeds of their own that only the world's version salts.
 
 An episode takes ten seconds to solve, so `sideslip calibrate` solves all once, into a file. The
-baselines drive the same seeds when a table is made. An entry is refused that no longer fits: by
-its world, its task, or what the uncontrolled car costs on its seeds.
+baselines drive the same seeds when a table is made. An entry is refused that no longer fits.
 """
 
 import hashlib
@@ -124,20 +123,11 @@ def _solve(case: _CalibrationCase) -> ClairvoyantEpisode:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The calibration of tasks; a stopped run goes on from the folder of finished cases.
-
-    Attributes:
-        tasks: Tasks to calibrate.
-        folder: Folder of finished cases.
-        seeds: Seeds of a task.
-
-    Raises:
-        ValueError: There are fewer than two seeds, so that there is no interval.
-    """
+    """The calibration of tasks; a stopped run goes on from the folder of finished cases."""
 
     tasks: Sequence[ControlTask]
-    folder: Path
-    seeds: int = SEEDS
+    folder: Path  # of finished cases
+    seeds: int = SEEDS  # of a task, two or more
 
     def __post_init__(self) -> None:
         if self.seeds < 2:
@@ -161,9 +151,6 @@ class Calibration:
 
         Returns:
             Record of each task.
-
-        Raises:
-            ModuleNotFoundError: CasADi or OSQP is not installed.
         """
         with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
             import casadi  # noqa: F401
@@ -171,12 +158,9 @@ class Calibration:
         self.folder.mkdir(parents=True, exist_ok=True)
         episodes = run_cases(_solve, self.cases, "calibration", jobs, console)
         rows = zip(*[iter(episodes)] * self.seeds, strict=True)
-        return [
-            CalibrationRecord(
-                **task.record, world_version=WORLD_VERSION, command=command, episodes=row
-            )
-            for task, row in zip(self.tasks, rows, strict=True)
-        ]
+        made: dict[str, Any] = {"world_version": WORLD_VERSION, "command": command}
+        pairs = zip(self.tasks, rows, strict=True)
+        return [CalibrationRecord(**made | task.record, episodes=row) for task, row in pairs]
 
     def remove_cases(self) -> None:
         """Remove finished cases once their entries are written; those of other runs stay."""
@@ -196,11 +180,9 @@ def _read_calibration(
         episodes = item.get("episodes", ())
         if not isinstance(episodes, list):
             raise ValueError(f"{where}: episodes is no list")
-        parsed = (
-            from_json(ClairvoyantEpisode, one, f"{where}, episode {k}")
-            for k, one in enumerate(episodes, 1)
-        )
-        record = from_json(CalibrationRecord, item | {"episodes": tuple(parsed)}, where)
+        places = ((one, f"{where}, episode {k}") for k, one in enumerate(episodes, 1))
+        parsed = tuple(from_json(ClairvoyantEpisode, *place) for place in places)
+        record = from_json(CalibrationRecord, item | {"episodes": parsed}, where)
         seeds, why = record.seeds, ""
         if record.world_version != WORLD_VERSION:
             why = f"of world {record.world_version}, not {WORLD_VERSION}"
@@ -229,7 +211,7 @@ def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
 def read_current(
     path: Path | None, tasks: Sequence[ControlTask]
 ) -> dict[ControlTask, CalibrationRecord]:
-    """Read the records of tasks, and check that the uncontrolled car costs what it did.
+    """Read the records of tasks; ValueError where the uncontrolled car no longer costs what it did.
 
     Args:
         path: File; None: the package's, if there is one.
@@ -237,9 +219,6 @@ def read_current(
 
     Returns:
         Records by task.
-
-    Raises:
-        ValueError: As `_read_calibration`; or the car costs something else in a task.
     """
     if path is None and not FILE.is_file():
         return {}

@@ -1,7 +1,4 @@
-"""Entries of the control benchmark: an agent, the estimator that it reads, and their options.
-
-An entry is names and options; it makes the env of any task with the estimator, and the agent.
-"""
+"""Entries of the control benchmark: an agent, the estimator that it reads, and their options."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,16 +7,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from ...agents import AGENTS, Agent, make_agent
-from ...agents.baselines import (
-    FILTER,
-    GRIP,
-    STEER_WEIGHT,
-    Options,
-    get_tuned_options,
-    make_noise_options,
-    make_oracle,
-)
+from ...agents import AGENTS, Agent, baselines, make_agent
 from ...agents.learned.policy import is_policy, load_policy
 from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
@@ -33,17 +21,7 @@ from ...estimators.filters import FILTERS
 from ...estimators.wrappers.estimate import EstimateObservation
 from ...estimators.wrappers.truth import TruthObservation
 from ..harness.drives import call_quietly
-from .tasks import (
-    NOMINAL,
-    ORACLES,
-    PARAMETERS,
-    STATE,
-    STEERING,
-    TIERS,
-    YAW,
-    ControlTask,
-    find_oracle,
-)
+from .tasks import NOMINAL, ORACLES, STEERING, TIERS, YAW, ControlTask, find_oracle
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER, JOINT = "exact-kf, all sensors", "joint"
@@ -56,19 +34,16 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
     "multirate-kf, camera and gps": ("multirate-kf", _BOTH),
     JOINT: (JOINT, {}),
-}
-"""Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
-ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")
-"""Controllers that follow the tyres of `JOINT`."""
+}  # filters by name in the tables: a name of `make_estimator`, and options over the tuned ones
+ADAPTIVE = ("adaptive-lqr", "adaptive-nmpc")  # controllers that follow the tyres of `JOINT`
 ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
-}
-"""Besides the reference controller, on the reference filter."""
-ORACLE_NAMES = (NOMINAL, PARAMETERS, STATE)
+}  # besides the reference controller, on the reference filter
+ORACLE_NAMES = (NOMINAL, *ORACLES)
 _CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
-_SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
+_SLOW_AGENTS = ("mpc", "nmpc", "adaptive-nmpc", *(names[1] for names in ORACLES.values()))
 
 _PUSHES = ("force_sd", "moment_sd")
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
@@ -76,23 +51,15 @@ _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d
 
 @dataclass(frozen=True)
 class Entry:
-    """An agent on an estimator, in any task; no key where options alone tell two entries apart.
+    """An agent on an estimator, in any task; no key where options alone tell two entries apart."""
 
-    Attributes:
-        agent: Name of `make_agent`, or a baseline.
-        estimator: Name in `SETUPS` or of `make_estimator`, "truth", or "" where the agent reads
-            none or brings its own.
-        options: Options of filter and agent instead of the best known.
-        objects: A user's objects instead of what the names mean: an agent or its factory as
-            "agent", a filter's factory as "estimator".
-        trust: Whether a zip may be read, which can run code of its author.
-    """
-
-    agent: str
-    estimator: str = ""
-    options: Options | None = field(default=None, compare=False)
+    agent: str  # name of `make_agent`, or a baseline
+    estimator: str = ""  # name in `SETUPS` or of `make_estimator`, "truth"; "": none, or its own
+    # options of filter and agent instead of the best known
+    options: baselines.Options | None = field(default=None, compare=False)
+    # a user's own instead of what the names mean: "agent" or its factory, "estimator" as a factory
     objects: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    trust: bool = field(default=False, compare=False)
+    trust: bool = field(default=False, compare=False)  # whether a zip may be read, which runs code
 
     @property
     def label(self) -> str:
@@ -141,7 +108,8 @@ class Entry:
         """
         case, env_id = ControlCase(task, self), task.env_id
         if self.is_oracle:
-            return make_oracle(case.driver, env_id, n, options=case.options, **case.env_options)
+            chosen = {"options": case.options, **case.env_options}
+            return baselines.make_oracle(case.driver, env_id, n, **chosen)
         env: Any
         if n is None:
             env = gym.make(env_id, **case.env_options)
@@ -156,7 +124,7 @@ class Entry:
             env = call_quietly(wrappers[0], env, source, **case.estimate_options)
         agent = make_agent(self.objects.get("agent", self.agent), env, **case.agent_options)
         if self.is_users and n is not None:
-            agent = check_agent(agent, n, env.single_action_space.shape[0])
+            agent = check_agent(agent, (n, env.single_action_space.shape[0]))
         return env, agent
 
 
@@ -178,16 +146,13 @@ class ControlCase(NamedTuple):
         return self.driver in _SLOW_AGENTS
 
     @property
-    def options(self) -> Options:
-        """Options of filter and agent: its own, or those of `agents.get_tuned_options`.
-
-        Nominal, the oracles and a user's own are as they were made.
-        """
+    def options(self) -> baselines.Options:
+        """Options of filter and agent: its own, or tuned; of oracles and a user's own none."""
         if self.entry.options is not None:
             return self.entry.options
         if self.entry.trust or self.entry.is_users:
             return {"filter": {}, "controller": {"trust": True} if self.entry.trust else {}}
-        return get_tuned_options(self.task.kind, self.driver)
+        return baselines.get_tuned_options(self.task.kind, self.driver)
 
     @property
     def env_options(self) -> dict[str, Any]:
@@ -195,9 +160,8 @@ class ControlCase(NamedTuple):
         agent = self.entry.agent
         card = load_policy(agent).card.env_options if is_policy(agent) else {}
         observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
-        return (
-            self.task.env_options | {"on_bad_action": "fail"} | observed | dict(self.task.changes)
-        )
+        options = self.task.env_options | {"on_bad_action": "fail"}
+        return options | observed | dict(self.task.changes)
 
     @property
     def spec(self) -> str:
@@ -219,10 +183,10 @@ class ControlCase(NamedTuple):
             if estimator == REFERENCE_FILTER:
                 sensors = gym.spec(self.task.env_id).kwargs["sensors"]
                 options = options | {"slow": list(SENSOR_SETS[sensors])}
-            if name == FILTER:
+            if name == baselines.FILTER:
                 world = make_world(self.env_options.get("world", "ideal"))
                 scenario = make_scenario(self.env_options["scenario"])
-                levels = make_noise_options(scenario, world)
+                levels = baselines.make_noise_options(scenario, world)
                 # where nothing pushes, the filter's own level
                 levels = {key: x for key, x in levels.items() if key not in _PUSHES or x > 0.0}
                 options = levels | self.options["filter"] | options
@@ -241,9 +205,9 @@ class ControlCase(NamedTuple):
         if self.entry.agent == "model-following":
             options["rejection"] = self.entry.estimator == "dakf"
         if self.entry.agent == REFERENCE_CONTROLLER:  # nominal's own design
-            options["grip"] = GRIP
+            options["grip"] = baselines.GRIP
             if self.task.env_id == STEERING:
-                options["steer_weight"] = STEER_WEIGHT
+                options["steer_weight"] = baselines.STEER_WEIGHT
         return options | self.options["controller"]
 
 
@@ -271,18 +235,17 @@ class _CheckedAgent:
         return result
 
 
-def check_agent(agent: Agent, rows: int, width: int) -> Agent:
+def check_agent(agent: Agent, shape: tuple[int, int]) -> Agent:
     """Wrap a user's agent: TypeError or ValueError where `predict` returns anything else.
 
     Args:
         agent: Agent with `predict` as stable-baselines3 has it.
-        rows: Number of cars.
-        width: Length of an action.
+        shape: Number of cars, and length of an action.
 
     Returns:
         Agent that is checked at each call.
     """
-    return _CheckedAgent(agent, (rows, width))
+    return _CheckedAgent(agent, shape)
 
 
 LEARNED: dict[str, tuple[Entry, ...]] = {
@@ -290,8 +253,7 @@ LEARNED: dict[str, tuple[Entry, ...]] = {
     "car-yaw": (Entry("distill-car-yaw", JOINT),),
     "coms-model": (Entry("distill-coms-steering", JOINT), Entry("raw-coms-steering", "")),
     "coms-zero-slip": (Entry("distill-coms-yaw", JOINT),),
-}
-"""Policies by the class of their tasks; verdicts speak of the first."""
+}  # policies by the class of their tasks; verdicts speak of the first
 _POLICIES = {entry for entries in LEARNED.values() for entry in entries}
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
@@ -316,9 +278,7 @@ def select_quick_tasks(tasks: Sequence[ControlTask], count: int = 2) -> list[Con
 
 
 def make_cases(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[ControlCase]:
-    """Make the matrix, task by task.
-
-    All estimators drive in the tasks with the first of their tier's ids.
+    """Make the matrix, task by task; in a tier's first id all estimators drive.
 
     Args:
         tasks: Tasks that are driven.

@@ -1,16 +1,14 @@
 """The verdict of the control benchmark, and its figures, tracks and side-by-side views.
 
 `_Gains` are r of an entry's drives, shape (n,), by task (see `score`). The cost of an entry over
-another's is exp(-r) here, so that a loss that the other does not have counts e^2 times.
-"""
+another's is exp(-r) here, so that a loss that the other does not have counts e^2 times."""
 
 import math
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from types import ModuleType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,16 +22,15 @@ from ..report.film import make_track_kml
 from .baseline_gaps import DELAY_TASK, DELAYS
 from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, Entry
 from .run import SIGNALS
-from .score import CONSTANTS, PairedDrives, Standing, check_losses
-from .tables import Matrix, compute_gaps, subtract
-from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask
+from .score import CONSTANTS, Standing
+from .tables import Matrix, compute_gaps, list_knowledge
+from .tasks import NOMINAL, STATE, TITLES, ControlTask
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 _Gains = dict[ControlTask, Array]
 _ByTier = Mapping[str, Sequence[Standing]]
-Driven = TypeVar("Driven", bound=Collection[Hashable])
 
 
 def compose_verdict(matrix: Matrix) -> str:
@@ -45,7 +42,7 @@ def compose_verdict(matrix: Matrix) -> str:
     Returns:
         Text of the verdict, a statement a line.
     """
-    filters, agents = _group_filters(matrix.by_tier), _group_agents(matrix.by_tier)
+    filters, agents = _group_filters(matrix.overall), _group_agents(matrix.overall)
     complete, none, best = agents.complete, agents.gains.get("none", {}), agents.find_best()
     text = ""
     if best not in ("", "none") and none:
@@ -57,22 +54,9 @@ def compose_verdict(matrix: Matrix) -> str:
         f"Of the controllers {complete.describe_first()}{text}.",
         f"Of the estimators, under one controller, {filters.describe_first()}.",
         _describe_reasons(matrix),
-        f"{_describe_exceptions(matrix.by_tier)}{_describe_resolution(matrix)}Not covered: other "
+        f"{_describe_exceptions(matrix)}{_describe_resolution(matrix)}Not covered: other "
         f"cars and roads, and what {episodes} episodes a task are too few to show.",
     )
-
-
-def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
-    """Select the names with every task that any name has: only they can be the best over all.
-
-    Args:
-        by_name: Tasks of an agent, or a mapping from them, by the agent's name.
-
-    Returns:
-        Selected names.
-    """
-    all_tasks = {task for tasks in by_name.values() for task in tasks}
-    return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
 
 
 def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
@@ -95,27 +79,22 @@ class _Ranking:
 
     @property
     def complete(self) -> "_Ranking":
-        """The names with every task."""
-        return _Ranking(select_complete(self.gains), self.below)
+        """The names with every task that any name has: only they can be the best over all."""
+        tasks = {task for gains in self.gains.values() for task in gains}
+        complete = {name: gains for name, gains in self.gains.items() if gains.keys() == tasks}
+        return _Ranking(complete, self.below)
 
     @cached_property
     def ranked(self) -> dict[str, dict[str, Estimate]]:
         """Names by fewest cheaper rivals, `below` last, with cost ratios over rivals by name."""
-        ratios = {
-            name: {
-                x: ratio
-                for x, y in self.gains.items()
-                if x != name and np.isfinite((ratio := _compute_cost_ratio(one, y)).value)
-            }
-            for name, one in self.gains.items()
-        }
+        ratios: dict[str, dict[str, Estimate]] = {}
+        for name, one in self.gains.items():
+            rivals = {x: _compute_cost_ratio(one, y) for x, y in self.gains.items() if x != name}
+            ratios[name] = {x: ratio for x, ratio in rivals.items() if np.isfinite(ratio.value)}
         losses = {name: sum(x.value > 1.0 for x in ratios[name].values()) for name in self.gains}
         gained = {name: np.mean([r.mean() for r in x.values()]) for name, x in self.gains.items()}
         order = sorted(self.gains, key=lambda x: (x in self.below, losses[x], -gained[x]))
-        return {
-            name: dict(sorted(ratios[name].items(), key=lambda rival: -rival[1].value))
-            for name in order
-        }
+        return {x: dict(sorted(ratios[x].items(), key=lambda y: -y[1].value)) for x in order}
 
     @property
     def costs(self) -> dict[str, Estimate]:
@@ -133,34 +112,29 @@ class _Ranking:
         return describe_leader(*first, "cost") if first else "nobody has a score"
 
 
-def _group_filters(by_tier: _ByTier) -> _Ranking:
+def _group_filters(standings: Sequence[Standing]) -> _Ranking:
     """Rank the estimators under the reference controller, the truth left out."""
-    return _rank(by_tier, lambda entry: (
+    return _rank(standings, lambda entry: (
         entry.estimator if entry.agent == REFERENCE_CONTROLLER and entry.estimator != TRUTH
         else ""))  # fmt: skip
 
 
-def _group_agents(by_tier: _ByTier) -> _Ranking:
+def _group_agents(standings: Sequence[Standing]) -> _Ranking:
     """Rank the agents on their default filters, the oracles left out."""
-    return _rank(by_tier, lambda entry: (
-        entry.agent if entry.agent not in ORACLE_NAMES and entry.is_default else ""))  # fmt: skip
+    return _rank(standings, lambda x: x.agent * (x.is_default and x.agent not in ORACLE_NAMES))
 
 
-def _rank(by_tier: _ByTier, name_entry: Callable[[Entry], str]) -> _Ranking:
-    """Collect what each name drove, in all tiers; "" is left out."""
-    gains, pairs = dict[str, _Gains](), dict[str, list[PairedDrives]]()
-    for standing in (item for standings in by_tier.values() for item in standings):
-        name = name_entry(standing.entry).replace(", ", " with ")  # in a list of names
-        if name and standing.pairs:
-            gains.setdefault(name, {}).update(standing.scores)
-            pairs.setdefault(name, []).extend(standing.pairs.values())
-    return _Ranking(gains, [name for name, item in pairs.items() if check_losses(item)])
+def _rank(standings: Sequence[Standing], name_entry: Callable[[Entry], str]) -> _Ranking:
+    """Collect what each name drove; "" is left out."""
+    driven = {name_entry(x.entry).replace(", ", " with "): x for x in standings if x.pairs}
+    driven.pop("", None)
+    below = [name for name, x in driven.items() if x.loses_more]
+    return _Ranking({name: x.scores for name, x in driven.items()}, below)
 
 
 def _describe_resolution(matrix: Matrix) -> str:
     """Describe where nominal and oracle-state lie too close, if that is in half of the tasks."""
-    state = next((item for item in matrix.overall if item.entry == Entry(STATE)), None)
-    pairs = state.pairs if state else {}
+    pairs = next((x.pairs for x in matrix.overall if x.entry == Entry(STATE)), {})
     close = 0
     for task, pair in pairs.items():
         slip, yaw = compute_gaps(pair, task)
@@ -168,48 +142,36 @@ def _describe_resolution(matrix: Matrix) -> str:
         close += not (slip > 0.2 or yaw > 1.0 or lost > 0.1)  # deg, deg/s, of the cars
     if 2 * close <= len(pairs):
         return ""
-    return (
-        f"In {close} of {len(pairs)} tasks knowing everything saves less than 0.2 deg, 1 deg/s "
-        "and 10 % of the cars. "
-    )
+    saved = f"In {close} of {len(pairs)} tasks knowing everything saves less than"
+    return f"{saved} 0.2 deg, 1 deg/s and 10 % of the cars. "
 
 
-def _describe_exceptions(by_tier: _ByTier) -> str:
+def _describe_exceptions(matrix: Matrix) -> str:
     """Describe the tiers in which another name surely leads, and agents of fewer tasks."""
     parts = []
-    for tier, standings in by_tier.items():
+    for tier, standings in matrix.by_tier.items():
         for group in (_group_filters, lambda x: _group_agents(x).complete):
-            overall, in_tier = (group(x).ranked for x in (by_tier, {tier: standings}))
+            overall, in_tier = (group(x).ranked for x in (matrix.overall, standings))
             first, best = next(iter(overall), ""), next(iter(in_tier), "")
             rivals = in_tier.get(best, {})
             if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
-    agents = _group_agents(by_tier)
-    if overall_best := agents.find_best():
-        partial = agents.gains.keys() - agents.complete.gains.keys()
-        best_gains = agents.gains[overall_best]
-        ratios = {name: _compute_cost_ratio(agents.gains[name], best_gains) for name in partial}
-        cheaper = (name for name in ratios if ratios[name].high < 1.0)
-        ordered = sorted(cheaper, key=lambda label: ratios[label].value)
-        parts += [f"{name} on its own manoeuvres" for name in ordered]
+    agents = _group_agents(matrix.overall)
+    best_gains = agents.gains.get(agents.find_best(), {})
+    partial = {x: y for x, y in agents.gains.items() if x not in agents.complete.gains}
+    ratios = {name: _compute_cost_ratio(gains, best_gains) for name, gains in partial.items()}
+    cheaper = sorted((ratio.value, name) for name, ratio in ratios.items() if ratio.high < 1.0)
+    parts += [f"{name} on its own manoeuvres" for _, name in cheaper]
     return f"It costs less with {summarise_names(parts)}. " if parts else ""
 
 
 def _describe_reasons(matrix: Matrix) -> str:
     """Describe what the oracles save by their knowledge, and the cost of delay."""
-    by_name: dict[str, _Gains] = {}
-    for standing in (item for standings in matrix.by_tier.values() for item in standings):
-        if standing.entry.is_oracle:
-            by_name.setdefault(standing.entry.agent, {}).update(standing.scores)
-    parameters, state = (by_name.get(name, {}) for name in (PARAMETERS, STATE))
-    steps = (
-        ("the true car and road", list(parameters.values())),
-        ("its exact motion", [subtract(state[x], r) for x, r in parameters.items() if x in state]),
-        ("what is ahead", list(matrix.foresight.values())),
-    )
+    meanings = ("the true car and road", "its exact motion", "what is ahead")
+    gained = list_knowledge(matrix.overall, list(matrix.foresight.values()))
     texts = [
         f"{what} saves {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
-        for what, logs in steps
+        for what, logs in zip(meanings, gained.values(), strict=True)
         if logs
     ]
     costs = matrix.delay_costs.items()
@@ -217,7 +179,7 @@ def _describe_reasons(matrix: Matrix) -> str:
     if late and np.isfinite(late[-1].value):
         grown = 100.0 * (late[-1].value / late[0].value - 1.0)
         delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
-    return f"Knowing {', then '.join(texts)} of the cost{delay}." if parameters else ""
+    return f"Knowing {', then '.join(texts)} of the cost{delay}." if gained["model"] else ""
 
 
 _PANELS = (
@@ -244,13 +206,11 @@ def add_figures(suite: Suite, matrix: Matrix, draw: ModuleType) -> None:
         draw: `report.figures`.
     """
     by_tier = matrix.by_tier
+    filters = _group_costs(by_tier, lambda x: x.estimator * (x.agent == REFERENCE_CONTROLLER))
     questions = (
-        ("Which controller holds the car?", {"All tasks": _group_agents(by_tier).costs}),
+        ("Which controller holds the car?", {"All tasks": _group_agents(matrix.overall).costs}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _name_agent)),
-        (
-            "Which estimator does a controller drive best with?",
-            _group_costs(by_tier, lambda x: x.estimator if x.agent == REFERENCE_CONTROLLER else ""),
-        ),
+        ("Which estimator does a controller drive best with?", filters),
         ("What would knowing more save?", _group_oracles(matrix)),
     )
     suite.answers += [
@@ -275,11 +235,8 @@ def _group_costs(by_tier: _ByTier, name: Callable[[Entry], str]) -> dict[str, di
     """Group costs over nominal's (%) by tier and name(entry), "" left out; the best is first."""
     groups = {}
     for tier, standings in by_tier.items():
-        costs = {
-            name(item.entry): _compute_cost(item.scores)
-            for item in standings
-            if name(item.entry) and item.scores
-        }
+        named = [(name(item.entry), item.scores) for item in standings if item.scores]
+        costs = {label: _compute_cost(scores) for label, scores in named if label}
         title = f"Tier {tier}: {TITLES[tier]}"
         groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
     return {title: costs for title, costs in groups.items() if costs}
@@ -292,15 +249,13 @@ def _name_agent(entry: Entry) -> str:
 
 def _group_oracles(matrix: Matrix) -> dict[str, dict[str, Estimate]]:
     """Group the oracles' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
-    by_tier, names = matrix.by_tier, ORACLE_NAMES
-    groups = _group_costs(by_tier, lambda x: x.agent if x.agent in names else "")
-    for tier in by_tier:
-        title = f"Tier {tier}: {TITLES[tier]}"
+    groups = _group_costs(matrix.by_tier, lambda x: x.agent * (x.agent in ORACLE_NAMES))
+    for tier in matrix.by_tier:
+        shown = groups.get(f"Tier {tier}: {TITLES[tier]}", {})
         logs = [value for task, value in matrix.foresight.items() if task.tier == tier]
-        if logs and "oracle-state" in groups.get(title, {}):
-            state = groups[title]["oracle-state"].value
+        if logs and STATE in shown:
             ratio = geometric_mean(*(-value for value in logs))
-            groups[title]["clairvoyant"] = ratio.rescale(state)
+            shown["clairvoyant"] = ratio.rescale(shown[STATE].value)
     return groups
 
 
@@ -309,15 +264,13 @@ def _draw_maps(
 ) -> list[tuple[str, "Figure", str]]:
     names = [standing.label for standing in standings]
     tasks = list(dict.fromkeys(c for standing in standings for c in standing.results))
-    figures = []
+    metrics = [[standing.by_task.get(task, {}) for task in tasks] for standing in standings]
+    figures, absent = [], Estimate(math.nan)
     for metric, good, text in (
         ("score", "high", "The mean r: 0 as nominal."),
         ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
     ):
-        values = np.full((len(standings), len(tasks)), np.nan)
-        for (i, standing), (j, task) in product(enumerate(standings), enumerate(tasks)):
-            if metric in standing.by_task.get(task, {}):
-                values[i, j] = standing.by_task[task][metric].value
+        values = np.array([[cell.get(metric, absent).value for cell in row] for row in metrics])
         if np.isfinite(values).any():
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every task"
             columns = [task.name for task in tasks]
@@ -331,12 +284,9 @@ def _draw_maps(
 
 def _compute_places(standings: Sequence[Standing], loss: float, floor_factor: float) -> Array:
     """Compute the places of entries by a score of other constants, 1 for the best, NaN for none."""
-    scores = [standing.compute_score(loss, floor_factor) for standing in standings]
-    keys = [
-        (standing.rank[0], math.inf if math.isnan(score) else -score)
-        for standing, score in zip(standings, scores, strict=True)
-    ]
-    order = sorted(range(len(keys)), key=keys.__getitem__)
+    scores = np.array([standing.compute_score(loss, floor_factor) for standing in standings])
+    below = [standing.rank[0] for standing in standings]
+    order = np.lexsort((np.nan_to_num(-scores, nan=np.inf), below))
     return np.where(np.isnan(scores), np.nan, np.argsort(order) + 1.0)
 
 
@@ -349,7 +299,7 @@ def make_tracks(matrix: Matrix) -> list[tuple[str, str, str]]:
     Returns:
         Name, media type and text of each file.
     """
-    series, best = matrix.series, _group_agents(matrix.by_tier).find_best()
+    series, best = matrix.series, _group_agents(matrix.overall).find_best()
     tasks = list(dict.fromkeys(task for task, _ in series))
     files = []
     for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
@@ -366,7 +316,7 @@ def make_tracks(matrix: Matrix) -> list[tuple[str, str, str]]:
 
 def _make_explorer(matrix: Matrix) -> Explorer:
     """Make the view of every entry's first test seed, at first no control and the best."""
-    series, best = matrix.series, _group_agents(matrix.by_tier).find_best()
+    series, best = matrix.series, _group_agents(matrix.overall).find_best()
     keyed: dict[tuple[str, ...], Array] = {}
     bodies: dict[tuple[str, ...], tuple[float, float]] = {}
     for (task, entry), values in series.items():
@@ -374,8 +324,8 @@ def _make_explorer(matrix: Matrix) -> Explorer:
         keyed[task.tier, task.name, entry.label] = values
         bodies[task.tier, task.name] = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
     labels = (entry.label for _, entry in series if entry.agent == best and entry.is_default)
-    menus = ("tier", "task")
-    return make_time_explorer("Any two side by side", menus, keyed, next(labels, ""), bodies)
+    shown = keyed, next(labels, ""), bodies
+    return make_time_explorer("Any two side by side", ("tier", "task"), *shown)
 
 
 def make_time_explorer(

@@ -14,29 +14,18 @@ from rich.console import Console
 
 from ...envs.scenarios.world import GROUPS, World, make_world
 from ..harness.stats import Estimate, average
-from .entries import JOINT, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
+from .entries import ADAPTIVE, JOINT, ORACLE_NAMES, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
 from .run import Results, measure
 from .score import rank_entries
-from .tasks import (
-    NOMINAL,
-    PARAMETERS,
-    QUICK_LEAD_IN,
-    STATE,
-    WORLD,
-    list_scored_tasks,
-    make_salt,
-    make_task_seeds,
-)
+from .tasks import QUICK_LEAD_IN, WORLD, list_scored_tasks, make_salt, make_task_seeds
 
 _FILTERS = ("exact-kf, gps", "exact-kf, camera", "bicycle-kf", "dakf")
 ENTRIES = (
-    *map(Entry, (NOMINAL, PARAMETERS, STATE, "none")),
+    *map(Entry, (*ORACLE_NAMES, "none")),
     *(Entry(name, REFERENCE_FILTER) for name in ("esc", "two-dof")),
-    Entry("adaptive-lqr", JOINT),
-    Entry("adaptive-nmpc", JOINT),
+    *(Entry(name, JOINT) for name in ADAPTIVE),
     *(Entry(REFERENCE_CONTROLLER, name) for name in _FILTERS),
-)
-"""The entries whose order is checked."""
+)  # the entries whose order is checked
 FACTORS = (0.0, 2.0)  # of a group's ranges about the ideal
 EPISODES, TASKS = 16, 12
 

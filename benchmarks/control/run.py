@@ -1,7 +1,6 @@
 """Episodes of the control benchmark: driven, reduced to metrics, timed, kept as finished cases.
 
-A chunk drives all its seeds at once in a vector env. A folder keeps finished chunks, by a hash of
-everything that their numbers depend on.
+A chunk drives all its seeds at once in a vector env; a folder keeps finished ones by their hash.
 """
 
 import hashlib
@@ -192,13 +191,11 @@ class _TimedFunction:
 def measure_decision_time(case: ControlCase) -> float:
     """Measure the wall time of a decision of one car: predict, and the estimator's part.
 
-    Medians over _STEPS steps of an episode, the bare env stepped side by side.
-
     Args:
         case: Task and who drives it.
 
     Returns:
-        Wall time (us).
+        Wall time (us), of medians over _STEPS steps, the bare env stepped side by side.
     """
     env, agent = case.entry.make(case.task, 1)
     bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)
@@ -212,13 +209,10 @@ def measure_decision_time(case: ControlCase) -> float:
     return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))
 
 
-CHUNK = 64
-"""Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
-_LENGTH = 24  # hexadecimal digits of a finished case's file name
+CHUNK = 64  # episodes of a finished case at most: a longer run takes up the cases of a shorter one
 
 
-Results = dict[tuple[ControlTask, Entry], DriveResult]
-"""Episodes by task and entry."""
+Results = dict[tuple[ControlTask, Entry], DriveResult]  # episodes by task and entry
 
 
 def measure(
@@ -311,13 +305,12 @@ def _hash_chunk(chunk: Chunk) -> str:
     """Hash a chunk, a policy's weights, and all sources that its numbers depend on."""
     weights, driver = hash_policy(chunk.entry.agent), chunk.case.driver
     key = json.dumps([hash_sources(), weights, driver, asdict(chunk)], sort_keys=True)
-    return hashlib.sha256(key.encode()).hexdigest()[:_LENGTH]
+    return hashlib.sha256(key.encode()).hexdigest()[:24]
 
 
 def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array]) -> DriveResult:
     """Make a chunk's result; ValueError for numbers that are not finite or another's."""
-    shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
-    shapes["seconds"] = ()
+    shapes = {"numbers": (len(chunk.seeds), len(NUMBERS)), "seconds": ()}
     if chunk.keep:
         shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
     for name, shape in shapes.items():

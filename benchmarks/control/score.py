@@ -1,9 +1,8 @@
 """From episode costs to scores, each drive paired with nominal's on the same seed.
 
-r = log((J_nominal + J_0) / (J + J_0)) where both finish; a drive that the entry alone loses counts
--2, one that nominal alone loses 2, one that both lose 0. J_0 is `ControlTask.cost_floor`. The score
-is the mean r; entries that surely lose more cars than nominal stand below all others. Standings
-become rows here.
+r = log((J_nominal + J_0) / (J + J_0)) where both finish, J_0 as `ControlTask.cost_floor`; a drive
+that the entry alone loses counts -2, one that nominal alone loses 2, one that both lose 0. The mean
+r is the score; entries that surely lose more cars than nominal stand below all others.
 """
 
 import math
@@ -16,18 +15,10 @@ import numpy.typing as npt
 
 from ...agents.rollout import compute_cost_ratios
 from ...envs.record import Array
+from ..harness import stats
 from ..harness.metrics import EPISODE
 from ..harness.results import Suite
-from ..harness.stats import (
-    Estimate,
-    average,
-    compute_tail_mean,
-    compute_win_rate,
-    geometric_mean,
-    interval,
-    is_share_larger,
-    share,
-)
+from ..harness.stats import Estimate
 from .entries import ControlCase, Entry
 from .run import DriveResult, Results
 from .tasks import NOMINAL, ControlTask
@@ -39,8 +30,7 @@ CONSTANTS = {
     "a loss: 3": (3.0, 1.0),
     "half of J_0": (LOSS, 0.5),
     "twice J_0": (LOSS, 2.0),
-}
-"""Other constants of the score: r of a loss, and the factor on J_0."""
+}  # other constants of the score: r of a loss, and the factor on J_0
 _CLIP = 3.0
 FAILURE_RATIO = 20.0  # times nominal's cost, of a failure in `compute_log_ratios`
 _RATES = {"spin": "spin_rate", "off-road": "departure_rate", "not-finite": "not_finite_rate"}
@@ -65,17 +55,11 @@ def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
 
 @dataclass(frozen=True)
 class PairedDrives:
-    """Drives of an entry and of nominal on the same seeds of a task.
-
-    Attributes:
-        nominal: Drives of nominal.
-        result: Drives of the entry; of both the first n count, as many as either has.
-        floor: Cost J_0 of the task.
-    """
+    """Drives of an entry and of nominal on the same seeds of a task."""
 
     nominal: DriveResult
-    result: DriveResult
-    floor: float
+    result: DriveResult  # of the entry; of both the first n count, as many as either has
+    floor: float  # cost J_0 of the task
 
     @cached_property
     def n(self) -> int:
@@ -135,11 +119,8 @@ class Standing:
     @cached_property
     def pairs(self) -> dict[ControlTask, PairedDrives]:
         """Drives beside nominal's, where there are any."""
-        return {
-            task: PairedDrives(self.nominal[task], result, task.cost_floor)
-            for task, result in self.drives.items()
-            if task in self.nominal
-        }
+        both = {task: x for task, x in self.drives.items() if task in self.nominal}
+        return {t: PairedDrives(self.nominal[t], x, t.cost_floor) for t, x in both.items()}
 
     @cached_property
     def scores(self) -> dict[ControlTask, Array]:
@@ -169,12 +150,12 @@ class Standing:
         """Metrics over all tasks; failures of all episodes, NaN where none was driven."""
         all_failed = [~result.survived for result in self.drives.values()]
         failed = np.concatenate(all_failed) if all_failed else np.empty(0)
-        return {"failure_rate": share(failed)} | _measure_pairs(list(self.pairs.values()))
+        return {"failure_rate": stats.share(failed)} | _measure_pairs([*self.pairs.values()])
 
     @cached_property
     def loses_more(self) -> bool:
         """Whether it surely loses more cars than nominal, over all its tasks."""
-        return check_losses(list(self.pairs.values()))
+        return _check_losses(list(self.pairs.values()))
 
     @property
     def is_partial(self) -> bool:
@@ -186,11 +167,6 @@ class Standing:
         """Key of the order: smaller is better; what has no number comes last."""
         value = self.overall.get("score", Estimate(math.nan)).value
         return self.loses_more or self.is_partial, float(np.nan_to_num(-value, nan=np.inf))
-
-    @property
-    def control_period(self) -> float:
-        """Time between two decisions (s)."""
-        return next(iter(self.results)).control_period
 
     @property
     def n(self) -> int:
@@ -214,14 +190,14 @@ class Standing:
 
     def _measure_task(self, task: ControlTask) -> dict[str, Estimate]:
         result = self.drives[task]
-        metrics = {"failure_rate": share(~result.survived)}
+        metrics = {"failure_rate": stats.share(~result.survived)}
         if task in self.pairs:
             metrics |= _measure_pairs([self.pairs[task]])
         for metric in EPISODE:
             if metric.name != "failure":
-                metrics[metric.name] = interval(result[metric.name])
+                metrics[metric.name] = stats.interval(result[metric.name])
         for failure, name in _RATES.items():
-            metrics[name] = share(result.mark_failures(failure))
+            metrics[name] = stats.share(result.mark_failures(failure))
         return metrics
 
     def add_rows(self, suite: Suite, salt: str) -> None:
@@ -241,32 +217,26 @@ class Standing:
         suite.add_rows([{"us_per_decision": self.us}], **labels)
 
 
-def check_losses(pairs: Sequence[PairedDrives]) -> bool:
-    """Check whether an entry surely loses more cars than nominal, paired.
-
-    Args:
-        pairs: Drives of its tasks.
-
-    Returns:
-        Whether it stands below the line.
-    """
+def _check_losses(pairs: Sequence[PairedDrives]) -> bool:
+    """Check whether an entry surely loses more cars than nominal, paired."""
     if not pairs:
         return False
     finished = np.concatenate([pair.finished for pair in pairs], axis=1)
-    return is_share_larger(*~finished)
+    return stats.is_share_larger(*~finished)
 
 
 def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
     """Score, and costs of the drives that both finish, over tasks of equal weight."""
     if not pairs:
         return {}
-    metrics = {"score": average(*(pair.compute_scores() for pair in pairs))}
+    metrics = {"score": stats.average(*(pair.compute_scores() for pair in pairs))}
     costs = [pair.costs[:, pair.both] for pair in pairs if pair.both.any()]
     if costs:
         logs = [np.log(compute_cost_ratios(*both)) for both in costs]
-        metrics["cost_vs_nominal"] = geometric_mean(*logs)
-        metrics["share_won"] = compute_win_rate(*np.concatenate(costs, axis=1))
-    metrics["worst_cost"] = compute_tail_mean(np.concatenate([pair.costs[0] for pair in pairs]))
+        metrics["cost_vs_nominal"] = stats.geometric_mean(*logs)
+        metrics["share_won"] = stats.compute_win_rate(*np.concatenate(costs, axis=1))
+    all_costs = np.concatenate([pair.costs[0] for pair in pairs])
+    return metrics | {"worst_cost": stats.compute_tail_mean(all_costs)}
     return metrics
 
 

@@ -12,14 +12,7 @@ from ..harness.results import Suite
 from ..report.study import Request, Study
 from .baseline_gaps import DELAY_TASK, DELAYS, measure_delay_cost
 from .calibration import measure_regrets, read_current
-from .entries import (
-    EPISODES,
-    QUICK_EPISODES,
-    ControlCase,
-    Entry,
-    make_cases,
-    select_quick_tasks,
-)
+from .entries import EPISODES, QUICK_EPISODES, ControlCase, Entry, make_cases, select_quick_tasks
 from .report import add_figures, compose_verdict, make_tracks
 from .run import measure, measure_decision_time
 from .score import rank_entries
@@ -60,12 +53,13 @@ def _add_tables(suite: Suite, matrix: Matrix) -> None:
     """Add rows, tables and tracks; a row of the cost of delay has the delay in its scenario."""
     for standing in (item for standings in matrix.by_tier.values() for item in standings):
         standing.add_rows(suite, matrix.salt)
+    n = max((len(drive.costs) for drive in matrix.results.values()), default=0)
     for entry, costs in matrix.delay_costs.items():
         labels = {"estimator": entry.estimator, "controller": entry.agent, "salt": matrix.salt}
         for delay, ratio in zip(DELAYS, costs, strict=True):
             where = f"{DELAY_TASK.name}, sensors {1e3 * delay:.0f} ms late"
             line: dict[str, Any] = {"cost_vs_nominal": ratio, "scenario": where}
-            suite.add_rows([line], DELAY_TASK.env_id, n=matrix.episodes, **labels)
+            suite.add_rows([line], DELAY_TASK.env_id, n=n, **labels)
     suite.tables = make_tables(matrix)
     suite.files = make_tracks(matrix)
     suite.text += f" Driven in {matrix.seconds / 60.0:.1f} CPU-minutes."

@@ -8,13 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ...agents.learned.policy import is_policy, load_policy
 from ...envs.record import Array
 from ...envs.task import FAILURES
 from ..harness.metrics import EPISODE
 from ..harness.results import Column, Line, ResultTable
 from ..harness.stats import Estimate, average, compute_p_value, holm
-from .entries import LEARNED, ORACLE_NAMES, Entry
+from .entries import ORACLE_NAMES, Entry
 from .run import Results
 from .score import PairedDrives, Standing, rank_entries
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask, find_oracle
@@ -40,11 +39,6 @@ class Matrix:
     def tasks(self) -> list[ControlTask]:
         """Tasks that were driven."""
         return list(dict.fromkeys(task for task, _ in self.results))
-
-    @property
-    def episodes(self) -> int:
-        """Episodes of a task, of slow entries at most."""
-        return max((len(drive.costs) for drive in self.results.values()), default=0)
 
     @cached_property
     def series(self) -> dict[tuple[ControlTask, Entry], Array]:
@@ -125,45 +119,30 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
     main, detail = [], []
     for tier, ranked in matrix.by_tier.items():
         title = f"Tier {tier}: {TITLES[tier]}"
-        trainings = _describe_policies() if tier == "1" else []
-        main.append(_make_main_table(title, ranked, *trainings))
+        main.append(_make_main_table(title, ranked))
         tasks = [task for task in matrix.tasks if task.tier == tier]
         detail.append(make_task_table(f"{title}, task by task", ranked, tasks))
         detail.append(_make_motion_table(f"{title}: the motion", ranked))
     runs = ((0.0, matrix.results), *matrix.late)
     failures = [line for delay, results in runs for line in list_failures(results, delay)]
     header = ("tier", "task", "controller and estimator", "what happened")
-    note = (
-        "The share of a cell's episodes; the rest of a failed one is charged at the highest cost."
-    )
-    wrong = ResultTable("Cells that went wrong", header, failures, note, keyed=False)
+    note = "The share of a cell's episodes; the rest of a failed one is charged at the highest "
+    wrong = ResultTable("Cells that went wrong", header, failures, note + "cost.", keyed=False)
     baselines = [_make_knowledge_table(matrix), _make_oracle_table(matrix)]
     return [*main, *baselines, *detail, *([wrong] if failures else [])]
 
 
-def _make_main_table(title: str, ranked: Sequence[Standing], *notes: str) -> ResultTable:
+def _make_main_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
     """Make the table of the entries, the best first."""
     lines: list[Line] = [
-        {"label": standing.label, "n": standing.n, "us": standing.us}
-        | {"tasks": (len(standing.pairs), len(standing.results))}
-        | standing.overall
-        for standing in ranked
+        {"label": x.label, "n": x.n, "us": x.us, **x.overall}
+        | {"tasks": (len(x.pairs), len(x.results))}
+        for x in ranked
     ]
     if below := sum(standing.loses_more for standing in ranked):
         lines.insert(len(lines) - below, {"label": _LINE})
-    note = " ".join([_MAIN_NOTE, *_describe_findings(ranked), *notes])
+    note = " ".join([_MAIN_NOTE, *_describe_findings(ranked)])
     return ResultTable(title, _MAIN, lines, note)
-
-
-def _describe_policies() -> list[str]:
-    """The training of the policies in the table."""
-    names = [entry.agent for entries in LEARNED.values() for entry in entries]
-    cards = {name: load_policy(name).card for name in names if is_policy(name)}
-    return [
-        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.world_id} in "
-        f"{card.cpu_seconds:.0f} CPU-s, for the reference {card.reference}."
-        for name, card in cards.items()
-    ]
 
 
 def make_task_table(
@@ -202,28 +181,21 @@ def _make_cell(standing: Standing, task: ControlTask) -> tuple[float, float] | s
 
 
 def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
-    """Make the table of the motion, means over all tasks."""
     lines = [
-        {"label": standing.label, "part": 1e-4 * standing.us / standing.control_period}
-        | {metric.name: standing.mean(metric.name) for metric in _SHOWN}
-        for standing in ranked
+        {"label": x.label, "part": 1e-4 * x.us / next(iter(x.results)).control_period}
+        | {metric.name: x.mean(metric.name) for metric in _SHOWN}
+        for x in ranked
     ]
     return ResultTable(title, _MOTION, lines, _MOTION_NOTE, detail=True)
 
 
 def _describe_findings(standings: Sequence[Standing]) -> list[str]:
     """Describe the entries whose score is above oracle-state's over their tier, Holm-corrected."""
-    oracle = next((item for item in standings if item.entry == Entry(STATE)), None)
-    if oracle is None:
-        return []
-    others = [
-        item
-        for item in standings
-        if item.entry.agent not in ORACLE_NAMES and item.scores.keys() & oracle.scores.keys()
-    ]
-    best = oracle.scores
+    best = next((item.scores for item in standings if item.entry == Entry(STATE)), {})
+    rivals = [item for item in standings if item.entry.agent not in ORACLE_NAMES]
+    others = [item for item in rivals if item.scores.keys() & best.keys()]
     excess = [  # below 0 where the entry is better
-        np.concatenate([subtract(best[task], r) for task, r in x.scores.items() if task in best])
+        np.concatenate([_subtract(best[task], r) for task, r in x.scores.items() if task in best])
         for x in others
     ]
     sentences = [
@@ -234,16 +206,8 @@ def _describe_findings(standings: Sequence[Standing]) -> list[str]:
     return _select_cheaper(sentences, excess)
 
 
-def subtract(values: Array, others: Array) -> Array:
-    """Subtract numbers of the seeds that both have.
-
-    Args:
-        values: Numbers, shape (n,).
-        others: Numbers that are subtracted, shape (m,).
-
-    Returns:
-        Differences, shape (min(n, m),).
-    """
+def _subtract(values: Array, others: Array) -> Array:
+    """Subtract numbers of the seeds that both have, shape (min(n, m),)."""
     n = min(len(values), len(others))
     return values[:n] - others[:n]
 
@@ -272,9 +236,8 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
 
 
 def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
-    none, nominal, parameters, state = (
-        matrix.results[task, Entry(name)] for name in ("none", NOMINAL, PARAMETERS, STATE)
-    )
+    names = ("none", NOMINAL, PARAMETERS, STATE)
+    none, nominal, parameters, state = (matrix.results[task, Entry(name)] for name in names)
     errors = [drive.error for drive in (none, nominal, state) if drive.error]
     if errors:
         return {"task": task.name, "falls": "; ".join(errors)}
@@ -306,14 +269,12 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
         task: Their task.
 
     Returns:
-        Gap of the slip angle (deg) and of the yaw rate (deg/s), NaN where it is not judged, or no
-        drive is finished by both.
+        Gap of slip (deg) and yaw rate (deg/s), NaN where not judged, or both finish no drive.
     """
     gaps = []
     for name in ("rms_slip_error", "rms_yaw_error"):
-        errors, nominal = (
-            drive[name][: pair.n][pair.both] for drive in (pair.result, pair.nominal)
-        )
+        drives = (pair.result, pair.nominal)
+        errors, nominal = (drive[name][: pair.n][pair.both] for drive in drives)
         is_judged = len(errors) and not (name == "rms_yaw_error" and task.reference == "zero-slip")
         gaps.append(float(np.degrees(np.median(nominal - errors))) if is_judged else math.nan)
     return gaps[0], gaps[1]
@@ -323,23 +284,36 @@ def _describe_order(scores: Sequence[Array], foresight: Array | None) -> str:
     """Describe whether a baseline surely scores less than the one before it, which knows less."""
     if foresight is not None and foresight.mean() <= 0.0:
         return "clairvoyant does not"
-    rises = [average(subtract(more, less)) for less, more in itertools.pairwise(scores)]
+    rises = [average(_subtract(more, less)) for less, more in itertools.pairwise(scores)]
     if any(rise.high < 0.0 for rise in rises):
         return "no"
     return "yes" if average(scores[-1]).low > 0.0 else "not surely"
+
+
+def list_knowledge(
+    standings: Sequence[Standing], foresight: Sequence[Array]
+) -> dict[str, list[Array]]:
+    """List r gained by knowing the car, then its state, then what is ahead, of each task's drives.
+
+    Args:
+        standings: Standings with the oracles.
+        foresight: Log of oracle-state's cost over the clairvoyant's, shape (n,) each.
+
+    Returns:
+        Numbers by what is known, empty without an oracle.
+    """
+    by_name = {x.entry.agent: x.scores for x in standings if x.entry.is_oracle}
+    parameters, state = (by_name.get(name, {}) for name in (PARAMETERS, STATE))
+    sensing = [_subtract(state[x], r) for x, r in parameters.items() if x in state]
+    return {"model": [*parameters.values()], "sensing": sensing, "foresight": [*foresight]}
 
 
 def _make_knowledge_table(matrix: Matrix) -> ResultTable:
     """Make the table of what not knowing costs in each tier: differences of neighbours' scores."""
     lines = []
     for tier, ranked in matrix.by_tier.items():
-        by_name = {x.entry.agent: x.scores for x in ranked if not x.entry.estimator}
-        parameters, state = (by_name.get(name, {}) for name in (PARAMETERS, STATE))
-        steps = {
-            "model": list(parameters.values()),
-            "sensing": [subtract(state[x], r) for x, r in parameters.items() if x in state],
-            "foresight": [x for task, x in matrix.foresight.items() if task.tier == tier],
-        }
+        foresight = [x for task, x in matrix.foresight.items() if task.tier == tier]
+        steps = list_knowledge(ranked, foresight)
         saved = {name: average(*logs) for name, logs in steps.items() if logs}
         lines.append({"tier": f"{tier}: {TITLES[tier]}"} | saved)
     note = (

@@ -1,8 +1,7 @@
 """Tasks of the control benchmark: a manoeuvre with its car, actuators and reference.
 
-Those of a tier are chosen once, on tuning seeds, by what they demand of a car without control
-(`baseline_gaps.py`); `contests.json` holds them with the measured demand. Test seeds follow a salt,
-a hash of the entries' sources and the world's version, so that nobody can have tuned on them.
+`contests.json` holds those that demand enough of a car without control (`baseline_gaps.py`). Test
+seeds follow a salt, a hash of the entries' sources and the world: nobody can have tuned on them.
 """
 
 import hashlib
@@ -38,8 +37,7 @@ TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "small car": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
     "road": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
     "limit": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
-}
-"""The (env id, vehicle, reference) with which a tier's scenarios are driven."""
+}  # the (env id, vehicle, reference) with which a tier's scenarios are driven
 TITLES = {
     "small car": "the COMS at 18 to 28 km/h",
     "road": "the passenger car at 60 to 90 km/h, friction unknown",
@@ -134,25 +132,19 @@ class TaskRecord:
 
 @dataclass(frozen=True)
 class TaskMeasurement(TaskRecord):
-    """A candidate with what was measured on tuning seeds: an entry of the file.
-
-    oracle, knowing: The better of `ORACLES` for state and for parameters. peak_slip: Median peak of
-    the slip angle without control (deg). lost: Fraction of the cars lost without control, and
-    lost_nominal, lost_oracle. slip_gap, yaw_rate_gap: Median by which oracle-state's root mean
-    square errors are below nominal's (deg, deg/s). verdict: "scored", or why not.
-    """
+    """A candidate with what was measured on tuning seeds: an entry of the file."""
 
     world_version: int
-    oracle: str
-    knowing: str
-    peak_slip: float
-    lost: float
+    oracle: str  # better of `ORACLES` for state
+    knowing: str  # better of `ORACLES` for parameters
+    peak_slip: float  # median peak of the slip angle without control (deg)
+    lost: float  # fraction of the cars lost without control
     lost_nominal: float
     lost_oracle: float
-    slip_gap: float
-    yaw_rate_gap: float
+    slip_gap: float  # median by which oracle-state's RMS error is below nominal's (deg)
+    yaw_rate_gap: float  # the same of the yaw rate (deg/s)
     n: int
-    verdict: str
+    verdict: str  # "scored", or why not
 
 
 def list_candidates() -> list[ControlTask]:
@@ -216,7 +208,6 @@ Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]  # of all tasks, 
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _ENTRY_SOURCES = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
-_LENGTH = 16
 _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
@@ -234,24 +225,20 @@ def make_salt(*more: str) -> str:
         for path in sorted((_PACKAGE / folder).rglob("*")):
             if path.suffix in endings:
                 digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
-    for text in more:
-        digest.update(text.encode())
-    return digest.hexdigest()[:_LENGTH]
+    digest.update("".join(more).encode())
+    return digest.hexdigest()[:16]
 
 
 def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
     """Make the first test seeds of a salt, below 2^32; more seeds keep the first.
 
     Args:
-        salt: Hexadecimal digits.
+        salt: Hexadecimal digits, or ValueError.
         n: Number of seeds.
         more: Text that makes them others.
 
     Returns:
         Seeds.
-
-    Raises:
-        ValueError: The salt is not hexadecimal.
     """
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
@@ -264,8 +251,7 @@ def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
 def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
     """Make the function from a task to its first n test seeds.
 
-    They differ between tasks: a seed draws the car as well, and tasks that share their cars would
-    not be independent strata of an interval.
+    They differ: tasks that share their cars would not be independent strata of an interval.
 
     Args:
         salt: Hexadecimal digits.

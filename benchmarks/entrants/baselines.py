@@ -36,7 +36,6 @@ from ..harness.results import read_objects, write_text
 from .challenge import EPISODES
 
 FILE = Path(__file__).with_name("baselines.json")
-COMMAND = f"python -m {__name__}"
 _BASELINES = tuple(map(Entry, (NOMINAL, STATE, "none")))
 _AGENT_RIVALS = (Entry("esc", REFERENCE_FILTER),)
 _RIVAL_FILTERS = ("multirate-kf, camera and gps", TRUTH)
@@ -99,8 +98,8 @@ def find_baselines(
 ) -> tuple[str, Results] | None:
     """Find the stored episodes of baselines, if each baseline has n of them.
 
-    Returns None if a sample driven again no longer reproduces any stored cost of a baseline. The
-    sample is `_SAMPLE` episodes of each case, of slow entries the first alone.
+    None, too, if a sample driven again (`_SAMPLE` episodes of each case, of slow entries the first
+    alone) no longer reproduces any stored cost of a baseline.
 
     Args:
         wanted: Cases to look up.
@@ -113,9 +112,8 @@ def find_baselines(
     records = _read_baselines(FILE) if FILE.is_file() else {}
     matches = {case: records[case] for case in wanted if case in records}
     salts = {record.salt for record in matches.values()}
-    if len(matches) < len(wanted) or any(len(x.costs) < n for x in matches.values()):
-        return None
-    if len(salts) != 1:
+    is_short = len(matches) < len(wanted) or any(len(x.costs) < n for x in matches.values())
+    if is_short or len(salts) != 1:
         return None
     (salt,) = salts
     slow = [case for case in wanted if case.is_slow]
@@ -138,13 +136,11 @@ def _write_baselines(path: Path = FILE) -> None:
     for (task, entry), result in measure(cases, seeds, console=Console()).items():
         if result.error:
             raise ValueError(f"{task.name}, {entry.label}: {result.error}")
+        codes = result["failure"].astype(int).tolist()
+        drives = {"costs": result.costs.tolist(), "failures": codes}
         record = task.record | {"estimator": entry.estimator, "controller": entry.agent}
-        numbers = {
-            "costs": result.costs.tolist(),
-            "failures": result["failure"].astype(int).tolist(),
-        }
         version = {"salt": salt, "world_version": WORLD_VERSION}
-        lines.append(json.dumps(record | version | numbers))
+        lines.append(json.dumps(record | version | drives))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 
 

@@ -26,20 +26,11 @@ from ..control.entries import (
     Entry,
     select_quick_tasks,
 )
-from ..control.tasks import (
-    STEERING,
-    TIERS,
-    YAW,
-    ControlTask,
-    list_scored_tasks,
-    make_salted_seeds,
-)
+from ..control.tasks import STEERING, TIERS, YAW, ControlTask, list_scored_tasks, make_salted_seeds
 from .worker import LIMIT
 
 EPISODES = 64
-_IDS = tuple(
-    name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name
-)
+_IDS = [name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name]
 _COMS, _CAR = "small car", "road"  # tiers, of which a scenario without one has car and reference
 
 
@@ -107,8 +98,6 @@ def make_user_entries(
 def choose_estimator(agent: str) -> str:
     """Choose the estimator of an agent: a policy's own, none for what saw an env alone.
 
-    A controller that follows the tyres reads the filter that estimates them.
-
     Args:
         agent: Name, file's class or path.
 
@@ -124,36 +113,21 @@ def choose_estimator(agent: str) -> str:
 
 @dataclass(frozen=True)
 class ComparisonRequest:
-    """A user's entries and where they drive.
+    """A user's entries and where they drive; ValueError for what cannot be compared.
 
     A scenario's name that is scored means its tasks; another one is driven in both ids with a yaw
     moment on camera and GPS, by the COMS, or by `vehicle` with the passenger car's references.
-
-    Attributes:
-        entries: The user's entries.
-        vehicle: Vehicle as for `make_vehicle`, instead of the tasks' cars, true and nominal.
-        scenarios: Scenarios as for `make_scenario`; empty: some tasks of every tier.
-        env_id: Id whose tasks alone are driven.
-        episodes: Episodes of a task.
-        seeds: Seeds instead of salted ones.
-        fresh: Whether seeds are drawn after the user's files are hashed, and all drive anew.
-        salt: Salt of a fresh request that is repeated.
-        limit: Wall time of an entry in a task (s).
-
-    Raises:
-        ValueError: An unknown id, less than two episodes, a fresh request without files, a salt
-            beside other seeds; and what the makers above raise.
     """
 
     entries: tuple[Entry, ...]
-    vehicle: Any = None
-    scenarios: tuple[Any, ...] = ()
-    env_id: str = ""
-    episodes: int = EPISODES
-    seeds: tuple[int, ...] | None = None
-    fresh: bool = False
-    salt: str = ""
-    limit: float = LIMIT
+    vehicle: Any = None  # as for `make_vehicle`, instead of the tasks' cars, true and nominal
+    scenarios: tuple[Any, ...] = ()  # as for `make_scenario`; empty: some tasks of every tier
+    env_id: str = ""  # id whose tasks alone are driven
+    episodes: int = EPISODES  # of a task
+    seeds: tuple[int, ...] | None = None  # instead of salted ones
+    fresh: bool = False  # seeds are drawn after the user's files are hashed, and all drive anew
+    salt: str = ""  # of a fresh request that is repeated
+    limit: float = LIMIT  # wall time of an entry in a task (s)
 
     def __post_init__(self) -> None:
         for entry in self.entries:
@@ -177,12 +151,8 @@ class ComparisonRequest:
     @property
     def files(self) -> list[Path]:
         """The user's files without repetition."""
-        texts = [
-            getattr(entry, part)
-            for entry in self.entries
-            for part in ("agent", "estimator")
-            if part not in entry.objects
-        ]
+        parts = [(entry, part) for entry in self.entries for part in ("agent", "estimator")]
+        texts = [getattr(entry, part) for entry, part in parts if part not in entry.objects]
         paths = [find_class(text)[0] if is_user_file(text) else Path(text) for text in texts]
         return list(dict.fromkeys(path for path in paths if path.is_file()))
 
@@ -210,10 +180,8 @@ class ComparisonRequest:
                 varied = changes | {"scenario": scenario.to_dict()}
             for task in self._select_tasks(variants, varied):
                 if tasks.setdefault(task, task).changes != varied:
-                    name = task.scenario
-                    raise ValueError(
-                        f"two scenarios are called {name!r}: give each a name of its own"
-                    )
+                    name = f"{task.scenario!r}: give each a name of its own"
+                    raise ValueError(f"two scenarios are called {name}")
         return list(tasks)
 
     def _select_tasks(

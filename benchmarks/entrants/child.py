@@ -1,7 +1,6 @@
 """The process of a user's entry: it gets observations or records, returns actions or estimates.
 
-The env, its seeds and the results stay with the driver. Requests come pickled; the answers are
-bytes of which nothing is unpickled.
+The env, its seeds and the results stay with the driver; nothing of an answer is unpickled.
 """
 
 import ctypes
@@ -64,7 +63,7 @@ class _EntryServer:
         env: Any = view
         agent = make_agent(source, env, **options)
         self._shape = view.num_envs, view.facts.width
-        self._agent = check_agent(agent, *self._shape)
+        self._agent = check_agent(agent, self._shape)
         return b""
 
     def predict(self, observation: Array, start: Array) -> bytes:
@@ -180,8 +179,7 @@ def _apply_landlock(libc: ctypes.CDLL, rights: Mapping[Path, int]) -> None:
         return
     known = _WRITES & ~_NEWER.get(version, 0)
     scoped = _SIGNALS if version >= 6 else 0
-    size = 24 if scoped else 8
-    attributes = (ctypes.c_uint64 * 3)(known, 0, scoped)
+    attributes, size = (ctypes.c_uint64 * 3)(known, 0, scoped), 24 if scoped else 8
     ruleset = libc.syscall(_CREATE, ctypes.byref(attributes), ctypes.c_size_t(size), 0)
     for path, right in rights.items():
         descriptor = os.open(path, os.O_PATH)

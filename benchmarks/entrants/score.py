@@ -1,7 +1,6 @@
 """The open benchmark: a user's entries and the package's on the same episodes, and their scores.
 
-`sideslip.score` gives an entry's score as a Python object; `run` makes the suite with verdict,
-tables and rows.
+`sideslip.score` gives an entry's score as a Python object; `run` makes the suite.
 """
 
 import hashlib
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 from ...envs.numerics import require_extra
 from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
@@ -23,10 +21,10 @@ from ..control.run import Chunk, Results, measure
 from ..control.score import Standing, rank_entries
 from ..control.tables import list_failures, make_task_table
 from ..control.tasks import NOMINAL, make_salt, make_task_seeds, make_tuning_seeds
-from ..harness.parallel import run_cases
 from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, average
 from ..harness.verdict import format_percent
+from ..report.study import Request
 from .baselines import find_baselines, make_baseline_cases
 from .challenge import EPISODES, ComparisonRequest, choose_estimator, make_user_entry
 from .worker import LIMIT, IsolatedDrive, run_user_chunk
@@ -43,8 +41,7 @@ _TABLE = (
     Column("n", "episodes"),
 )
 _NONE = Estimate(math.nan)
-_COLUMNS = {"score": "score", "cost": "cost_vs_nominal"}
-_COLUMNS |= {"won": "share_won", "failures": "failure_rate"}
+_COLUMNS = dict(score="score", cost="cost_vs_nominal", won="share_won", failures="failure_rate")
 _REHEARSED = 2  # episodes of a task in which entries show what they open
 
 
@@ -63,15 +60,11 @@ class Comparison:
         return rank_entries(self.results, None)
 
 
-def _compare(
-    request: ComparisonRequest,
-    jobs: int | None = None,
-    console: Console | None = None,
-    keep: Path | None = None,
-) -> Comparison:
+def _compare(request: ComparisonRequest, options: Request) -> Comparison:
     """Drive a request: names and files in processes of their own, objects in this one."""
     entries, tasks = request.entries, request.tasks
-    shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
+    progress: dict[str, Any] = {"jobs": options.jobs, "console": options.console}
+    shared = progress | {"keep": options.keep}
     controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
     filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
     rivals = make_baseline_cases(tasks, controllers, filters)
@@ -82,28 +75,24 @@ def _compare(
     allowed: frozenset[str] | None = None
     salt = known[0] if known else request.salt or make_salt()
     if request.fresh:
-        allowed = _find_opened_files(request, isolated, jobs, console)
+        allowed = _find_opened_files(request, isolated, options)
         digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(allowed)]
         salt = make_salt(*digests, secrets.token_hex(16))
     seeds = request.seeds or make_task_seeds(salt, request.episodes)
     results = known[1] if known else measure(rivals, seeds, title="baselines", **shared)
     runner = IsolatedDrive(request.limit, allowed)
-    results |= measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
+    results |= measure(isolated, seeds, title="entrants", runner=runner, **progress)
     results |= measure(objects, seeds, jobs=1, runner=run_user_chunk)
     return Comparison(request, "" if request.seeds else salt, bool(known), results)
 
 
 def _find_opened_files(
-    request: ComparisonRequest,
-    cases: Sequence[ControlCase],
-    jobs: int | None,
-    console: Console | None,
+    request: ComparisonRequest, cases: Sequence[ControlCase], options: Request
 ) -> frozenset[str]:
     """Find the files that entries open, theirs included, by a drive on tuning seeds."""
     chunks = [Chunk(*case, tuple(make_tuning_seeds(_REHEARSED))) for case in cases]
-    rehearse = IsolatedDrive(request.limit).rehearse
-    opened = run_cases(rehearse, chunks, "rehearsal", jobs, console)
-    return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))
+    opened = options.run_cases(IsolatedDrive(request.limit).rehearse, chunks, "rehearsal")
+    return frozenset().union(*opened, map(os.path.realpath, request.files))
 
 
 _MAX_SENTENCES = 4  # entries with a sentence
@@ -125,9 +114,8 @@ def _make_sentence(standing: Standing) -> str:
     score = standing.overall.get("score")
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
     if score is None:
-        return (
-            f"{standing.label}: {f'not driven: {errors[0]}' if errors else 'nominal is not driven'}"
-        )
+        why = f"not driven: {errors[0]}" if errors else "nominal is not driven"
+        return f"{standing.label}: {why}"
     tiers = []
     for tier in dict.fromkeys(task.tier for task in standing.scores if task.tier):
         scores = [r for task, r in standing.scores.items() if task.tier == tier]
@@ -160,8 +148,7 @@ def _describe_score(score: Estimate) -> str:
 def _describe_trust(comparison: Comparison) -> str:
     """Sentence on what the numbers rest, and what they do not say."""
     request = comparison.request
-    n = len(request.seeds or range(request.episodes))
-    count = len(request.tasks)
+    n, count = len(request.seeds or range(request.episodes)), len(request.tasks)
     where = f"{count} task{'s' if count > 1 else ''} x {n} episodes"
     if request.fresh:
         files = ", ".join(path.name for path in request.files)
@@ -280,10 +267,9 @@ def score(
     if estimator is None:
         estimator = choose_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
     entry = make_user_entry(agent, estimator, trust)
-    request = ComparisonRequest(
-        (entry,), vehicle, scenario_list, env_id, episodes, chosen, fresh=fresh, limit=limit
-    )
-    comparison = _compare(request, jobs)
+    where = vehicle, scenario_list, env_id, episodes, chosen
+    request = ComparisonRequest((entry,), *where, fresh=fresh, limit=limit)
+    comparison = _compare(request, Request(jobs=jobs))
     standing = next(item for item in comparison.overall if item.entry == entry)
     rows = []
     for task, result in standing.results.items():
@@ -297,31 +283,23 @@ def score(
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
     errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
     n, tasks, error = standing.n, tuple(rows), next(filter(None, errors), "")
-    text = _make_sentence(standing)
-    return Score(*names, total, cost, won, failures, n, tasks, error, text)
+    return Score(*names, total, cost, won, failures, n, tasks, error, _make_sentence(standing))
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
 
 
-def run(
-    request: ComparisonRequest,
-    jobs: int | None = None,
-    console: Console | None = None,
-    keep: Path | None = None,
-) -> Suite:
+def run(request: ComparisonRequest, options: Request) -> Suite:
     """Drive a request and make its suite.
 
     Args:
         request: Entries and tasks.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-        keep: Folder of the baselines' finished cases.
+        options: Processes, progress, and the folder of the baselines' finished cases.
 
     Returns:
         Suite.
     """
-    comparison = _compare(request, jobs, console, keep)
+    comparison = _compare(request, options)
     suite = Suite("control", "Your own beside the package's", _TEXT)
     suite.verdict = "\n".join(_compose_verdict(comparison))
     by_task = make_task_table("Task by task", comparison.overall, request.tasks)

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
@@ -161,17 +162,13 @@ def _find_place(texts: Sequence[str], stack: str) -> str:
 LIMIT = 600.0  # s of wall time a cell
 
 
-class _RemoteAgent:
-    """The agent that a child makes of a text, as `make_agent` takes a factory."""
-
-    def __init__(self, child: _ChildProcess, source: str, trust: bool) -> None:
-        self._child, self._source, self._trust = child, source, trust
-
-    def __call__(self, env: CarVectorEnv, **options: object) -> "_RemotePolicy":
-        """Let the child build its agent from the view of an env."""
-        view = EnvView.from_env(env)
-        self._child.call("agent", self._source, view, {"trust": self._trust, **options})
-        return _RemotePolicy(self._child, (view.num_envs, view.facts.width))
+def _make_remote_agent(
+    child: _ChildProcess, source: str, trust: bool, env: CarVectorEnv, **options: object
+) -> "_RemotePolicy":
+    """Let a child build the agent of a text from the view of an env."""
+    view = EnvView.from_env(env)
+    child.call("agent", source, view, {"trust": trust, **options})
+    return _RemotePolicy(child, (view.num_envs, view.facts.width))
 
 
 class _RemotePolicy:
@@ -262,19 +259,14 @@ def run_user_chunk(chunk: Chunk) -> DriveResult:
 
 @dataclass(frozen=True)
 class IsolatedDrive:
-    """`run_user_chunk`, but agent and estimator of a user in a child of their own.
+    """`run_user_chunk`, but agent and estimator of a user in a child of their own."""
 
-    Attributes:
-        limit: Wall time (s).
-        allowed: Files that a child may open, of `ChildSettings`.
-    """
-
-    limit: float = LIMIT
-    allowed: frozenset[str] | None = None
+    limit: float = LIMIT  # wall time (s)
+    allowed: frozenset[str] | None = None  # files that a child may open, of `ChildSettings`
 
     def __call__(self, chunk: Chunk) -> DriveResult:
         """Run a chunk whose entry has names and files."""
-        return _run_isolated_chunk(self, chunk)[0]
+        return self._run(chunk)[0]
 
     def rehearse(self, chunk: Chunk) -> set[str]:
         """Run a chunk.
@@ -285,38 +277,34 @@ class IsolatedDrive:
         Returns:
             Files that its entries open.
         """
-        return _run_isolated_chunk(self, chunk)[1]
+        return self._run(chunk)[1]
 
-
-def _run_isolated_chunk(drive: IsolatedDrive, chunk: Chunk) -> tuple[DriveResult, set[str]]:
-    """Episodes of a chunk, and the files that its children opened."""
-    entry, children, opened = chunk.entry, list[_ChildProcess](), set[str]()
-    objects = dict(entry.objects)
-    try:
-        for part in ("agent", "estimator"):
-            source: str = getattr(entry, part)
-            is_foreign = is_user_file(source) or source.endswith(ZIP) or ":" in source
-            if part in objects or not is_foreign:
-                continue
-            child = _ChildProcess((entry.agent, entry.estimator), drive)
-            children.append(child)
-            objects[part] = (
-                _RemoteAgent(child, source, entry.trust)
-                if part == "agent"
-                else _RemoteEstimators(child, source)
-            )
-        result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
-        for child in children:
-            if not child.reason:
-                opened.update(json.loads(child.call("opened")))
-    except _EntryError as error:
-        result = _make_failed_result(chunk, str(error))
-    finally:
-        spent = sum(child.close() for child in children)
-    reason = next((child.reason for child in children if child.reason), result.error)
-    if reason:
-        return _make_failed_result(chunk, reason), opened
-    return replace(result, seconds=result.seconds + spent), opened
+    def _run(self, chunk: Chunk) -> tuple[DriveResult, set[str]]:
+        """Run a chunk; its episodes, and the files that its children opened."""
+        entry, children, opened = chunk.entry, list[_ChildProcess](), set[str]()
+        objects = dict(entry.objects)
+        try:
+            for part in ("agent", "estimator"):
+                source: str = getattr(entry, part)
+                is_foreign = is_user_file(source) or source.endswith(ZIP) or ":" in source
+                if part in objects or not is_foreign:
+                    continue
+                child = _ChildProcess((entry.agent, entry.estimator), self)
+                children.append(child)
+                make_agent = partial(_make_remote_agent, child, source, entry.trust)
+                objects[part] = make_agent if part == "agent" else _RemoteEstimators(child, source)
+            result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
+            for child in children:
+                if not child.reason:
+                    opened.update(json.loads(child.call("opened")))
+        except _EntryError as error:
+            result = _make_failed_result(chunk, str(error))
+        finally:
+            spent = sum(child.close() for child in children)
+        reason = next((child.reason for child in children if child.reason), result.error)
+        if reason:
+            return _make_failed_result(chunk, reason), opened
+        return replace(result, seconds=result.seconds + spent), opened
 
 
 def _make_failed_result(chunk: Chunk, error: str) -> DriveResult:

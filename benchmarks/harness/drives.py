@@ -77,10 +77,9 @@ def make_unchecked_filter(
     Returns:
         The filter.
     """
-    slow: dict[str, object] = {"slow": list(log.slow) or None}
-    if "accel_y" not in log.record.present:
-        slow |= {"fast": ("gyro",)}
-    config = parse_config(name, FILTERS[name], log.slow, slow | dict(options))
+    known: dict[str, object] = {"slow": list(log.slow) or None}
+    known |= {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
+    config = parse_config(name, FILTERS[name], log.slow, known | dict(options))
     return Estimator(config, log.record.dt, *assemble(config, vehicle, log.record.dt, None))
 
 

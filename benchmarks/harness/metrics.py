@@ -133,14 +133,11 @@ _OTHERS = {
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()
-}
-"""Unit of every metric that a row may have."""
+}  # unit of every metric that a row may have
 
 
 def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
     """Compute the power that N cars' tyres dissipate: -F_y times the sliding speed, both axles.
-
-    Drive slip is not modelled.
 
     Args:
         params: Packed parameters of the engine, one row for each car.
@@ -148,7 +145,7 @@ def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
         switches: Packed switches of the engine, likewise.
 
     Returns:
-        Power of each car (W), shape (N,).
+        Power of each car (W), shape (N,), without that of drive slip.
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

@@ -1,7 +1,6 @@
 """Independent cases side by side, in processes or on a Ray cluster, with a progress bar.
 
-Every engine and every number of workers give the same results. Of a user's error only the
-message is shown; every other error keeps its traceback.
+Every engine and every number of workers give the same results.
 """
 
 import io
@@ -38,15 +37,11 @@ def count_cores() -> int:
 
 @contextmanager
 def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
-    """Use an engine for the cases within.
+    """Use an engine for the cases within; ValueError where there is no such engine or cluster.
 
     Args:
         name: Name, `PROCESSES` or "ray".
         address: Existing Ray cluster, "host:port", "" for this machine's; it must run this version.
-
-    Raises:
-        ValueError: The name is unknown, an address without Ray, or there is no such cluster.
-        ModuleNotFoundError: ray is not installed.
     """
     check_choice("engine", name, _ENGINES)
     if name == PROCESSES:
@@ -122,9 +117,9 @@ class Bar(progress.Progress):
     def __init__(self, console: Console | None) -> None:
         shown = console is not None and console.is_interactive
         text, count = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
-        columns = (text, progress.BarColumn(20), count)
-        times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
-        super().__init__(*columns, *times, console=console, disable=not shown)
+        times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
+        columns = (text, progress.BarColumn(20), count, *times)
+        super().__init__(*columns, console=console, disable=not shown)
         self._speaks, self._over = console is not None and not shown, Event()
         self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
@@ -239,7 +234,7 @@ _MAX_LETTERS = 1000  # of a message
 
 @contextmanager
 def report_user_errors() -> Iterator[None]:
-    """End the process with exit status 2 and the message of a user's error."""
+    """End the process with exit status 2 and the message of a user's error, no traceback."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # unencodable characters do not raise
             stream.reconfigure(errors="backslashreplace")

@@ -27,12 +27,9 @@ VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
 @dataclass(frozen=True)
 class ResultRow:
-    """One number of a benchmark.
+    """One number of a benchmark, ValueError for a metric or verdict outside of the vocabulary.
 
     Value and bounds of a claim, which has a verdict, and of a replay are median and range.
-
-    Raises:
-        ValueError: The metric or verdict is outside of the vocabulary.
     """
 
     suite: str
@@ -57,9 +54,8 @@ class ResultRow:
 
 _COLUMNS = {item.name for item in fields(ResultRow)} - {"suite", "metric", "value", "low", "high"}
 
-
-Cell = Any
-"""A text, a number, an `Estimate`, several numbers of one template, or nothing (NaN too)."""
+Cell = Any  # a text, a number, an `Estimate`, several numbers of one template, or nothing (NaN too)
+Line = Mapping[str, Cell]  # cells of a line by key, of which metrics become rows
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,6 @@ class Column:
     scale: float = 1.0  # factor of the numbers
     form: str = "g"  # format of each number, or template of several: "{:.3g} ({:.3g})"
     interval: bool = True  # whether intervals are shown
-
-
-Line = Mapping[str, Cell]
-"""Cells of a line by key, of which metrics become rows."""
 
 
 @dataclass
@@ -90,14 +82,7 @@ class ResultTable:
     opened: bool = False  # the report shows it unfolded
 
     def split(self) -> list[tuple[Column, list[Cell]]]:
-        """Split the table into columns.
-
-        Returns:
-            Each column with its cells.
-
-        Raises:
-            ValueError: A line is not as long as the columns.
-        """
+        """Split the table into columns with their cells; ValueError for a line of other length."""
         columns = [x if isinstance(x, Column) else Column(str(x)) for x in self.columns]
         lines = list[Sequence[Cell]]()
         for line in self.cells:
@@ -119,9 +104,8 @@ class ResultTable:
         """Convert the table to pandas, in the headings' units (needs the extra `report`)."""
         from pandas import DataFrame
 
-        scaled = [
-            [_rescale(cell, column.scale) for cell in cells] for column, cells in self.split()
-        ]
+        columns = self.split()
+        scaled = [[_rescale(cell, column.scale) for cell in cells] for column, cells in columns]
         return DataFrame(list(zip(*scaled, strict=True)), columns=self.header)
 
     def _repr_html_(self) -> str:
@@ -233,25 +217,20 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
         path: File.
         rows: Rows of a run's suites.
     """
-    numbers = ("value", "low", "high")
-    plain = [
-        asdict(row) | {x: None for x in numbers if not math.isfinite(getattr(row, x))}
-        for row in rows
-    ]
+    plain = [asdict(row) for row in rows]
+    for row in plain:
+        row |= {x: None for x in ("value", "low", "high") if not math.isfinite(row[x])}
     write_text(path, "[\n" + ",\n".join(map(json.dumps, plain)) + "\n]\n")
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
-    """Read rows of `write_json`.
+    """Read rows of `write_json`; ValueError with file, row and column where there are none.
 
     Args:
         path: File.
 
     Returns:
         Rows.
-
-    Raises:
-        ValueError: The file has no such rows; the message has file, row and column.
     """
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
@@ -261,16 +240,13 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
 
 def read_objects(path: str | Path) -> list[dict[str, Any]]:
-    """Read a JSON list of objects.
+    """Read a JSON list of objects; ValueError for anything else.
 
     Args:
         path: File.
 
     Returns:
         Objects.
-
-    Raises:
-        ValueError: The file holds something else.
     """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))

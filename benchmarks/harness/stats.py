@@ -1,8 +1,7 @@
 """Statistics over seeds with 95 % intervals, paired where two columns share their seeds.
 
-Intervals are Student's, from each episode's contribution to the error (`margin_of_error`), on a
-logarithmic scale for positive numbers; those of fractions are Wilson's. No interval of a mean holds
-for rare failures that did not occur: failures are counted, and `share` bounds their rate.
+Intervals are Student's, on a logarithmic scale for positive numbers; those of fractions Wilson's.
+No interval of a mean holds for rare failures that did not occur: `share` bounds their rate.
 """
 
 import math
@@ -38,7 +37,7 @@ class Estimate(NamedTuple):
         Returns:
             Product.
         """
-        return Estimate(factor * self.value, factor * self.low, factor * self.high)
+        return Estimate(*(factor * number for number in self))
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
         """Format the number and, in brackets, its interval if there is one.
@@ -161,10 +160,8 @@ def _make_ratio(statistic: Callable[..., Any]) -> Callable[..., Array]:
     return ratio
 
 
-ratio_of_means = _make_ratio(np.mean)
-"""Mean over that of a reference."""
-ratio_of_roots = _make_ratio(root_mean)
-"""RMSE over that of a reference, from squared errors."""
+ratio_of_means = _make_ratio(np.mean)  # mean over that of a reference
+ratio_of_roots = _make_ratio(root_mean)  # RMSE over that of a reference, from squared errors
 
 
 def average(*strata: Array) -> Estimate:
@@ -263,11 +260,10 @@ def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
     Returns:
         Whether the one-sided p value is at most 2.5 %.
     """
-    one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
-    larger = int((one & ~other).sum())
-    differing = int((one != other).sum())
     from scipy.special import bdtrc
 
+    one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
+    larger, differing = int((one & ~other).sum()), int((one != other).sum())
     return differing > 0 and float(bdtrc(larger - 1, differing, 0.5)) <= _TAIL
 
 

@@ -25,11 +25,7 @@ class Panel:
 
 @dataclass
 class Explorer:
-    """Time series of which two are shown beside each other.
-
-    Raises:
-        ValueError: There are no cells, or a cell lacks a signal or a part of its key.
-    """
+    """Time series of which two are shown beside each other; ValueError for an incomplete cell."""
 
     title: str
     menus: Sequence[str]  # labels of the parts of a cell's key but the last one, which is the entry
@@ -54,16 +50,13 @@ class Explorer:
 
 
 def format_verdict(*lines: str) -> str:
-    """Join the lines of a verdict.
+    """Join the lines of a verdict; ValueError for more than LINES of them.
 
     Args:
         lines: Lines, of which empty ones are left out.
 
     Returns:
         Verdict.
-
-    Raises:
-        ValueError: There are more than LINES of them.
     """
     filled = [line for line in lines if line]
     if len(filled) > LINES:
@@ -72,9 +65,7 @@ def format_verdict(*lines: str) -> str:
 
 
 def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str:
-    """Describe the first entry and its lead, or with which others it ties.
-
-    A rival ties where the interval reaches, or nearly reaches, 1.
+    """Describe the first entry and its lead, or those whose interval reaches 1, or nearly: a tie.
 
     Args:
         name: Name of the first.

@@ -1,8 +1,7 @@
-"""Figures as plotly figures: time series, curves, tracks, groups, heat maps.
+"""Figures as plotly figures; importing this module needs plotly, the extra `report`.
 
 Every axis carries its unit, every name has its colour (`envs.rendering.palette`). Lines longer than
 `POINTS` are thinned: those over time keep their peaks and gaps, tracks take even steps.
-Importing this module needs plotly, the extra `report`.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -20,8 +19,7 @@ with require_extra("report", "figures need plotly"):
 
 SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
 """Colours from bad to good, safe for the colour-blind."""
-POINTS = 1000
-"""Maximum of points of a line: a figure is no wider in pixels."""
+POINTS = 1000  # maximum of points of a line: a figure is no wider in pixels
 _DASHES = {"reference": "dash", "bound": "dot"}
 _DASH_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
@@ -68,7 +66,7 @@ def draw_time_series(
     dots: Collection[str] = (),
     zero_line: bool = False,
 ) -> go.Figure:
-    """Draw series on one axis over time, "truth" on top and thicker.
+    """Draw series on one axis over time, "truth" on top and thicker; ValueError for unequal ones.
 
     Args:
         t: Times (s), shape (n,).
@@ -80,9 +78,6 @@ def draw_time_series(
 
     Returns:
         Figure.
-
-    Raises:
-        ValueError: A series is not as long as `t`.
     """
     t = np.asarray(t, float)
     figure = go.Figure()
@@ -104,26 +99,18 @@ def draw_time_series(
 
 
 def draw_curves(
-    x: Array,
-    series: Mapping[str, Array | tuple[Array, Array, Array]],
-    x_label: str,
-    y_label: str,
-    log: str = "",
+    x: Array, series: Mapping[str, Array | tuple[Array, Array, Array]], x_label: str, y_label: str
 ) -> go.Figure:
-    """Draw lines with dots.
+    """Draw lines with dots; ValueError for a line that is not as long as `x`.
 
     Args:
         x: Places of the dots, shape (n,).
         series: Values by name, shape (n,), or (value, low, high) for whiskers.
         x_label: Quantity and unit of `x`.
         y_label: Quantity and unit of the values.
-        log: Logarithmic axes, of "x", "y" and "xy".
 
     Returns:
         Figure.
-
-    Raises:
-        ValueError: A series is not as long as `x`.
     """
     figure = go.Figure()
     for name, pen in _choose_line_styles(series).items():
@@ -137,22 +124,17 @@ def draw_curves(
             ends = {"array": bounds[1] - value, "arrayminus": value - bounds[0], "symmetric": False}
             trace.error_y = {"type": "data", "color": pen[0], "thickness": 1, "width": 3, **ends}
         figure.add_trace(trace)
-    figure.update_xaxes(**_LOG if "x" in log else {})
-    figure.update_yaxes(**_LOG if "y" in log else {})
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
 def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
-    """Draw paths, seen from above.
+    """Draw paths, seen from above; ValueError where the two of one differ in length.
 
     Args:
         paths: Paths (x, y) (m) by name.
 
     Returns:
         Figure.
-
-    Raises:
-        ValueError: The two of a path differ in length.
     """
     figure = go.Figure()
     for name, colour_and_dash in _choose_line_styles(paths).items():
@@ -169,9 +151,7 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
 def draw_groups(
     groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
 ) -> go.Figure:
-    """Draw dots with intervals on a logarithmic axis, group below group.
-
-    A name that is a variant of a known one has a hollow dot.
+    """Draw dots with intervals on a logarithmic axis, group below group; variants' are hollow.
 
     Args:
         groups: Numbers by name, by the group's title.
@@ -276,23 +256,14 @@ def draw_heat_map(
     scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
     low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
     trace = go.Heatmap(
-        z=values,
-        x=list(columns),
-        y=list(names),
-        texttemplate="%{z:.2~f}",
-        textfont={"size": 10},
-        colorscale=scale,
-        zmin=float(low),
-        zmax=float(high),
-        xgap=1,
-        ygap=1,
-        colorbar={"title": {"text": unit}},
+        z=values, x=list(columns), y=list(names), zmin=float(low), zmax=float(high),
+        colorscale=scale, colorbar={"title": {"text": unit}}, xgap=1, ygap=1,
+        texttemplate="%{z:.2~f}", textfont={"size": 10},
         hovertemplate="%{y}<br>%{x}: %{z:.2~f}<extra></extra>",
-    )
+    )  # fmt: skip
     figure = go.Figure(trace)
     figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)
     figure.update_yaxes(autorange="reversed", showgrid=False, ticks="", automargin=True)
-    figure.update_layout(
-        height=170 + 22 * len(names), hovermode="closest", showlegend=False, meta="scroll"
-    )
+    size = {"height": 170 + 22 * len(names), "meta": "scroll"}
+    figure.update_layout(hovermode="closest", showlegend=False, **size)
     return figure

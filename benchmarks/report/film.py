@@ -35,15 +35,10 @@ class FilmDriver(NamedTuple):
 
 
 def check_film(path: Path | None) -> None:
-    """Check before the work that a film can be written.
+    """Check before the work that a film can be written: its ending, folder and needed modules.
 
     Args:
         path: File, None for none.
-
-    Raises:
-        ValueError: The file has another ending.
-        OSError: The file cannot be written.
-        ModuleNotFoundError: The extra `render` is not installed.
     """
     if path is None:
         return
@@ -95,8 +90,7 @@ def _render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) 
             next(other, None)  # where its episode is over it stays where it is
         main, *ghosts = [base.make_render_state() for base in bases]
         if k % every == 0 or step.terminated or step.truncated:
-            names = [driver.name for driver in drivers[1:]]
-            named = list(zip(names, ghosts, strict=True))
+            named = list(zip((driver.name for driver in drivers[1:]), ghosts, strict=True))
             yield read_pixels(draw_picture(main, drivers[0].name if ghosts else "true", named))
 
 
@@ -151,7 +145,7 @@ def make_track_kml(
     colours: dict[str, str] | None = None,
     origin: tuple[float, float] = ORIGIN,
 ) -> str:
-    """Make a KML document of tracks.
+    """Make a KML document of tracks; ValueError without one, or for an unequal or infinite one.
 
     Args:
         title: Title of the document.
@@ -161,9 +155,6 @@ def make_track_kml(
 
     Returns:
         Document.
-
-    Raises:
-        ValueError: There is no track, or an unequal or infinite one.
     """
     if not tracks:
         raise ValueError("a KML document needs at least one track")

@@ -1,8 +1,7 @@
 """The report as one HTML file that needs no network, and tables in Markdown pages.
 
 The page is `page.html` with `report.css`, `report.js` and `explorer.js` beside this module. plotly
-and the figures lie in it as gzip in base64, lines as steps. Its policy lets no script run but ours,
-by its hash. A Markdown page has `<!-- tables of SUITE -->` and `<!-- end -->` around its tables.
+and the figures lie in it as gzip in base64. Its policy lets no script run but ours, by its hash.
 """
 
 import base64
@@ -17,7 +16,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +29,6 @@ from .tables import TextColumn, format_columns
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
-
 
 _MAX_LETTERS = 40  # letters: a longer cell wraps
 
@@ -60,9 +58,8 @@ def _format_column(column: TextColumn, is_first: bool, keyed: bool) -> list[str]
     for text, value in zip(column.texts, column.values, strict=True):
         has_value = column.is_numeric and value is not None
         data = f' data-value="{value!r}"'.replace("inf", "Infinity") if has_value else ""
-        tag, key = (
-            ('th scope="row"', _format_key(text) if keyed else "") if is_first else ("td", "")
-        )
+        tag = 'th scope="row"' if is_first else "td"
+        key = _format_key(text) if is_first and keyed else ""
         kind = ' class="long"' if len(text) > _MAX_LETTERS else _format_class(column.is_numeric)
         cells.append(f"<{tag}{kind}{data}>{key}{escape(text)}</{tag[:2]}>")
     return cells
@@ -85,9 +82,6 @@ def _mark_code(text: str) -> str:
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
-_MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
-
-
 def _format_page_table(table: ResultTable) -> str:
     """Format a heading, the table, and its note in lines of 120."""
     columns = format_columns(table)
@@ -101,22 +95,17 @@ def _format_page_table(table: ResultTable) -> str:
 
 
 def check_page(path: Path | None, names: Sequence[str]) -> None:
-    """Check that a page has marks for a suite that is asked for.
+    """Check that a page has marks for a suite that is asked for; ValueError otherwise.
 
     Args:
         path: File of the page, None for none.
         names: Names of the suites.
-
-    Raises:
-        ValueError: The page has none.
     """
     if path is not None:
         text = path.read_text(encoding="utf-8")
         if not any(_compile_pattern(name).search(text) for name in names):
-            raise ValueError(
-                f"{path}: expected the lines <!-- tables of SUITE --> and <!-- end --> for one of "
-                f"{', '.join(names)}"
-            )
+            marks = "<!-- tables of SUITE --> and <!-- end --> for one of"
+            raise ValueError(f"{path}: expected the lines {marks} {', '.join(names)}")
 
 
 def write_page(path: Path, suites: Sequence[Suite]) -> None:
@@ -135,7 +124,8 @@ def write_page(path: Path, suites: Sequence[Suite]) -> None:
 
 
 def _compile_pattern(name: str) -> re.Pattern[str]:
-    return re.compile(_MARKED.format(re.escape(name)), re.MULTILINE | re.DOTALL)
+    marked = rf"(?<=^<!-- tables of {re.escape(name)} -->\n).*?(?=^<!-- end -->$)"
+    return re.compile(marked, re.MULTILINE | re.DOTALL)
 
 
 _MIN_PACKED = 40  # a shorter array is left as it is
@@ -172,13 +162,9 @@ def _encode_figure(figure: "Figure") -> str:
         content["layout"].pop(name, None)
     for trace, plain in zip(figure.data, content["data"], strict=True):
         for axis, levels in _LEVELS.items():
-            values = getattr(trace, axis, None)
-            if (
-                isinstance(values, np.ndarray)
-                and values.dtype.kind == "f"
-                and values.ndim == 1
-                and len(values) > _MIN_PACKED
-            ):
+            values: Any = getattr(trace, axis, None)
+            is_line = isinstance(values, np.ndarray) and values.ndim == 1
+            if is_line and values.dtype.kind == "f" and len(values) > _MIN_PACKED:
                 plain[axis] = _encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
@@ -193,16 +179,11 @@ def write_report(
 ) -> None:
     """Write one self-contained HTML file: an answer, then every suite's verdict, pictures, tables.
 
-    The file is written whole or not at all.
-
     Args:
-        path: File.
-        suites: Results.
+        path: File, written whole or not at all.
+        suites: Results, or ValueError.
         command: Command line that made the suites.
         environment: Versions by name.
-
-    Raises:
-        ValueError: There is no suite, or a row is not as long as its header.
     """
     if not suites:
         raise ValueError("a report needs at least one suite")
@@ -225,7 +206,7 @@ def write_report(
         command=escape(command),
         made=" · ".join(f"{escape(name)} <b>{escape(value)}</b>" for name, value in facts.items()),
         contents="\n".join(
-            f'<li><a href="#{link}">{escape(suite.title)}</a></li>' for link, suite in linked
+            f'<li><a href="#{x}">{escape(suite.title)}</a></li>' for x, suite in linked
         ),
         answer=" ".join(_mark_code(line) for line in lead.headlines[:3]),
         picture="".join(_format_figure(*item) for item in lead.answers[:1]),
@@ -269,19 +250,14 @@ def _format_figure(title: str, figure: "Figure", caption: str) -> str:
 
 def _format_explorer(explorer: Explorer) -> str:
     """Format two cells side by side; `explorer.js` makes the menus and draws."""
+    cells = ((list(key), signals.items()) for key, signals in explorer.cells.items())
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
         "panels": [{"label": p.label, "lines": list(map(list, p.lines))} for p in explorer.panels],
         "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
         "colours": {key[-1]: find_colour(key[-1]) for key in explorer.cells},
-        "cells": [
-            [
-                list(key),
-                {name: _encode_steps(_select_samples(values)) for name, values in signals.items()},
-            ]
-            for key, signals in explorer.cells.items()
-        ],
+        "cells": [[key, {x: _encode_steps(_select_samples(y)) for x, y in z}] for key, z in cells],
     }
     return (
         f'<figure class="explorer wide">\n<h3>{escape(explorer.title)}</h3>\n'
@@ -309,10 +285,8 @@ def _hash(script: str) -> str:
 
 def _download(name: str, media: str, text: str) -> str:
     data = base64.b64encode(text.encode()).decode()
-    return (
-        f'<p class="file"><a download="{escape(name)}" href="data:{media};base64,{data}">'
-        f"{escape(name)}</a></p>"
-    )
+    link = f'<a download="{escape(name)}" href="data:{media};base64,{data}">{escape(name)}</a>'
+    return f'<p class="file">{link}</p>'
 
 
 def _read_asset(name: str) -> str:

@@ -1,9 +1,7 @@
 """The skeleton of a suite: a study is data, and every study is run in the same way.
 
-A study has a title, a text, its number of seeds and four functions: `measure` drives and returns
-results, `add_tables` makes rows and tables of them, `compose_verdict` their answer in words and
-`add_figures` pictures, where plotly is installed. Lines of a table are records, as of a DataFrame:
-`Suite.add_rows` makes rows of them, `ResultTable` with its columns a table.
+`measure` drives and returns results, `add_tables` makes rows and tables of them, `compose_verdict`
+their answer in words, `add_figures` pictures. Lines of a table are records, as of a DataFrame.
 """
 
 from collections.abc import Callable, Sequence
@@ -104,8 +102,8 @@ class Study(Generic[Results]):
     measure: Callable[[Request], Results]  # drives, and returns the results
     add_tables: Callable[[Suite, Results], None]  # adds rows and tables of the results to a suite
     compose_verdict: Callable[[Results], str]  # composes the answer from the results
+    # adds pictures of the results with `report.figures`, its last argument
     add_figures: Callable[[Suite, Results, ModuleType], None] | None = None
-    """Adds pictures of the results with `report.figures`, its last argument."""
     needs: tuple[str, str] = ("", "")  # optional module, and the verdict where it is not installed
 
     def run(self, request: Request) -> Suite:
@@ -115,7 +113,7 @@ class Study(Generic[Results]):
             request: Options of the run.
 
         Returns:
-            Suite with rows, tables, verdict and figures; the latter only where plotly is installed.
+            Suite with rows, tables, verdict, and figures only where plotly is installed.
         """
         suite = Suite(self.name, self.title, self.text)
         module, absence = self.needs

@@ -1,10 +1,22 @@
-"""Cells of tables as texts: the one place where numbers are formatted for people."""
+"""Tables as texts, the one place where numbers are formatted for people; suites on the screen."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-from ..harness.results import Cell, Column, ResultTable
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from ..harness.results import Cell, Column, ResultTable, Suite
 from ..harness.stats import Estimate
+
+_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
+_MIN_WIDTH = 22  # letters that a column of text has at least, and the first one on a narrow screen
+_NARROW = 80  # columns
+_FEW, _ROWS = 2, 20  # suites of a run whose tables are printed, and the rows of all of them
 
 
 class TextColumn(NamedTuple):
@@ -23,16 +35,13 @@ class TextColumn(NamedTuple):
 
 
 def format_columns(table: ResultTable) -> list[TextColumn]:
-    """Format the columns of a table.
+    """Format the columns of a table; ValueError for a line that is not as long.
 
     Args:
         table: Table.
 
     Returns:
         Texts and numbers of each column.
-
-    Raises:
-        ValueError: A line is not as long as the columns.
     """
     columns = []
     for column, cells in table.split():
@@ -70,3 +79,107 @@ def _get_value(cell: Cell, scale: float = 1.0) -> float | None:
         return None
     value = scale * float(cell[0] if isinstance(cell, tuple) else cell)
     return None if math.isnan(value) else value
+
+
+def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None:
+    """Print a run in about 60 lines: verdicts, up to two tables, and where the rest is.
+
+    Args:
+        console: Console to print to.
+        suites: Results; of more than two only one line of each verdict is printed.
+        reported: Whether a report has the rest.
+    """
+    is_short = len(suites) <= _FEW
+    for suite in suites:
+        _print_title(console, suite)
+        lines = suite.headlines
+        if not is_short:
+            lines = lines[1:2] or lines  # a verdict's second line is the answer
+        console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
+        shown = [table for table in suite.tables if not table.detail]
+        for table in shown[: int(is_short)]:  # the first table of a short run, else none
+            max_rows = _ROWS // len(suites)
+            left = len(table.cells) - max_rows
+            cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
+            part = _split_table(cut, console.width)[0]
+            console.print(_make_rich_table(table.title, part, console.width))
+            if left > 0:
+                console.print(f"[dim]and {left} rows more[/]\n", highlight=False)
+    count = sum(len(suite.tables) for suite in suites)
+    where = "in the report" if reported else "in a report: --html FILE"
+    text = f"All {count} tables, with notes and figures, are" if count > 1 else "The table is"
+    console.print(f"{text} {where}.", highlight=False)
+
+
+def _print_title(console: Console, suite: Suite) -> None:
+    if len(suite.title) + 4 <= console.width:
+        console.rule(f"[bold]{escape(suite.title)}")
+    else:  # a rule would cut it
+        console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
+
+
+def print_suite(console: Console, suite: Suite) -> None:
+    """Print title, verdict, text, and each table with its note, without tables of details.
+
+    Args:
+        console: Console to print to.
+        suite: Results.
+    """
+    _print_title(console, suite)
+    if suite.verdict:
+        console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
+    console.print(f"{escape(suite.text)}\n", highlight=False)
+    shown = [table for table in suite.tables if not table.detail]
+    for table in shown:
+        for i, part in enumerate(_split_table(table, console.width)):
+            title = f"{table.title} (continued)" if i else table.title
+            console.print(_make_rich_table(title, part, console.width))
+        if table.note:
+            console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+    if more := len(suite.tables) - len(shown):
+        count = f"{more} tables more are" if more > 1 else "1 table more is"
+        console.print(f"{count} in the report (--html).\n", highlight=False)
+
+
+def _split_table(table: ResultTable, width: int) -> list[list[TextColumn]]:
+    """Split a table into parts of as many columns as the width takes, the first in all."""
+    first, *columns = format_columns(table)
+    start = min(_measure_width(first), _choose_width(width) + 2) + 2
+    parts, used = [[first]], start
+    for column in columns:
+        added = _measure_width(column)
+        if used + added > width and len(parts[-1]) > 1:
+            parts.append([first])
+            used = start
+        parts[-1].append(column)
+        used += added
+    return parts
+
+
+def _measure_width(column: TextColumn) -> int:
+    longest = max(map(len, [column.heading, *column.texts]))
+    return (longest if column.is_numeric else min(longest, _MIN_WIDTH)) + 2
+
+
+def _choose_width(width: int) -> int:
+    """Choose the maximum of letters in the first column by the width of the screen (letters)."""
+    return _NAME if width >= _NARROW else _MIN_WIDTH
+
+
+def _make_rich_table(title: str, columns: list[TextColumn], width: int) -> RichTable:
+    """Make a table with numbers to the right and whole, texts to the left and wrapped."""
+    style = box.SIMPLE_HEAD
+    shown = RichTable(title=title, title_justify="left", box=style, padding=(0, 1, 0, 0))
+    for i, column in enumerate(columns):
+        right = i > 0 and column.is_numeric
+        longest = max(map(len, column.texts), default=0)
+        shown.add_column(
+            column.heading,
+            justify="right" if right else "left",
+            no_wrap=right,
+            min_width=min(longest, _choose_width(width)) if i == 0 else None,
+            overflow="fold",  # a long word goes on in the next line
+        )
+    for line in zip(*(column.texts for column in columns), strict=True):
+        shown.add_row(*map(escape, line))
+    return shown

@@ -1,7 +1,7 @@
 """Search of the options that give a controller the best score over the tasks of a class.
 
-Every controller gets the same number of trials on the same tuning seeds. The objective is minus the
-mean score r over tasks and seeds. The lead-in is short.
+Every controller gets the same number of trials on the same tuning seeds, with a short lead-in. The
+objective is minus the mean score r over tasks and seeds.
 """
 
 import hashlib
@@ -31,8 +31,7 @@ from ..harness.results import Suite, write_text
 from .estimator import SearchOptions
 from .study import create_study, make_result_table, run_search
 
-KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")
-"""Classes of tasks."""
+KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")  # classes of tasks
 STEERING = ("coms-model", "car-steering")  # the action steers too
 
 
@@ -54,11 +53,7 @@ _LQG = (_TIME, _GRIP, _STEER)
 _NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _TIME, _GRIP, _STEER._replace(start=10.0))  # s
 
 SPACES: dict[str, tuple[SearchNumber, ...]] = {
-    "two-dof": (
-        SearchNumber("gain", 1.0, 0.1, 10.0),
-        SearchNumber("pole", POLE, 2.0, 60.0),
-        _GRIP,
-    ),
+    "two-dof": (SearchNumber("gain", 1.0, 0.1, 10.0), SearchNumber("pole", POLE, 2.0, 60.0), _GRIP),
     "model-following": (
         SearchNumber("bandwidth.0", 5.0, 0.5, 50.0),  # rad/s, of the slip
         SearchNumber("bandwidth.1", 5.0, 0.5, 50.0),  # of the yaw rate
@@ -87,9 +82,7 @@ SPACES: dict[str, tuple[SearchNumber, ...]] = {
 tuning makes of nominal."""
 _SLOW = ("mpc", "nmpc", "adaptive-nmpc")
 _STAGES = (2, 4, 8)  # seeds after which the better half of a slow controller's trials goes on
-LOGS = Path(__file__).with_name("logs")
-"""Studies whose options the package ships."""
-_UNTUNED: Options = {"filter": {}, "controller": {}}
+LOGS = Path(__file__).with_name("logs")  # studies whose options the package ships
 
 
 @dataclass(frozen=True)
@@ -134,7 +127,7 @@ class ControllerTuning:
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
-    """Make the search of a controller's options.
+    """Make the search of a controller's options; ValueError without tasks or seeds.
 
     Args:
         name: Name of the controller.
@@ -143,9 +136,6 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
 
     Returns:
         Search.
-
-    Raises:
-        ValueError: The name or class is unknown, or there are no tasks or no seeds.
     """
     check_choice("controller", name, SPACES)
     check_choice("class", kind, KINDS)
@@ -167,7 +157,7 @@ def _run_entry(
 
 @lru_cache(maxsize=64)
 def _drive_nominal(control_task: ControlTask, seeds: tuple[int, ...]) -> DriveResult:
-    return _run_entry(control_task, NOMINAL, _UNTUNED, seeds)
+    return _run_entry(control_task, NOMINAL, {"filter": {}, "controller": {}}, seeds)
 
 
 def _compute_objective(
@@ -203,7 +193,7 @@ def _evaluate_trials(
 
 
 def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
-    """Search for the best options by TPE; a search that was stopped goes on.
+    """Search for the best options by TPE, or go on; ValueError where a task cannot be driven.
 
     Args:
         task: Search.
@@ -211,10 +201,6 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
 
     Returns:
         The study's log as JSON types.
-
-    Raises:
-        ValueError: The controller cannot drive a task, the storage fails, or no trial that drove
-            all seeds is finite.
     """
     options = task._make_options(task.start)
     for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once

@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def make_estimator_tuning(
     noises: Mapping[str, Range | None] | None = None,
     seeds: int = 12,
 ) -> EstimatorTuning:
-    """Make a tuning of what a user asks for: check it, and fill in the rest.
+    """Make a tuning of what a user asks for: check it, or ValueError, and fill in the rest.
 
     Args:
         estimator: Name of the estimator.
@@ -98,16 +99,13 @@ def make_estimator_tuning(
         env_id: Id of the env; default: the first whose scenarios have the estimator's sensors.
         target: State whose error counts.
         options: Options that are held.
-        search: Options to be found, with their range or None for the default one; default: process
-            noise `q_...` of every state that `options` does not hold.
+        search: Options to be found, with range or None for the default one; default: `q_...` of
+            every state that `options` does not hold.
         noises: Measurement noises, searched as well.
         seeds: Number of training drives in each scenario.
 
     Returns:
         Tuning.
-
-    Raises:
-        ValueError: A name is unknown, a scenario lacks the sensors, or a range or seeds are none.
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
@@ -125,26 +123,21 @@ def make_estimator_tuning(
         known = ", ".join(state for state in states if state in drive.log.truth) or "none"
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
     if search is None:
-        search = {
-            f"q_{state}": None
-            for state in states
-            if f"q_{state}" not in held and _has_option(estimator, f"q_{state}", held, facts)
-        }
+        names = [f"q_{state}" for state in states if f"q_{state}" not in held]
+        search = {name: None for name in names if _has_option(estimator, name, held, facts)}
     searched = {**search, **(noises or {})}
     if not searched:
         raise ValueError(f"{estimator} has no process noise to search; name the options to search")
     for option in searched:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
-        if not _has_option(estimator, option, held, facts):
-            wrong = {**facts, **held, option: 1.0}
-            call_quietly(make_estimator, estimator, **wrong)  # raises with what it has
+        if not _has_option(estimator, option, held, facts):  # it raises with what it has
+            call_quietly(make_estimator, estimator, **{**facts, **held, option: 1.0})
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
-    return EstimatorTuning(
-        estimator, scenarios, env_id, target, unit, sensors, held, ranges, numbers
-    )
+    subject = estimator, scenarios, env_id, target, unit, sensors
+    return EstimatorTuning(*subject, held, ranges, numbers)
 
 
 def _check_range(option: str, limits: Range | None) -> Range:
@@ -163,13 +156,12 @@ def _has_option(
     estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> bool:
     """Check whether the estimator has an option, whatever number suits it."""
+    options = {**_make_unstable_option(estimator), **held, option: 1e-3}
     try:
-        options = {**_make_unstable_option(estimator), **held, option: 1e-3}
-        call_quietly(make_estimator, estimator, **facts, **options)
+        with suppress(ValueError):
+            call_quietly(make_estimator, estimator, **facts, **options)
     except TypeError:
         return False
-    except ValueError:
-        return True
     return True
 
 
@@ -201,10 +193,8 @@ def _simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode
     """Simulate the drives of an env id, a scenario and seeds."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
-    return [
-        LoggedEpisode(rollout(env, seed=seed).log, make_filter_arguments(env.unwrapped))
-        for seed in seeds
-    ]
+    base = env.unwrapped
+    return [LoggedEpisode(rollout(env, seed=x).log, make_filter_arguments(base)) for x in seeds]
 
 
 def simulate(
@@ -233,9 +223,7 @@ def simulate(
 
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
-_TUNED = """\
-# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.
-"""
+_TUNED = "# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.\n"
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
 # searched too. Each entry is the output of its command; `sensors` are the slow ones.

@@ -1,10 +1,8 @@
 """Levels of `joint`, found on simulated cars of world v1 by a log score.
 
 `python -m sideslip.benchmarks.tuning.levels --trials 2000 --out levels.json` goes on from the
-levels in use. Every drive has a car, errors of sensors and of the data sheet, a road and an event
-of its own; in 60 % of them the ranges of two groups of errors are doubled, since the next
-car is none of those that were calibrated here. Logs of 1 kHz and of 100 Hz, with camera, GPS,
-both and neither, weigh alike. No recorded drive has a part in it.
+levels in use. Every drive has a car, errors, a road and an event of its own; in 60 % of them the
+ranges of two groups of errors are doubled, since the next car is none of these.
 """
 
 import dataclasses
@@ -13,7 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
@@ -46,8 +44,7 @@ _SEARCHED = (
     *("steer_offset_sd", "bank_time", "course_noise"),
     *("psi_noise", "y_l_noise"),
     *("map_heading_sd", "map_heading_time", "map_lag_sd"),
-)
-"""Options whose factors are searched; how roads and cameras lean is no matter of search."""
+)  # options whose factors are searched; how roads and cameras lean is no matter of search
 _KINDS = ("camera", "gps", "camera and gps", "gps, 100 Hz", "nothing, 100 Hz")
 _WORST = 100.0  # squared error over its variance, of which more counts as much
 _POPULATION = 12
@@ -105,9 +102,8 @@ def _reduce_rate(log: Log, every: int, sensors: Iterable[str]) -> Log:
         if name in sensors
     }
     fast = np.ascontiguousarray(record.fast[::every])
-    thinned = dataclasses.replace(
-        record, fast=fast, packets=packets, first=record.first // every, dt=step
-    )
+    first = record.first // every
+    thinned = dataclasses.replace(record, fast=fast, packets=packets, first=first, dt=step)
     return Log(thinned, slow, {name: truth[::every] for name, truth in log.truth.items()})
 
 
@@ -141,17 +137,10 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
     if "camera" in kind:
         scenario |= {"road": "nominal-path", "camera_heading": 0.5, "camera_offset": 4.0}
     sensors = {"camera": "Vision", "camera and gps": "Fusion"}.get(kind, "Gps")
-    vehicle = "coms" if is_small else "passenger-car"
-    env = gym.make(
-        f"sideslip/Yaw{sensors}-v1",
-        world=world,
-        scenario=scenario,
-        vehicle=vehicle,
-        control_period=10,
-    )
-    base: Any = env.unwrapped
+    name, vehicle = f"sideslip/Yaw{sensors}-v1", "coms" if is_small else "passenger-car"
+    env = gym.make(name, world=world, scenario=scenario, vehicle=vehicle, control_period=10)
     log = record_drive(env, seed)
-    facts = make_filter_arguments(base)
+    facts = make_filter_arguments(env.unwrapped)
     if "100 Hz" in kind:
         log = _reduce_rate(log, 10, ("gps",) if "gps" in kind else ())
         facts |= {"dt": log.record.dt, "sensors": log.slow}
@@ -222,10 +211,7 @@ def _search(
         asked = [search_state.ask() for _ in range(_POPULATION)]
         if not scores:
             asked[0] = np.zeros(len(names))  # the start itself
-        levels = [
-            {k: start[k] * math.exp(v) for k, v in zip(names, point, strict=True)}
-            for point in asked
-        ]
+        levels = [{k: start[k] * math.exp(v) for k, v in zip(names, x, strict=True)} for x in asked]
         cases = [(x, range(i, drives, 2)) for x in levels for i in range(2)]
         title = f"{len(scores)} of {trials} trials"
         halves = run_cases(_score, cases, title, jobs, console)

@@ -38,8 +38,7 @@ PARTS: dict[str, Mapping[str, object]] = {
     "without the map's heading": {"map_heading_sd": 0.0},
     "without friction": {"inverse_friction_sd": 0.0},
     "without tyres": _NO_TYRES | {"accel_scale_sd": 0.0},
-}
-"""Filters by name, as options over the defaults."""
+}  # filters by name, as options over the defaults
 
 
 def _measure(seed: int, names: tuple[str, ...]) -> list[tuple[float, ...]]:
@@ -66,16 +65,15 @@ def main(
     for i, name in enumerate(names):
         rmse, nees, held, score = numbers[:, i].T
         lead = average(numbers[:, 0, 3] - score)
-        rows.append(
-            {
-                "filter": name,
-                "rms / deg": math.degrees(float(np.sqrt(np.mean(rmse**2)))),
-                "median NEES": float(np.median(nees)),
-                "in 95 % / %": 100.0 * float(np.mean(held)),
-                "log score lost": [float(lead.value), float(lead.low), float(lead.high)],
-            }
-        )
-        console.print(rows[-1], highlight=False)
+        row = {
+            "filter": name,
+            "rms / deg": math.degrees(float(np.sqrt(np.mean(rmse**2)))),
+            "median NEES": float(np.median(nees)),
+            "in 95 % / %": 100.0 * float(np.mean(held)),
+            "log score lost": [float(lead.value), float(lead.low), float(lead.high)],
+        }
+        rows.append(row)
+        console.print(row, highlight=False)
     if out is not None:
         write_text(out, json.dumps({"n": len(numbers), "rows": rows}, indent=1) + "\n")
 

@@ -1,7 +1,7 @@
 """Search with Optuna over the logarithms of numbers, and its result for estimators as a suite.
 
-A study lives in a database, so that a search that was stopped goes on and several machines can
-share one. It is searched on training seeds and judged on test seeds. Needs the extra `tune`.
+A study lives in a database, so that a stopped search goes on and several machines can share one. It
+is searched on training seeds and judged on test seeds. Needs the extra `tune`.
 """
 
 import contextlib
@@ -26,13 +26,7 @@ from ..harness.drives import SETTLED, LoggedEpisode, call_quietly
 from ..harness.parallel import Bar, count_cores, run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from .estimator import (
-    SAMPLERS,
-    STORAGE,
-    EstimatorTuning,
-    SearchOptions,
-    simulate,
-)
+from .estimator import SAMPLERS, STORAGE, EstimatorTuning, SearchOptions, simulate
 
 with require_extra("tune", "tuning needs optuna"):
     import cmaes  # noqa: F401  Optuna imports it when it is too late
@@ -104,7 +98,7 @@ def _evaluate_file(path: str, task: EstimatorTuning, values: dict[str, float]) -
 def create_study(
     task: _Question, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
 ) -> "optuna.Study":
-    """Create or load a task's study in a storage: an RDB URL, or the path of an SQLite file.
+    """Create or load a task's study; ValueError for a storage that fails, or holds something else.
 
     Args:
         task: Question.
@@ -114,20 +108,14 @@ def create_study(
 
     Returns:
         Study.
-
-    Raises:
-        ValueError: The sampler is unknown, the storage cannot be used, or the study holds
-            something else.
     """
     url = storage if "://" in storage else f"sqlite:///{storage}"
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
     others = (RuntimeError, ImportError)  # another Optuna's tables, no driver
     with _silence_optuna(), _convert_storage_errors(storage, *others):
+        database = optuna.storages.RDBStorage(url, engine_kwargs=wait)
         study = optuna.create_study(
-            storage=optuna.storages.RDBStorage(url, engine_kwargs=wait),
-            study_name=task.study,
-            direction="minimize",
-            load_if_exists=True,
+            storage=database, study_name=task.study, direction="minimize", load_if_exists=True
         )
         study.sampler = _make_sampler(sampler, seed + len(study.trials), len(task.search))
         _list_finished(study, task)
@@ -257,7 +245,7 @@ _EDGE = 1.25  # times an end of its range or less: the number counts as being th
 def run(
     task: EstimatorTuning, search: SearchOptions, test_seeds: int = 20
 ) -> tuple[Suite, dict[str, float]]:
-    """Search on the task's seeds, and judge on others.
+    """Search on the task's seeds, and judge on others; ValueError where no filter is stable.
 
     Args:
         task: Tuning.
@@ -266,9 +254,6 @@ def run(
 
     Returns:
         Suite and the numbers.
-
-    Raises:
-        ValueError: There are no test seeds, the storage fails, or no trial gave a stable filter.
     """
     if not 1 <= test_seeds <= task.seeds[0]:
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
@@ -277,46 +262,34 @@ def run(
     training = simulate(task, task.seeds, "training drives", *shown)
     numbers = _search(study, task, training, search)
     test = simulate(task, range(test_seeds), "test drives", *shown)
-    suite = Suite(
-        "tune",
-        f"Tuning {task.estimator} on {task.subject}",
+    text = (
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % intervals; "
         f"{search.trials} trials. The default is make_estimator with no more than what is held "
         "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
-        "least.",
-        tables=[
-            *_make_comparisons(task, training, test, numbers),
-            make_result_table(numbers, task.search),
-        ],
+        "least."
     )
-    return suite, numbers
+    comparisons = _make_comparisons(task, (training, test), numbers)
+    tables = [*comparisons, make_result_table(numbers, task.search)]
+    return Suite("tune", f"Tuning {task.estimator} on {task.subject}", text, tables=tables), numbers
 
 
 def _make_comparisons(
-    task: EstimatorTuning,
-    training: Sequence[LoggedEpisode],
-    test: Sequence[LoggedEpisode],
-    numbers: dict[str, float],
+    task: EstimatorTuning, groups: Sequence[Sequence[LoggedEpisode]], numbers: dict[str, float]
 ) -> list[ResultTable]:
-    """Make a table of errors before and after for each scenario."""
-    default = [_compute_stable_squares(task, drives, {}) for drives in (training, test)]
-    tuned = [_compute_stable_squares(task, drives, numbers) for drives in (training, test)]
+    """Make a table of errors before and after for each scenario, in training and test drives."""
+    default = [_compute_stable_squares(task, drives, {}) for drives in groups]
+    tuned = [_compute_stable_squares(task, drives, numbers) for drives in groups]
     tables = []
     for i, scenario in enumerate(task.scenarios):
         before, after = [values[i] for values in default], [values[i] for values in tuned]
-        ratio = (
-            interval(after[1], ratio_of_roots, before[1])
-            if np.isfinite(before[1]).all() and np.isfinite(after[1]).all()
-            else Estimate(math.nan)
-        )
-        tables.append(
-            ResultTable(
-                f"{task.estimator} on {scenario} ({task.env_id})",
-                ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds"),
-                [["default", *map(_format_spread, before)], ["found", *map(_format_spread, after)]],
-                f"Found over default on the test seeds: {ratio.inline(digits='.3f')}.",
-            )
-        )
+        ratio = Estimate(math.nan)
+        if np.isfinite([before[1], after[1]]).all():
+            ratio = interval(after[1], ratio_of_roots, before[1])
+        title = f"{task.estimator} on {scenario} ({task.env_id})"
+        heads = ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds")
+        lines = [["default", *map(_format_spread, before)], ["found", *map(_format_spread, after)]]
+        note = f"Found over default on the test seeds: {ratio.inline(digits='.3f')}."
+        tables.append(ResultTable(title, heads, lines, note))
     return tables
 
 
@@ -365,9 +338,5 @@ def make_entry(
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
     q = TUNINGS.get((task.estimator, task.sensors), {}) | q
     noise = {key: value for key, value in numbers.items() if not key.startswith("q_")}
-    result: dict[str, object] = {
-        "estimator": task.estimator,
-        "sensors": task.sensors,
-        "command": command,
-    }
-    return result | {"q": q, "noise": noise} | ({"note": note} if note else {})
+    known = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
+    return {**known, "q": q, "noise": noise, **({"note": note} if note else {})}

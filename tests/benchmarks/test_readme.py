@@ -20,7 +20,7 @@ def test_the_tables_are_made_from_their_files() -> None:
     pages = {readme.README: readme._make_table(rows, transfer)}
     doubled = readme._make_doubled_table(rows)
     pages[readme.PAGE] = readme._make_task_table(rows)
-    pages[own_ground.PAGE] = own_ground.make_table(read_json(ROOT / own_ground.ROWS))
+    pages[own_ground.PAGE] = own_ground._make_table(read_json(ROOT / own_ground.ROWS))
     for path, made in pages.items():
         text = (ROOT / path).read_text()
         assert readme.replace_table(text, made) == text

@@ -57,7 +57,7 @@ def _of(command: str, function: str, *rows: Row) -> list[Case]:
 # fmt: off
 CASES = [
     *_of("run", "agents.rollout.rollout", ("--seed 3", "seed", 3)),
-    *_of("run", f"{CLI}.main.make_driver",
+    *_of("run", f"{CLI}.common.make_driver",
          ("--control-period 20", "setup.options.control_period", 20)),
     *_of("bench control", f"{CLI}.main.run_suites",
          ("--episodes 8", "request.episodes", 8),
@@ -171,15 +171,15 @@ CASES = [
 NOTHING = SimpleNamespace(spec=None, search={}, car=None, wires=None, reason="")
 RETURNED: dict[str, dict[str, Any]] = {
     "run": {
-        f"{CLI}.main.make_driver": (NOTHING, None),
-        f"{CLI}.main.show_episode": None,
+        f"{CLI}.common.make_driver": (NOTHING, None),
+        f"{CLI}.common.show_episode": None,
         "agents.rollout.rollout": None,
     },
     "bench": {
         f"{CLI}.main.check_page": None,
         f"{CLI}.main.use_engine": nullcontext(),
         f"{CLI}.main.run_suites": [],
-        f"{CLI}.main.write_output": None,
+        f"{CLI}.common.write_output": None,
     },
     "inspect": {
         "benchmarks.recorded.inspection.inspect_file": NOTHING,

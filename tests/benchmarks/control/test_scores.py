@@ -13,7 +13,7 @@ from sideslip.benchmarks.control.robustness import _compare_scores, _list_revers
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.score import (
     PairedDrives,
-    check_losses,
+    _check_losses,
     compute_log_ratios,
     rank_entries,
 )
@@ -82,7 +82,7 @@ def test_below_the_line_stand_those_that_surely_lose_more_cars() -> None:
     ranked = rank_entries(results, "road")
     assert [item.label for item in ranked][-1] == "sure" and ranked[-1].loses_more
     assert not any(item.loses_more for item in ranked[:-1])
-    assert not check_losses([PairedDrives(nominal, nominal, 1.0)]) and not check_losses([])
+    assert not _check_losses([PairedDrives(nominal, nominal, 1.0)]) and not _check_losses([])
 
 
 def test_who_leaves_out_a_task_is_ranked_behind_who_drives_it() -> None:

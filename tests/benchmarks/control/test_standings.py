@@ -119,7 +119,7 @@ def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
     found = results()
     for contest in (ONE, TWO):
         found[contest, Entry("adaptive-lqr", filter_)] = episodes(15.0)
-    assert _group_agents({"road": table(found)}).find_best() == best
+    assert _group_agents(table(found)).find_best() == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:

@@ -25,7 +25,7 @@ from sideslip.benchmarks.recorded.quality import (
 )
 from sideslip.benchmarks.recorded.replay import TRUTH_WARNING, _sort_remarks, replay_file
 from sideslip.benchmarks.report.html import write_report
-from sideslip.benchmarks.report.terminal import print_suite
+from sideslip.benchmarks.report.tables import print_suite
 from sideslip.envs.record import FAST, PACKET, Array, Log
 from sideslip.envs.recordings.log_file import make_packet_rows
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle

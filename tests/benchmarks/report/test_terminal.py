@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.harness.results import Column, ResultTable, Suite
-from sideslip.benchmarks.report.terminal import print_run, print_suite
+from sideslip.benchmarks.report.tables import print_run, print_suite
 from sideslip.estimators.make import ESTIMATORS
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
