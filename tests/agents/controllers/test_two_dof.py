@@ -10,8 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.two_dof import _compute_static_gain
-from sideslip.agents.design.pi import POLE, design_pi, sample_pi
+from sideslip.agents.controllers.two_dof import POLE, _compute_static_gain, design_pi, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import Bicycle, make_bicycle_model
 from sideslip.estimators import EstimateObservation
