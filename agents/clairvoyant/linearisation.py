@@ -85,10 +85,8 @@ def _compute_moments(
 def _advance(
     fixed: PlanParams, x: PlanState, action: Sequence[Scalar], known: PreviewStep
 ) -> tuple[PlanState, Scalar]:
-    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort.
-
-    The driver's acceleration is that of the step's start; added steering acts by its mean.
-    """
+    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort."""
+    # the driver's acceleration is that of the step's start; added steering acts by its mean
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
     speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
@@ -116,10 +114,8 @@ def _advance(
     motion = _rk4(motion, loads, forces, car, road, q * TICK, kind)
     # a rate is taken over `RATE_TICKS`, in shorter periods over one of them
     span = min(q, RATE_TICKS)
-    held, command, moment = (
-        _yaw_moment(*sides, car)
-        for sides in ((x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r))
-    )
+    sides = (x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r)
+    held, command, moment = (_yaw_moment(left, right, car) for left, right in sides)
     moments = _compute_moments(fixed, held, moment, range(-span, 0))
     moments += _compute_moments(fixed, command, moment, range(q))
     effort, steering_tick = 0.0, fixed.steering_tick
@@ -137,8 +133,7 @@ def _advance(
 def _get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
     """Get the SI unit of each state in the solver, in which all are of order one."""
     scales = {"phi_dot": 0.5} | dict.fromkeys(("phi", "slewing", "added", "slip_f", "slip_r"), 0.1)
-    torques = ("T_l", "T_r", "command_l", "command_r")
-    scales |= dict.fromkeys(torques, float(fixed.car.T_max))
+    scales |= dict.fromkeys(("T_l", "T_r", "command_l", "command_r"), float(fixed.car.T_max))
     return [scales.get(name, 1.0) for name in names]
 
 
@@ -188,9 +183,8 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     names = _list_active_states(fixed)
     scale, size = np.array(_get_state_scales(fixed, names)), len(names)
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
-    x = PlanState(*(0.0,) * len(PlanState._fields))._replace(
-        **{name: scale[i] * w[i] for i, name in enumerate(names)}
-    )
+    values = {name: scale[i] * w[i] for i, name in enumerate(names)}
+    x = PlanState(*(values.get(name, 0.0) for name in PlanState._fields))
     step_inputs = PreviewStep(*ca.vertsplit(known))
     state, effort = _advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
     next_state = ca.vertcat(*(getattr(state, name) for name in names)) / scale
@@ -207,7 +201,7 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
 
 
-def linearise_run(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation:
+def linearise(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation:
     """Linearise every period of a run; an input that the action lacks has a unit Hessian alone.
 
     Args:

@@ -21,14 +21,7 @@ from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
 from ..rollout import iterate_steps
-from .linearisation import (
-    N_INPUTS,
-    IlqrProblem,
-    Linearisation,
-    PlanRun,
-    linearise_run,
-    make_problem,
-)
+from .linearisation import N_INPUTS, IlqrProblem, Linearisation, PlanRun, linearise, make_problem
 from .preview import Forecast, PlanParams, PlanState, make_forecast, read_plan_state
 
 if TYPE_CHECKING:
@@ -134,21 +127,13 @@ def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
 
 @jit
 def _run_backward_pass(
-    linearisation: Linearisation,
-    limits: Limits,
-    inputs: Matrix,
-    length: int,
-    damping: float,
-    d: Matrix,
-    G: Matrix,
-) -> None:
-    """Run the backward pass over a run's linearisation, with damping on the diagonal of Quu.
-
-    Fills d (K, 2) and G (K, 2, size), with zeros behind the run's length: an input u of the run
-    becomes u + d + G dx, with dx the scaled state less the run's. G = -Quu^-1 Qux where both inputs
-    are free. Where the rate limits the steering, the limit moves with the last command: so does the
-    gain.
-    """
+    linearisation: Linearisation, limits: Limits, inputs: Matrix, length: int, damping: float,
+    d: Matrix, G: Matrix,
+) -> None:  # fmt: skip
+    """Run the backward pass over a run's linearisation, with damping on the diagonal of Quu."""
+    # Fills d (K, 2) and G (K, 2, size), with zeros behind the run's length: an input u of the run
+    # becomes u + d + G dx, with dx the scaled state less the run's. G = -Quu^-1 Qux where both are
+    # free. Where the rate limits the steering, the limit moves with the last command: so does G.
     # The cost to go from the next period's state is v'dx + dx'V dx / 2. With this period's cost,
     # in the state and the inputs, it is q'(dx, du) + (dx, du)'Q (dx, du) / 2.
     size = linearisation.F.shape[1]
@@ -182,11 +167,9 @@ def _run_backward_pass(
 
 
 def _simulate_run(
-    env: gym.Env[Actions, Actions],
-    seed: int,
-    actions: Array | Actions,
+    env: gym.Env[Actions, Actions], seed: int, actions: Array | Actions,
     feedback: tuple[Array, Array] | None = None,
-) -> PlanRun:
+) -> PlanRun:  # fmt: skip
     """Simulate an episode; feedback: states (K + 1, n), gains (K, width, n) on the miss."""
     env.reset(seed=seed)
     base = _get_base(env)
@@ -233,17 +216,13 @@ def _solve_ilqr(
 
 
 def _run_line_search(
-    env: gym.Env[Actions, Actions],
-    seed: int,
-    problem: IlqrProblem,
-    forecast: Forecast,
-    run: PlanRun,
-    damping: float,
-) -> tuple[PlanRun, float]:
+    env: gym.Env[Actions, Actions], seed: int, problem: IlqrProblem, forecast: Forecast,
+    run: PlanRun, damping: float,
+) -> tuple[PlanRun, float]:  # fmt: skip
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_inputs(problem, run)
-    linearisation = linearise_run(problem, forecast.known, nominal_run)
+    linearisation = linearise(problem, forecast.known, nominal_run)
     limits = _compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
     inputs[:, : fixed.width] = nominal_run.actions
@@ -256,10 +235,8 @@ def _run_line_search(
             candidate = nominal_run.actions + length * d[:, : fixed.width]
             trial = _simulate_run(env, seed, candidate, (nominal_run.states, gains))
             if trial.cost < run.cost:
-                factors = {
-                    STEP_LENGTHS[0]: 1.0 / _DAMPING_FACTOR,
-                    STEP_LENGTHS[-1]: _DAMPING_FACTOR,
-                }
+                first, *_, last = STEP_LENGTHS
+                factors = {first: 1.0 / _DAMPING_FACTOR, last: _DAMPING_FACTOR}
                 return trial, max(damping * factors.get(length, 1.0), _DAMPING_LIMITS[0])
         damping *= _DAMPING_FACTOR
     return run, damping

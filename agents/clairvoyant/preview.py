@@ -105,19 +105,14 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
     Returns:
         Forecast from the manoeuvre's start to the episode's end.
-
-    Raises:
-        ValueError: The env is elsewhere in its episode.
     """
     n = base.control_period
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock.tick] != p[P.task.lead_in]:
         raise ValueError("a forecast starts where a manoeuvre does: call reset() first")
-    start, fixed = (
-        read_plan_state(z),
-        _make_plan_params(base, p, snapshot["config"].start.switches, n),
-    )
+    start = read_plan_state(z)
+    fixed = _make_plan_params(base, p, snapshot["config"].start.switches, n)
     ticks = np.arange(fixed.periods * n + 1) + int(z[Z.clock.tick])
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
@@ -181,11 +176,6 @@ def _compute_preview(
     n, last = fixed.ticks, len(command) - 1
     nodes = np.arange(0, last, n)
     angle = states[:, Z.drive.delta_f] - states[:, Z.drive.added]
-
-    def compute_wheel_angle(places: npt.NDArray[np.int64], rest: float) -> Array:
-        # the front wheels' angle without the added one, after a tick's lag
-        return np.asarray(as_python(apply_lag)(command[places], angle[places], rest))
-
     lag, middle = fixed.steering_tick, nodes + n // 2
     wind = read(p, P.wind)
     wind_forces = np.array([compute_wind(float(tick), wind) for tick in ticks[:-1]])
@@ -208,20 +198,13 @@ def _compute_preview(
     # the last one, which counts whole, half a tick more. This is exact for n = 1.
     weights = np.full(len(nodes), n * TICK)
     weights[0] = 0.5 * (n - 1) * TICK
-    table = (
-        compute_wheel_angle(nodes, lag.start),
-        compute_wheel_angle(middle, lag.middle if n % 2 else lag.start),
-        compute_wheel_angle(nodes + n - 1, lag.end),
-        command[nodes],
-        *mean_forces.T,
-        *tyres,
-        *set_points.T,
-        turns.reshape(-1, n).mean(axis=1),
-        weights,
-        *states[np.ix_(nodes, Z.refs)].T,
-        np.ones(len(nodes)),
-    )
-    known = np.array(PreviewStep._make(table))
+    rests = lag.start, lag.middle if n % 2 else lag.start, lag.end
+    places = zip((nodes, middle, nodes + n - 1), rests, strict=True)
+    # the front wheels' angle without the added one, after a tick's lag
+    wheels = [as_python(apply_lag)(command[i], angle[i], rest) for i, rest in places]
+    turn, refs = turns.reshape(-1, n).mean(axis=1), states[np.ix_(nodes, Z.refs)].T
+    inputs = *wheels, command[nodes], *mean_forces.T, *tyres, *set_points.T
+    known = np.array([*inputs, turn, weights, *refs, np.ones(len(nodes))])
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
     column, is_complete = PreviewStep._fields.index, ticks[-1] == fixed.task.duration
     end[column("command")] = command[last]

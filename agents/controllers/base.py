@@ -12,6 +12,7 @@ from ...envs.engine.config import make_car
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import ARRAYS, Scalar
 from ...envs.record import Array
+from ...envs.task import REFERENCES, make_reference_params
 from ...envs.vehicle.actuators import compute_torque_limit
 from ...envs.vehicle.linear import Bicycle
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
@@ -26,29 +27,22 @@ class Controller(ABC):
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
-    (N, memory). A controller serves a single env or all rows of a vector env, which then share its
-    design.
+    (N, memory). A controller serves a single env or all rows of a vector env, with one design.
 
-    Where a needed entry is not finite the action is NaN and the memory stays as it was, which makes
-    a failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
+    A missing entry is a ValueError. Where an entry is not finite the action is NaN and the memory
+    stays as it was, which makes a failed estimator visible: an env with `on_bad_action="fail"` ends
+    the episode, others raise.
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
         grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
             force. None: no such limit. Friction is `true_friction`, else the nominal car's.
-
-    Attributes:
-        needs: Entries of the observation that the controller reads.
-        memory: Numbers of memory for each row.
-
-    Raises:
-        ValueError: A needed entry is missing, `grip` is not positive, or rows have different
-            nominals.
     """
 
-    needs: tuple[str, ...] = ()
-    memory = 0
+    needs: tuple[str, ...] = ()  # entries of the observation that the controller reads
+    memory = 0  # numbers of memory for each row
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
+    vehicle: Vehicle  # the car that the controller is designed for
     _design: tuple[Any, ...]  # the last argument of a compiled law
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
@@ -67,8 +61,8 @@ class Controller(ABC):
         self.nominal = self.vehicle = facts.nominal
         self.full_scale, self.authority = facts.full_scale, facts.authority
         self.control_period, self.reference = facts.control_period, facts.reference
-
-    vehicle: Vehicle  # the car that the controller is designed for
+        self._reference_kind = REFERENCES.index(facts.reference)
+        self._target = make_reference_params(facts.nominal)
 
     def __repr__(self) -> str:
         grip = "" if self.grip is None else f", grip {self.grip:g}"
@@ -121,12 +115,9 @@ class Controller(ABC):
         """
 
     def predict(
-        self,
-        observation: npt.NDArray[np.float32],
-        state: Array | None = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[npt.NDArray[np.float32], Array]:
+        self, observation: npt.NDArray[np.float32], state: Array | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None, deterministic: bool = True,
+    ) -> tuple[npt.NDArray[np.float32], Array]:  # fmt: skip
         """Compute the action for an observation or a batch.
 
         Args:
@@ -137,9 +128,6 @@ class Controller(ABC):
 
         Returns:
             Action in [-1, 1], shape (width,) or (N, width), and the next state.
-
-        Raises:
-            ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
         if obs.shape[-1] != self._n_entries or obs.ndim > 2:
@@ -170,7 +158,7 @@ def _describe_wrapper(missing: list[str]) -> str:
 
 
 def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
-    """Return a number that must be positive and finite.
+    """Return a number that must be positive and finite; TypeError or ValueError for another.
 
     Args:
         name: Name of the option, for the message.
@@ -179,10 +167,6 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
 
     Returns:
         The number as a float.
-
-    Raises:
-        TypeError: It is no number.
-        ValueError: The number is out of range.
     """
     if not isinstance(value, Real):
         raise TypeError(f"{name} is a number, got {value!r}")

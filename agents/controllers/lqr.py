@@ -12,7 +12,6 @@ import numpy.typing as npt
 from ...envs.numerics.jit import copy_into, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
 from ...envs.record import Array
-from ...envs.task import REFERENCES
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
@@ -113,17 +112,10 @@ class Lqr(Controller):
     min_period = 1  # ticks, of the period that the gains are designed for
 
     def __init__(
-        self,
-        env: AnyEnv,
-        disturbance_time: float = 0.3,
-        vehicle: VehicleSource | None = None,
-        stiffness: Sequence[str] = (),
-        span: tuple[float, float] = (0.5, 1.6),
-        knots: int = 7,
-        steer_weight: float = 1.0,
-        grip: float | None = None,
-        knows_car: bool = False,
-    ) -> None:
+        self, env: AnyEnv, disturbance_time: float = 0.3, vehicle: VehicleSource | None = None,
+        stiffness: Sequence[str] = (), span: tuple[float, float] = (0.5, 1.6), knots: int = 7,
+        steer_weight: float = 1.0, grip: float | None = None, knows_car: bool = False,
+    ) -> None:  # fmt: skip
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
@@ -132,13 +124,10 @@ class Lqr(Controller):
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if set(pair) <= set(names)), "none")
         substitutes = ("beta_ref", "beta_ref")
-        self.needs = (
-            *Inputs._fields[: IN.gamma_hat],
-            "gamma_hat" if "gamma_hat" in names else "gyro",
-            *pairs.get(kind, substitutes),
-            *(stiffness or substitutes),
-            *self._list_extra_entries(names),
-        )
+        yaw_rate = "gamma_hat" if "gamma_hat" in names else "gyro"
+        extra = *pairs.get(kind, substitutes), *(stiffness or substitutes)
+        self.needs = *Inputs._fields[: IN.gamma_hat], yaw_rate, *extra
+        self.needs += self._list_extra_entries(names)
         self._car_columns: slice | None = None
         self._by_car: dict[bytes, Lqr] = {}
         if knows_car:
@@ -150,11 +139,11 @@ class Lqr(Controller):
         self._steer_unit = self.authority  # of the added steering that is remembered
         self.remembered = 2 if rate > 0.0 else 0  # numbers at the end of the memory
         self.memory = self.width - 1 + self.remembered
-        period, judged = max(self.control_period, self.min_period), REFERENCES.index(self.reference)
+        period = max(self.control_period, self.min_period)
         time = check_positive("disturbance_time", disturbance_time)
         weight = check_positive("steer_weight", steer_weight)
         plant = period, self.full_scale, self.width == 2
-        self.design_spec = DesignSpec(*plant, judged, kind, time, weight, rate)
+        self.design_spec = DesignSpec(*plant, self._reference_kind, kind, time, weight, rate)
         factors = np.geomspace(*span, knots) if stiffness else np.zeros(0)
         nominals = car.front_stiffness, car.rear_stiffness
         self._design_gains(car, *(tuple((nominal * factors).tolist()) for nominal in nominals))

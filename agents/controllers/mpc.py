@@ -81,19 +81,12 @@ class Mpc(Lqr):
         status: Status of each row in the last call: "solved", "solved inaccurate" (ten times the
             tolerance of 1e-4 of full scale), or why there is no solution and the action is NaN.
         solve_time: Time of the solver for each row (s).
-
-    Raises:
-        ModuleNotFoundError: The extra `mpc` is not installed.
     """
 
     def __init__(
-        self,
-        env: AnyEnv,
-        horizon: int = 30,
-        iterations: int = 20000,
-        disturbance_time: float = 0.3,
-        grip: float | None = None,
-    ) -> None:
+        self, env: AnyEnv, horizon: int = 30, iterations: int = 20000,
+        disturbance_time: float = 0.3, grip: float | None = None,
+    ) -> None:  # fmt: skip
         try:
             import osqp
         except ModuleNotFoundError:

@@ -12,18 +12,13 @@ from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
-from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
+from ...envs.task import LAGGED, ReferenceParams, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource
 from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
-from ..design.prediction import (
-    PredictionModel,
-    PredictionStart,
-    PredictionTask,
-    make_prediction_model,
-)
+from ..design.prediction import PredictionModel, PredictionStart, PredictionTask, make_prediction
 from ..design.sampled_model import interpolate_gains
 from ..env_info import AnyEnv, list_plant_kinds
 from .base import check_positive
@@ -38,7 +33,7 @@ TYRES = ("front_tyres_hat", "rear_tyres_hat")
 INVERSE_FRICTION = "inverse_friction_hat"
 _MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 
-# Added steering last commanded (rad) and index in `STATUSES`; the plan's variables follow, and what
+# Added steering last commanded (rad) and status; the plan's variables follow, and what
 # `Lqr` remembers of the yaw moment.
 Memory = namedtuple("Memory", "added_command status")
 LAST = Memory(*range(2))
@@ -182,11 +177,8 @@ class Nmpc(Lqr):
     motors and limits are those of the nominal car, or of the true one where the observation has
     them (`stiffness`, `true_friction`). The driver's command and acceleration are held. The plan is
     added to `lqr`'s action, within the limits of moment, `grip`, steering and its rate. Where no
-    limit is met and the car is linear the action is `lqr`'s. Each decision starts from the last
-    plan.
-
-    It also reads phi_hat and phi_rate_hat where they are there. Where no prediction is finite the
-    action is NaN.
+    limit is met and the car is linear the action is `lqr`'s. It also reads phi_hat and phi_rate_hat
+    where they are there. Where no prediction is finite the action is NaN.
 
     Args:
         env: Env of the controller.
@@ -200,49 +192,37 @@ class Nmpc(Lqr):
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
         knows_car: Whether each row's car is in the observation, as for `Lqr`.
-
-    Raises:
-        ValueError: An option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP
     knows_friction = True
 
     def __init__(
-        self,
-        env: AnyEnv,
-        horizon: float = 0.5,
-        iterations: int = 2,
-        disturbance_time: float = 0.3,
-        vehicle: VehicleSource | None = None,
-        stiffness: Sequence[str] = (),
-        span: tuple[float, float] = (0.5, 1.6),
-        knots: int = 7,
-        steer_weight: float = 10.0,
-        grip: float | None = None,
-        knows_car: bool = False,
-    ) -> None:
+        self, env: AnyEnv, horizon: float = 0.5, iterations: int = 2, disturbance_time: float = 0.3,
+        vehicle: VehicleSource | None = None, stiffness: Sequence[str] = (),
+        span: tuple[float, float] = (0.5, 1.6), knots: int = 7, steer_weight: float = 10.0,
+        grip: float | None = None, knows_car: bool = False,
+    ) -> None:  # fmt: skip
         options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, knows_car
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
-        spec, target = self.design_spec, make_reference_params(self.nominal)
+        spec = self.design_spec
         steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
         blocks = _make_blocks(steps, MAX_VARIABLES // self.width)
         self.memory = PLAN + self.width * len(blocks) + self.remembered
         self._plant, *others = list_plant_kinds(env)
         if others:
-            raise ValueError(
-                "the rows of a vector env share one prediction, but their plants differ"
-            )
+            raise ValueError("rows of a vector env share one prediction, but their plants differ")
         disturbed = ("none", "forces", "rates").index(spec.disturbances)
         lasting = blocks, disturbed, self.control_period / spec.period, iterations
-        self.design = self._make_design(target, *lasting)
+        self.design = self._make_design(*lasting)
 
-    def _make_design(self, target: ReferenceParams, *lasting: Any) -> Design:
+    def _make_design(self, *lasting: Any) -> Design:
         """Make the parts of all decisions from the gains and what lasts when these change."""
-        spec, tables = self.design_spec, (self.table[..., : -self.width], self._terminal)
-        model = make_prediction_model(self.vehicle, self._plant, spec, target, self.authority)
+        tables, target = (self.table[..., : -self.width], self._terminal), self._target
+        plant = self.vehicle, self._plant, self.design_spec
+        model = make_prediction(*plant, target, self.authority)
         gains, terminal = map(np.ascontiguousarray, tables)
         return Design(model, target, gains, terminal, self.axes, int(self.scheduled), *lasting)
 
@@ -250,7 +230,7 @@ class Nmpc(Lqr):
         fitted = fit_fiala(car) if self._plant.tyres == "magic-formula" else car
         other = super()._design_anew(fitted)
         assert isinstance(other, Nmpc)
-        other.design = other._make_design(self.design.target, *self.design[-4:])
+        other.design = other._make_design(*self.design[-4:])
         return other
 
     def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -273,9 +253,9 @@ class Nmpc(Lqr):
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
     def _compute_actions(self, inputs: Array, state: Array, action: Array) -> None:
-        rolls = (
-            inputs[:, len(IN) : len(IN) + 2] if self._rolling else np.full((len(inputs), 2), np.nan)
-        )
+        rolls = np.full((len(inputs), 2), np.nan)
+        if self._rolling:
+            rolls = inputs[:, len(IN) : len(IN) + 2]
         limits = self._compute_max_moment(inputs), np.ascontiguousarray(self._get_friction(inputs))
         _nmpc_law(inputs, state, action, *limits, np.ascontiguousarray(rolls), self.design)
 

@@ -59,9 +59,6 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
 
     Returns:
         Gains k_p (N m/rad) and k_i (N m/(rad s)).
-
-    Raises:
-        ValueError: The placement is unknown, or the pole is not positive.
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
@@ -89,26 +86,11 @@ def _limit_gain(vehicle: Vehicle, k_p: float) -> float:
     return min(max(float(k_p), -max_gain), max_gain)
 
 
-def sample_pi(
-    vehicle: Vehicle, speed: float, period: float, pole: float = POLE, placement: str = "radius"
-) -> PI:
-    """Design the PI of `design_pi` for a sampled loop with the moment held between.
-
-    The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
-    (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product of
-    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period. As
-    there, the real parts of complex poles are taken: a_1 = a_2, and the zero cancels no pole.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        period: Sampling period T (s).
-        pole: Radius or place of the closed-loop poles (rad/s).
-        placement: "radius" or "real".
-
-    Returns:
-        Gains k_p (N m/rad) and k_i (N m/(rad s)).
-    """
+def _sample_pi(vehicle: Vehicle, speed: float, period: float, pole: float, placement: str) -> PI:
+    """Design the PI of `design_pi` for a sampled loop, with the moment held between."""
+    # The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
+    # (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product
+    # of the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period.
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
     p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
@@ -136,17 +118,14 @@ def sample_pi(
         upper = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
         factor = 4.0 if upper is None else brentq(compute_excess, upper - 0.05, upper)
         k_p = continuous * factor
-    k_p = _limit_gain(vehicle, float(k_p))
+    k_p = _limit_gain(vehicle, k_p)
     return PI(k_p, k_p * (1.0 - a_1) / period)
 
 
 @jit
 def _compute_denominator(car: Bicycle, V: Scalar) -> Scalar:
-    """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
-
-    At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
-    a speed, m V^2 = 2 (l_r C_r - l_f C_f).
-    """
+    """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes."""
+    # zero, at m V^2 = 2 (l_r C_r - l_f C_f), is where the yaw moment does not move a steady beta
     mV2, excess = car.m * V * V, car.l_f * car.C_f - car.l_r * car.C_r
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
@@ -241,7 +220,7 @@ class TwoDof(Controller):
         gain: Factor on the PI's gains.
         pole: Pole of the closed loop (rad/s), as for `design_pi`.
         placement: Rule of the pole, as for `design_pi`.
-        sampled: Whether to place the poles of the sampled loop (`sample_pi`).
+        sampled: Whether to place the poles of the sampled loop.
         grip: Grip limit, as for `Controller`.
         feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
     """
@@ -250,28 +229,21 @@ class TwoDof(Controller):
     memory = len(Memory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        rate: str = "control",
-        gain: float = 1.0,
-        pole: float = POLE,
-        placement: str = PLACEMENTS[0],
-        sampled: bool = False,
-        grip: float | None = None,
+        self, env: AnyEnv, rate: str = "control", gain: float = 1.0, pole: float = POLE,
+        placement: str = PLACEMENTS[0], sampled: bool = False, grip: float | None = None,
         feedforward: str = FEEDFORWARDS[0],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(env, grip)
         if feedforward not in FEEDFORWARDS:
-            raise ValueError(
-                f"feedforward is one of {', '.join(FEEDFORWARDS)}, got {feedforward!r}"
-            )
+            known = ", ".join(FEEDFORWARDS)
+            raise ValueError(f"feedforward is one of {known}, got {feedforward!r}")
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
         factor = check_positive("gain", gain, allow_zero=True)
-        design = partial(sample_pi, period=dt) if sampled else design_pi
+        design = partial(_sample_pi, period=dt) if sampled else design_pi
         pis = [design(self.nominal, float(v), pole=pole, placement=placement) for v in SPEEDS]
         self.k_p, self.k_i = np.ascontiguousarray((factor * np.array(pis)).T)
         follows, gains = int(feedforward == FEEDFORWARDS[0]), (self.k_p, self.k_i)

@@ -14,15 +14,7 @@ import numpy as np
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
-from ...envs.task import (
-    LAGGED,
-    LIMITED,
-    REFERENCES,
-    ZERO_SLIP,
-    ReferenceParams,
-    compute_reference,
-    make_reference_params,
-)
+from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
 from ...envs.vehicle.parameters import Vehicle
@@ -141,14 +133,9 @@ class Esc(Controller):
     memory = 1
 
     def __init__(
-        self,
-        env: AnyEnv,
-        bandwidth: float = BANDWIDTH,
-        band: float = 0.02,
-        slip: float = 0.05,
-        stiffness: float | None = None,
-        grip: float | None = None,
-    ) -> None:
+        self, env: AnyEnv, bandwidth: float = BANDWIDTH, band: float = 0.02, slip: float = 0.05,
+        stiffness: float | None = None, grip: float | None = None,
+    ) -> None:  # fmt: skip
         bounded = "beta_hat" in get_env_facts(env).names
         self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
         super().__init__(env, grip)
@@ -158,10 +145,9 @@ class Esc(Controller):
         if stiffness is None:
             stiffness = self.full_scale / slip
         bound = slip, check_positive("stiffness", stiffness, allow_zero=True), int(bounded)
-        target, speeds = make_reference_params(self.nominal), np.array(SPEEDS)
         gains = np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS])
-        time = self.control_period * TICK
-        self._design = target, speeds, gains, float(band), *bound, self.full_scale, time
+        scales, table = (self.full_scale, self.control_period * TICK), (np.array(SPEEDS), gains)
+        self._design = self._target, *table, float(band), *bound, *scales
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _esc_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
@@ -229,8 +215,7 @@ class SlidingMode(Controller):
     The equivalent control of the nominal car at the measured speed keeps s constant. Within the
     boundary layer s decays at `rate`, outside at rate x layer (rad/s2). xi makes beta's error decay
     at `pole`. Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps beta_ref.
-    Reads beta_hat, and gamma_hat or else the gyro.
-    Source: Rajamani, Vehicle Dynamics and Control, 8.3.
+    Reads beta_hat, and gamma_hat or else the gyro. Source: Rajamani, Vehicle Dynamics, 8.3.
 
     Args:
         env: Env of the controller, with beta_hat in its observation.
@@ -243,21 +228,16 @@ class SlidingMode(Controller):
     memory = len(SlidingModeMemory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        pole: float = 15.0,
-        rate: float = 40.0,
-        layer: float = 0.2,
+        self, env: AnyEnv, pole: float = 15.0, rate: float = 40.0, layer: float = 0.2,
         grip: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         yaw_rate = "gamma_hat" if "gamma_hat" in get_env_facts(env).names else "gyro"
         self.needs = (*SlidingModeInputs._fields[: SLIDING_IN.gamma_hat], yaw_rate)
         super().__init__(env, grip)
         self.pole, self.rate = check_positive("pole", pole), check_positive("rate", rate)
         surface = self.pole, self.rate, check_positive("layer", layer)
-        target, kind = make_reference_params(self.nominal), REFERENCES.index(self.reference)
         scales = self.full_scale, self.control_period * TICK
-        self._design = self._bicycle, target, kind, *surface, *scales
+        self._design = self._bicycle, self._target, self._reference_kind, *surface, *scales
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
@@ -333,20 +313,14 @@ class ModelFollowing(Controller):
         bandwidth: K_beta and K_gamma (rad/s).
         rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: The action does not steer, or the bandwidth is no pair.
     """
 
     memory = len(ModelMemory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        bandwidth: Sequence[float] = MODEL_BANDWIDTH,
-        rejection: bool = True,
+        self, env: AnyEnv, bandwidth: Sequence[float] = MODEL_BANDWIDTH, rejection: bool = True,
         grip: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         substitutes = {} if "gamma_hat" in get_env_facts(env).names else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
             substitutes |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
@@ -357,9 +331,8 @@ class ModelFollowing(Controller):
         K = [float(value) for value in bandwidth]
         if len(K) != 2 or not all(0.0 < value < math.inf for value in K):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
-        target, kind = make_reference_params(self.nominal), REFERENCES.index(self.reference)
-        gains, scales = (np.array(K), float(rejection)), (self.full_scale, self.authority)
-        self._design = self._bicycle, target, kind, *gains, *scales, self.control_period * TICK
+        car = self._bicycle, self._target, self._reference_kind, np.array(K), float(rejection)
+        self._design = *car, self.full_scale, self.authority, self.control_period * TICK
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _model_following_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

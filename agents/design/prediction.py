@@ -118,17 +118,14 @@ class PlanBatch(NamedTuple):
 
 
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Compute mean and standard deviation, over a step's ticks, of a lag's remaining fraction.
-
-    This rho is what a lag leaves of the deviation from a command. The mean square of
-    command + deviation rho is (command + deviation mean)^2 + (deviation std)^2.
-    """
+    """Compute mean and standard deviation, over a step's ticks, of a lag's remaining part rho."""
+    # the mean square of command + deviation rho is (command + deviation mean)^2 + (deviation std)^2
     tick = make_lag(time_constant, TICK)
     rho = tick.mean * tick.end ** np.arange(ticks)
     return float(rho.mean()), float(rho.std())
 
 
-def make_prediction_model(
+def make_prediction(
     vehicle: Vehicle, plant: PlantKind, spec: DesignSpec, target: ReferenceParams, authority: float
 ) -> PredictionModel:
     """Make the model of a car in a design's periods, with its cost.
@@ -206,13 +203,9 @@ def _detect_limit(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 @inline
 def _multiply_row(
-    M: Matrix,
-    row: int,
-    model: PredictionModel,
-    driver: Scalar,
-    state: _PredictionState,
+    M: Matrix, row: int, model: PredictionModel, driver: Scalar, state: _PredictionState,
     beta: Scalar,
-) -> Scalar:
+) -> Scalar:  # fmt: skip
     """Multiply a row of M, K or T of shape (rows, 9 or 11), by the states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     first = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
@@ -352,15 +345,14 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             state, efforts = _predict_step(
                 model, start, state, share, added_command, share_beyond, steer_beyond
             )
-            beta = compute_sideslip_angle(
-                state.motion.v_x, state.motion.v_y, model.kind.small_angle
-            )
+            motion = state.motion
+            beta = compute_sideslip_angle(motion.v_x, motion.v_y, model.kind.small_angle)
             # J sums the ticks after the start: trapezoid rule over the ends of the steps, plus half
             # a tick because the last tick counts whole
             node = math.sqrt(model.step if row < last else 0.5 * (model.step + TICK))
             span = math.sqrt(model.step)
             store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)
-            gamma_error = state.motion.gamma - state.gamma_ref
+            gamma_error = motion.gamma - state.gamma_ref
             store_element(residuals, node * model.per_gamma * gamma_error, row + 1)
             store_element(residuals, span * efforts[0], row + 2)
             store_element(residuals, span * efforts[1], row + 3)

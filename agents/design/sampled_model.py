@@ -55,12 +55,9 @@ class DesignSpec:
     @property
     def cost_weights(self) -> tuple[float, ...]:
         """Weights of sideslip angle, yaw rate, yaw moment and added steering in the cost."""
-        return (
-            1.0 / BETA_SCALE**2,
-            0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
-            EFFORT_WEIGHT,
-            self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0,
-        )
+        gamma = 0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2
+        steer = self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0
+        return 1.0 / BETA_SCALE**2, gamma, EFFORT_WEIGHT, steer
 
     @property
     def inputs(self) -> tuple[str, ...]:
