@@ -190,8 +190,8 @@ def make_oracle(
         settings["vehicle"] = base.vehicle
         known = {"stiffness": [f"true_{x}" for x in STIFFNESSES]}
         settings |= known if world.is_ideal else {"knows_car": True}
-    controller_class = Nmpc if is_predictive else Lqr
-    return env, controller_class(env, **settings | dict(chosen["controller"]))
+    settings |= dict(chosen["controller"])
+    return env, Nmpc(env, **settings) if is_predictive else Lqr(env, **settings)
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:

@@ -225,8 +225,7 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
 
 def _select_gains(plant: LinearPlant, gains: Array) -> Array:
     """Select, from gains (..., n) on the state, those (..., 5) on the entries `Lqg.needs`."""
-    names = plant.model.states
-    selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
+    selected = gains[..., [plant.model.states.index(name) for name in (*OUTPUTS, "driver")]]
     selected[..., -1] *= plant.decay
     return selected
 

@@ -128,15 +128,12 @@ class Card:
 
 
 def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
-    """Check that a foreign file names no code to import.
+    """Check that a foreign file names no code to import; ValueError where it does.
 
     Args:
         env_id: Id of a registered env.
         estimator: Name of an estimator, or "".
         estimator_options: Arguments of `EstimateObservation`, without an estimator.
-
-    Raises:
-        ValueError: The id or the estimator is an entry point or a file.
     """
     if "estimator" in estimator_options:
         raise ValueError("estimator_options holds an estimator, which is none of its options")
@@ -207,9 +204,6 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         path: Path that ends in `.safetensors`.
         network: Network to write.
         card: Card of its training.
-
-    Raises:
-        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -312,9 +306,9 @@ def _build_network(fields: Any, tensors: Tensors) -> Network:
         layers = range(len(fields["hidden"]) + 1)
         weights = [unused.pop(f"weight_{i}") for i in layers]
         biases = [unused.pop(f"bias_{i}") for i in layers]
-        form = (fields[name] for name in ("activation", "output", "clip", "history"))
-        mean, scale = unused.pop("mean"), unused.pop("scale")
-        network = Network(mean, scale, weights, biases, *form, cells)
+        form = {name: fields[name] for name in ("activation", "output", "clip", "history")}
+        arrays = unused.pop("mean"), unused.pop("scale"), weights, biases
+        network = Network(*arrays, **form, cells=cells)
     except KeyError as error:
         raise ValueError(f"the tensor {error} is missing") from None
     except (TypeError, IndexError):
@@ -335,7 +329,7 @@ def _build_cell(prefix: str, kind: str, _: int, *traces: Any, unused: Tensors) -
 
 
 class PolicyController(Controller):
-    """The deterministic action of a policy's network, clipped to [-1, 1].
+    """The deterministic action of a policy's network, clipped; ValueError for an unfit env.
 
     It reads the entries of its training by name, so a wider observation serves as well. Entries
     that never varied in training are not read. Where the env steers and the policy does not, the
@@ -344,9 +338,6 @@ class PolicyController(Controller):
     Args:
         env: Env of the controller.
         policy: Shipped name, file's path, or `Policy`.
-
-    Raises:
-        ValueError: The env's entries, units, control period, world or action are not the policy's.
     """
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy) -> None:

@@ -2,8 +2,8 @@
 
 docs/howto/live.md has their format, of which a change is another VERSION, but for STATUS, which no
 other program gets. A fast row, an INERTIAL datagram, ends its tick; packets of slow sensors belong
-to the next row. They were captured their age before their stamp or, where that is 0, before that
-row. Equal batches give equal ticks, so that a session can be replayed.
+to the next row, captured their age before their stamp or, where that is 0, before that row. Equal
+batches give equal ticks.
 """
 
 import math

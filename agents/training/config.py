@@ -228,8 +228,7 @@ class TrainingTask:
         Returns:
             New vector env.
         """
-        options = self.options(num_envs)
-        return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
+        return make_native_env(self.env_id, num_envs, self.estimator_kwargs, self.options(num_envs))
 
     def make_model_options(self, seconds: float) -> Settings:
         """Make the arguments of the algorithm's class, in JSON types.

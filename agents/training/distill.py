@@ -1,12 +1,10 @@
 """Distillation: a policy with memory imitates a teacher with more information, by DAgger.
 
-A teacher drives cars of its own, with any sensors, filter or truth, in lockstep with the
-student's: equal seeds and actions give equal motion to the last bit. In the first round the
-teacher acts, with coloured noise, in later ones the student; the teacher's action is always the
-label (Ross et al., AISTATS 2011).
-
-The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
-matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
+A teacher drives cars of its own, with any sensors, filter or truth, in lockstep with the student's.
+In the first round the teacher acts, with coloured noise, in later ones the student; the teacher's
+action is always the label (Ross et al., AISTATS 2011). The loss is what an action's error adds to
+the cost of the rest of the drive, by the Riccati matrix of the teacher's design, over the cost of
+the episode: the score's logarithm, linearised.
 """
 
 import itertools
@@ -133,8 +131,7 @@ def _collect_demonstrations(
     x, y, privileged, valid = (np.stack(part, axis=1) for part in zip(*steps, strict=True))
     curvature = np.eye(teacher.width, dtype=np.float32)
     if isinstance(teacher, Lqr):  # S of its design at the mean speed, `Lqr.curvature`
-        names = [entry.name for entry in cars.layout]
-        speed = float(x[..., names.index("wheel_left")].mean())
+        speed = float(x[..., [e.name for e in cars.layout].index("wheel_left")].mean())
         curvature = teacher.curvature(speed).astype(np.float32)
     weights = (valid / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
     return Demonstrations(x, y, privileged, weights, curvature, costs)
@@ -170,8 +167,7 @@ def distill(
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
-    sizes = len(cars.layout), cars.single_action_space.shape[0]
-    model = Student(*sizes, config, n_privileged)
+    model = Student(len(cars.layout), cars.single_action_space.shape[0], config, n_privileged)
 
     def save_round(scaling: Scaling, result: RoundResult) -> Policy:
         cpu_seconds = round(time.process_time() - start_time, 1)

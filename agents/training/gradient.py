@@ -72,8 +72,7 @@ class GruPolicy(BasePolicy):
         Returns:
             Actions and next state.
         """
-        z = self.features_extractor(observations)
-        _, after = self.cell(z[None], state[None])
+        _, after = self.cell(self.features_extractor(observations)[None], state[None])
         return self.layers(after[0]), after[0]
 
     def _begin(self, count: int) -> torch.Tensor:
