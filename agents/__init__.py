@@ -16,58 +16,31 @@ from .controllers.yaw_stability import Esc, ModelFollowing, SlidingMode
 from .env_info import AnyEnv
 from .learned.policy import ZIP, PolicyController, is_policy, list_shipped
 
+# Every agent that has a name, but for policies: the package's own and those registered.
 AGENTS = Registry(
     "agent",
     {
-        "none": NoControl,
-        "feedforward": Feedforward,
-        "two-dof": TwoDof,
-        "model-following": ModelFollowing,
-        "esc": Esc,
-        "sliding-mode": SlidingMode,
-        "lqr": Lqr,
-        "adaptive-lqr": AdaptiveLqr,
-        "adaptive-nmpc": AdaptiveNmpc,
-        "mpc": Mpc,
-        "nmpc": Nmpc,
-        "lane-keeping": LaneKeeping,
-        "learned": PolicyController,
+        "none": NoControl, "feedforward": Feedforward, "two-dof": TwoDof,
+        "model-following": ModelFollowing, "esc": Esc, "sliding-mode": SlidingMode, "lqr": Lqr,
+        "adaptive-lqr": AdaptiveLqr, "adaptive-nmpc": AdaptiveNmpc, "mpc": Mpc, "nmpc": Nmpc,
+        "lane-keeping": LaneKeeping, "learned": PolicyController,
     },
-)
-"""Every agent that has a name, but for policies: the package's own and those registered."""
+)  # fmt: skip
 
 __all__ = [
-    "AGENTS",
-    "AdaptiveLqr",
-    "AdaptiveNmpc",
-    "Agent",
-    "Controller",
-    "Esc",
-    "Feedforward",
-    "LaneKeeping",
-    "Lqr",
-    "ModelFollowing",
-    "Mpc",
-    "Nmpc",
-    "NoControl",
-    "PolicyController",
-    "SlidingMode",
-    "TwoDof",
-    "make_agent",
-    "register_agent",
-]
+    "AGENTS", "AdaptiveLqr", "AdaptiveNmpc", "Agent", "Controller", "Esc", "Feedforward",
+    "LaneKeeping", "Lqr", "ModelFollowing", "Mpc", "Nmpc", "NoControl", "PolicyController",
+    "SlidingMode", "TwoDof", "make_agent", "register_agent",
+]  # fmt: skip
 
 
 class Agent(Protocol):
     """An actor in an env: a model of stable-baselines3, a controller, or a user's own object."""
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         """Compute the action for an observation.
 
         Args:
@@ -98,7 +71,7 @@ def make_agent(
     Args:
         name: Name in `AGENTS`, shipped policy, `.../NAME.safetensors`, `.../NAME.zip` of a
             stable-baselines3 model trained on this env, "package.module:Name", "FILE.py:Name"; a
-            factory, called with the env and the options; or an `Agent`, which is returned.
+            factory, called with env and options; or an `Agent`, which is returned.
         env: Env of this package.
         trust: Whether a zip may be read, which can run code of its author.
         options: Arguments of the controller, or of `agents.training.export.policy_from_zip`.

@@ -1,16 +1,15 @@
 """Oracles, controllers that know more and more of the truth, and the tuned options of entries.
 
 An entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone, and the
-better of the two that know state, disturbances and car: "Cost and score" of docs/ARCHITECTURE.md.
-`sideslip tune controller` finds the options of `tuned.toml`, by the class of tasks: a car with its
-disturbances and its reference, such as "coms-model" or "car-steering".
+better of the two that know state, disturbances and car. `sideslip tune controller` finds the
+options of `tuned.toml` by class of tasks: car, disturbances and reference, as in "coms-model".
 """
 
 import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -40,30 +39,26 @@ ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
 `STATE_ORACLES` also the state and the disturbances; neither controller is always the better one."""
 
 FILTER = "exact-kf"
-_TYRE_OPTIONS = {"wary": 10} | dict.fromkeys(
-    ("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1
-)
-"""Options of an oracle's filter for tyres with a limit: it knows them to a tenth, for its tyre law
-differs from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
+# Options of an oracle's filter for tyres with a limit: it knows them to a tenth, for its tyre law
+# differs from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much.
+_TYRE_SDS = ("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd")
+_TYRE_OPTIONS = {"wary": 10} | dict.fromkeys(_TYRE_SDS, 0.1)
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; sqrt(1 - 0.7^2) is left laterally
 STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `lqr` does not design
-_NOISE = dict(
-    gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
-)
+_NOISE = {"gyro": "gyro_noise", "accel": "accel_y_noise", "camera_psi": "psi_noise",
+          "camera_y": "y_l_noise"}  # fmt: skip
 CONSTANT_ERRORS = (
     *("camera_yaw", "camera_pitch", "camera_height", "gyro_scale", "gyro_drift", "accel_scale"),
     *("accel_roll", "accel_ahead", "gps_stamp", "map_lag"),
-)
-"""Constant errors of sensors from which no reference is made; who knows them subtracts them."""
+)  # constant errors of sensors from which no reference is made; who knows them subtracts them
 _ACCELERATION = 2.0  # m/s2 to the side, of a manoeuvre
 _BANK_TIME = 10.0  # s within which a wavy road forgets its bank
 _WAVE = math.sqrt(0.5)  # root mean square of a wave, or of two axles' spreads, over its amplitude
 FILE = Path(__file__).with_name("tuned.toml")
 PARTS = ("filter", "controller")
-Options = dict[str, dict[str, Any]]
-"""Options of the filter and of the controller, by `PARTS`."""
+Options = dict[str, dict[str, Any]]  # options of the filter and of the controller, by `PARTS`
 
 
 def make_noise_options(
@@ -71,10 +66,9 @@ def make_noise_options(
 ) -> dict[str, Any]:
     """Make options of `exact-kf` from the noise and the disturbances of a scenario.
 
-    The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
-    is read where the body rolls, as the filter then assumes. In a world that is not ideal, what can
-    be seen of its errors has states, and the rest counts as noise: what is unknown of the tyres as
-    forces, a late map as noise of the heading, a late GPS as noise of the course.
+    The accelerometer is read where the body rolls, as the filter then assumes. In a world that is
+    not ideal, what can be seen of its errors has states, and the rest counts as noise: what is
+    unknown of the tyres as forces, a late map as noise of the heading, a late GPS of the course.
 
     Args:
         scenario: Scenario whose noise the filter knows.
@@ -85,17 +79,13 @@ def make_noise_options(
         Options by name; `camera_yaw_sd` needs a camera.
     """
     noise, share = scenario.noise, HDOP_LAWS[scenario.hdop_law]
-    options = {
-        "force_sd": scenario.disturbance_force,
-        "moment_sd": scenario.disturbance_moment,
-        "disturbance_time": scenario.disturbance_time,
-        "hdop_table": [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)],
-    }
+    sd, table = scenario.disturbance_force, [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)]
+    options = {"force_sd": sd, "moment_sd": scenario.disturbance_moment, "hdop_table": table}
+    options["disturbance_time"] = scenario.disturbance_time
+    ranges = {"bias_sd": "gyro_bias", "bank_sd": "bank"}
     if scenario.roll:
-        options["fast"] = ["gyro", "accel_y"]
-        options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
-    options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
-    options["bank_sd"] = compute_range_rms(scenario, "bank")
+        options["fast"], ranges["accel_bias_sd"] = ["gyro", "accel_y"], "accel_y_bias"
+    options |= {key: compute_range_rms(scenario, name) for key, name in ranges.items()}
     options |= {option: noise[key] for key, option in _NOISE.items() if key in noise}
     if "course" in noise:
         options["course_noise"] = noise["course"] / (0.5 * sum(scenario.range("speed")))
@@ -109,10 +99,7 @@ def make_noise_options(
 
 def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
     """Make the options of `exact-kf` that a world adds or changes."""
-
-    def get_rms(name: str) -> float:
-        return compute_range_rms(world, name)
-
+    get_rms = partial(compute_range_rms, world)
     plain, speed = Noise()._asdict() | dict(scenario.noise), 0.5 * sum(scenario.range("speed"))
     turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
     lag = get_rms("map_lag") * turning  # rad, error of the road's direction
@@ -120,16 +107,12 @@ def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
     known = SCENARIOS.get(scenario.name, scenario)  # of a variant too: nobody is told of it
     spreads = [compute_range_rms(known, name, 1.0) for name in STIFFNESSES]
     force_share = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
-    options = {
-        "camera_yaw_sd": get_rms("camera_yaw"),
-        "steer_offset_sd": get_rms("steer_offset"),
-        "psi_noise": math.hypot(plain["camera_psi"], lag),
-        "q_psi": lag * turning,
+    options = {f"{name}_sd": get_rms(name) for name in ("camera_yaw", "steer_offset")} | {
+        "psi_noise": math.hypot(plain["camera_psi"], lag), "q_psi": lag * turning,
         "course_noise": math.hypot(*course) / speed,
         "accel_y_noise": math.hypot(plain["accel"], get_rms("vibration")),
-        "force_share": force_share,
-        "moment_share": 0.5 * force_share,
-    }
+        "force_share": force_share, "moment_share": 0.5 * force_share,
+    }  # fmt: skip
     if wave := get_rms("bank_wave"):
         options["bank_sd"] = math.hypot(compute_range_rms(scenario, "bank"), wave)
         options["bank_time"] = _BANK_TIME
@@ -145,27 +128,23 @@ def compute_range_rms(source: Scenario | World, name: str, ideal: float = 0.0) -
         ideal: Value from which it counts.
 
     Returns:
-        Root mean square, in the quantity's unit.
+        Root mean square, in that unit.
     """
     low, high = (end - ideal for end in get_range(getattr(source, name)))
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
 
 def make_oracle(
-    name: str,
-    env_id: str,
-    num_envs: int | None = None,
+    name: str, env_id: str, num_envs: int | None = None,
     vector_kwargs: Mapping[str, Any] | None = None,
-    options: Mapping[str, Mapping[str, Any]] | None = None,
-    **env_kwargs: Any,
-) -> tuple[Any, Controller]:
+    options: Mapping[str, Mapping[str, Any]] | None = None, **env_kwargs: Any,
+) -> tuple[Any, Controller]:  # fmt: skip
     """Make an oracle and the env whose observation it needs.
 
     In a world, those that know more than nominal get the drawn car, with gains of its own, and
-    readings of steering, wheels and motors that are calibrated. References are made from the env's
-    own readings, as for everybody: so the sensors of these err in its env too. Other constant
-    errors, of which no reference is made, are absent from the env of an oracle of parameters, as
-    biases are.
+    calibrated readings of steering, wheels and motors. References are made from the env's readings,
+    as for everybody, so these err in its env too. Constant errors of which no reference is made are
+    absent from the env of an oracle of parameters, as biases are.
 
     Args:
         name: Name in `ORACLES`.
@@ -174,15 +153,10 @@ def make_oracle(
         vector_kwargs: Arguments of the vector env.
         options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
             sensors of the id, `make_noise_options` of the scenario, a grip limit.
-        env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
-            true car may differ between episodes, in a world its other parameters too.
+        env_kwargs: Arguments of the env (scenario, vehicle, ...).
 
     Returns:
         The env and the agent.
-
-    Raises:
-        ValueError: The name is unknown.
-        TypeError: The options have another key.
     """
     check_choice("oracle", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
@@ -198,56 +172,43 @@ def make_oracle(
         unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
         env_kwargs |= {"scenario": unbiased.to_dict(), "world": world.to_dict()}
         single_env = gym.make(env_id, **env_kwargs)
-    base: Any = single_env.unwrapped
-    env = single_env
+    base, env = single_env.unwrapped, single_env
     if num_envs is not None:
         env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
     if name not in STATE_ORACLES:
         env = _add_filter(env, base, name in PARAMETER_ORACLES, chosen["filter"])
     if name != NOMINAL:
         truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
-        states = () if name in PARAMETER_ORACLES else STATES
-        parameters = (
-            (*STIFFNESSES, FRICTION.removeprefix("true_")) if world.is_ideal else TRUE_PARAMETERS
-        )
-        env = truth_wrapper(env, parameters, states)
+        tyres = (*STIFFNESSES, FRICTION.removeprefix("true_"))
+        parameters = tyres if world.is_ideal else TRUE_PARAMETERS
+        env = truth_wrapper(env, parameters, () if name in PARAMETER_ORACLES else STATES)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
     is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
     if not is_predictive:  # the prediction has the steering's rate limit
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings["vehicle"] = base.vehicle
-        if world.is_ideal:
-            settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
-        else:
-            settings["knows_car"] = True
-    controller_class = Nmpc if is_predictive else Lqr
-    return env, controller_class(env, **settings | dict(chosen["controller"]))
+        known = {"stiffness": [f"true_{x}" for x in STIFFNESSES]}
+        settings |= known if world.is_ideal else {"knows_car": True}
+    settings |= dict(chosen["controller"])
+    return env, Nmpc(env, **settings) if is_predictive else Lqr(env, **settings)
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
     """Add a filter on all slow sensors, with the true tyres where it knows them."""
     world: World = base.config.world
-    law = world.tyres or base.scenario.tyres
-    has_tyre_filter = knows_tyres and law in ("fiala", "magic-formula")
     if knows_tyres:  # and how the steering sensor errs
         world = dataclasses.replace(world, steer_offset=IDEAL.steer_offset)
     levels = make_noise_options(base.scenario, world, knows_tyres)
-    levels |= {"slow": list(base.slow_sensors)}
+    levels["slow"] = list(base.slow_sensors)
     for sensor, option in (("gps", "hdop_table"), ("camera", "camera_yaw_sd")):
         if sensor not in base.slow_sensors:
             levels.pop(option, None)
-    if has_tyre_filter:
+    if knows_tyres and (world.tyres or base.scenario.tyres) in ("fiala", "magic-formula"):
         levels |= _TYRE_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
-    return wrapper(
-        env,
-        FILTER,
-        outputs=OUTPUTS,
-        std=False,
-        vehicle=TRUTH if knows_tyres else None,
-        options=levels | dict(options),
-    )
+    car, levels = TRUTH if knows_tyres else None, levels | dict(options)
+    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, vehicle=car, options=levels)
 
 
 @cache
@@ -262,17 +223,15 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file holds something else, or is of another world; the message has the path.
+        ValueError: The file holds something else, or is of another world.
     """
     try:
         classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from None
     if (version := classes.pop("world_version", 0)) != WORLD_VERSION:
-        raise ValueError(
-            f"{path} was tuned in world {version}, this is {WORLD_VERSION}: tune anew, "
-            "sideslip tune controller NAME --write"
-        )
+        text = f"{path} was tuned in world {version}, this is {WORLD_VERSION}: tune anew"
+        raise ValueError(f"{text}, sideslip tune controller NAME --write")
     for kind, names in classes.items():
         for name, parts in names.items() if isinstance(names, dict) else [("", names)]:
             is_valid = isinstance(parts, dict) and parts.keys() <= set(PARTS)

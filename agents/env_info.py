@@ -133,9 +133,6 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
 
     Returns:
         Env with its wrappers.
-
-    Raises:
-        TypeError: An argument is missing or unknown.
     """
     try:
         return gym.make(env_id, **options)
@@ -146,9 +143,8 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
 def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
     """Collect the facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
 
-    Every wrapper must be of a class that is known to keep observations and actions, or have
-    `transparent = True` on itself or its class. A subclass that overrides how it steps, resets,
-    observes or acts must set it anew.
+    Every wrapper must be known to keep observations and actions, or have `transparent = True` on
+    itself or its class. A subclass that overrides how it steps, observes or acts sets it anew.
 
     Args:
         env: Env of this package, wrapped or bare.
@@ -168,26 +164,22 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
 
 def _collect_facts(env: Any) -> EnvFacts:
-    nominals: Sequence[Vehicle]
-    vehicles: Sequence[Vehicle]
     if isinstance(env, EnvView):
         return env.facts
     base: Any = env.unwrapped
     if isinstance(env, gym.Env):
         layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
         _check_wrappers(env, layout)
-        nominals, vehicles = [base.nominal], [base.vehicle]
     elif isinstance(env, VectorEnv):
         layout, width = get_layout(env), base.single_action_space.shape[0]
-        nominals, vehicles = _get_row_values(base, "nominal"), _get_row_values(base, "vehicle")
     else:
         layout, width = _get_common_value(base, "layout"), base.action_space.shape[0]
         _check_wrappers(env, layout)
-        nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
+    cars = zip(*(_get_row_values(base, name) for name in ("nominal", "vehicle")), strict=True)
     period, kind = (_get_common_value(base, name) for name in ("control_period", "reference"))
-    limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
-    for i, car in enumerate(zip(nominals, limits, strict=True)):
-        if car != (nominals[0], limits[0]):
+    designs = [(nominal, car.yaw_moment_limit, car.steering_authority) for nominal, car in cars]
+    for i, design in enumerate(designs):
+        if design != designs[0]:
             raise ValueError(
                 f"the rows of a vector env share one design, but row {i} has another nominal "
                 "vehicle or other limits than row 0: make an agent for each kind of car"
@@ -195,7 +187,7 @@ def _collect_facts(env: Any) -> EnvFacts:
     rates = {config.world.moment_rate for config in list_configs(env)}
     if len(rates) != 1:
         raise ValueError("the rows of a vector env share one design, but not one moment_rate")
-    return EnvFacts(layout, nominals[0], *limits[0], period, kind, width, *rates)
+    return EnvFacts(layout, *designs[0], period, kind, width, *rates)
 
 
 def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
@@ -275,11 +267,9 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
     # sub-environments in other processes: their wrappers show in the spaces alone
     if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):
         single = "single_" if isinstance(env, VectorEnv) else ""
-        observed = getattr(base, f"{single}observation_space")
-        acted_on = getattr(base, f"{single}action_space")
-        if observed != make_space(layout) or acted_on != gym.spaces.Box(
-            -1.0, 1.0, acted_on.shape, np.float32
-        ):
+        spaces = [getattr(base, f"{single}{name}_space") for name in ("observation", "action")]
+        shares = gym.spaces.Box(-1.0, 1.0, spaces[1].shape, np.float32)
+        if spaces != [make_space(layout), shares]:
             wrong.append(f"a wrapper within {type(base).__name__}")
     if wrong:
         raise ValueError(
@@ -308,6 +298,8 @@ def get_layout(env: CarVectorEnv) -> tuple[ObservationEntry, ...]:
 
 def _get_row_values(base: Any, name: str) -> Sequence[Any]:
     """Return an attribute of each row: the vector env's own sequence, or its sub-environments'."""
+    if isinstance(base, gym.Env):
+        return [getattr(base, name)]
     return list(getattr(base, name) if hasattr(base, name) else base.get_attr(name))
 
 

@@ -1,10 +1,8 @@
 """The least expected cost of a linear scenario, by Riccati's equations: what no policy can beat.
 
-With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The
-cost follows from the cost to go, backwards from the episode's end, and from the estimate's
-covariance along the packets' arrivals. The cap of the cost and the motors' limit, which such
-scenarios make rare, are left out. The best guess of the driver's next angle is
-`LinearPlant.decay` times the last one (a first-order Gauss-Markov process).
+With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The cap
+of the cost and the motors' limit, which such scenarios make rare, are left out. The best guess of
+the driver's next angle is `LinearPlant.decay` times the last one (a Gauss-Markov process).
 """
 
 from dataclasses import dataclass
@@ -25,12 +23,7 @@ from ..estimators.vector import estimate as vector
 from ..estimators.wrappers.estimate import EstimateObservation
 from .baselines import FILTER, OUTPUTS, make_noise_options
 from .controllers.base import Controller
-from .design.sampled_model import (
-    DesignModel,
-    DesignSpec,
-    make_design_model,
-    make_tick_model,
-)
+from .design.sampled_model import DesignModel, DesignSpec, make_design_model, make_tick_model
 from .env_info import AnyEnv, CarEnv, list_configs
 
 _REQUIRED = {
@@ -44,8 +37,8 @@ _ALLOWED = {
     "gps_delays", "gps_outage",
 }  # fmt: skip
 _ZERO = ("motor_lag", "steering_lag", "motor_power", "antenna_ahead", "antenna_left")
+# Noise from which on a sensor that the filter does not read says nothing of the car.
 _MIN_NOISE = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 1e4}
-"""Noise from which on a sensor that the filter does not read says nothing of the car."""
 
 
 @dataclass(frozen=True)
@@ -71,21 +64,13 @@ class LinearPlant:
 
 @dataclass(frozen=True)
 class Optimum:
-    """The optimal policy, u = -K_j E[x_j | measurements], and its cost.
+    """The optimal policy, u = -K_j E[x_j | measurements], and its cost."""
 
-    Attributes:
-        plant: Linear plant of the scenario.
-        cost: Expected cost of an episode.
-        gains: K_j, shape (steps, n).
-        weights: S_j, shape (steps,): an input that differs by du costs S_j du^2 more.
-        errors: Error covariances of the optimal estimate, shape (schedules, steps, n, n).
-    """
-
-    plant: LinearPlant
-    cost: float
-    gains: Array
-    weights: Array
-    errors: Array
+    plant: LinearPlant  # of the scenario
+    cost: float  # expected, of an episode
+    gains: Array  # K_j, shape (steps, n)
+    weights: Array  # S_j, shape (steps,): an input that differs by du costs S_j du^2 more
+    errors: Array  # covariances of the optimal estimate's error, shape (schedules, steps, n, n)
 
     def compute_cost(self, gains: Array) -> float:
         """Compute the expected cost of u = -L_j E[x_j | measurements].
@@ -123,8 +108,7 @@ class Optimum:
         """
         read_gains = _select_gains(self.plant, self.gains)
         read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts: no guess
-        wrong = actions + np.einsum("nji,ji->nj", read, read_gains)
-        return np.asarray(wrong**2 @ self.weights)
+        return np.asarray((actions + np.einsum("nji,ji->nj", read, read_gains)) ** 2 @ self.weights)
 
 
 def _make_linear_plant(env: AnyEnv) -> LinearPlant:
@@ -134,8 +118,7 @@ def _make_linear_plant(env: AnyEnv) -> LinearPlant:
     _check(config)
     car, speed = config.base.nominal, config.base.held_speed
     assert speed is not None
-    kind = REFERENCES.index(config.reference)
-    full = config.base.vehicle.yaw_moment_limit
+    kind, full = REFERENCES.index(config.reference), config.base.vehicle.yaw_moment_limit
     design_spec = DesignSpec(n, full, False, kind, "forces", scenario.disturbance_time)
     model = make_design_model(car, speed, design_spec)
     G1, _, C, _ = make_tick_model(car, speed, design_spec)
@@ -161,11 +144,8 @@ def _check(config: EnvConfig) -> None:
     values = {key: getattr(scenario, key) for key in _REQUIRED}
     wrong = [f"{key} {value!r}" for key, value in values.items() if value != _REQUIRED[key]]
     wrong += [key for key in scenario.to_dict() if key not in _ALLOWED | set(_REQUIRED)]
-    wrong += [
-        f"noise of {name} below {minimum:g}"
-        for name, minimum in _MIN_NOISE.items()
-        if not scenario.noise.get(name, 0.0) >= minimum
-    ]
+    noisy = [name for name, sd in _MIN_NOISE.items() if scenario.noise.get(name, 0.0) >= sd]
+    wrong += [f"noise of {k} below {sd:g}" for k, sd in _MIN_NOISE.items() if k not in noisy]
     wrong += [f"noise of {name}" for name in scenario.noise if name.endswith("_bias")]
     car = base.vehicle
     if car != base.nominal or any(getattr(car, name) for name in _ZERO):
@@ -231,16 +211,12 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
     base: Any = env.unwrapped
     facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
     filter_ = make_estimator(FILTER, **facts, **_make_true_options(env))
-    names = plant.model.states
-    state_indices = [names.index(name) for name in OUTPUTS]
-    filter_indices = [filter_.names.index(name) for name in OUTPUTS]
-    covariances = np.zeros((plant.steps, len(names), len(names)))
-    idle = np.zeros(env.action_space.shape or (), np.float32)
+    names, n = plant.model.states, len(plant.model.states)
+    in_state, in_filter = ([x.index(name) for name in OUTPUTS] for x in (names, filter_.names))
+    covariances, idle = np.zeros((plant.steps, n, n)), np.zeros(env.action_space.shape or (), "f4")
     for j in range(plant.steps):
-        record = base.record
-        filter_.step(record.fast, record.packets.reshape(-1, PACKET_WIDTH))
-        P = filter_.P[np.ix_(filter_indices, filter_indices)]
-        covariances[j][np.ix_(state_indices, state_indices)] = P
+        filter_.step(base.record.fast, base.record.packets.reshape(-1, PACKET_WIDTH))
+        covariances[j][np.ix_(in_state, in_state)] = filter_.P[np.ix_(in_filter, in_filter)]
         if j > 0:  # the angle from now on is not seen yet: its guess is off by the noise of W
             covariances[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
         env.step(idle)
@@ -249,8 +225,7 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
 
 def _select_gains(plant: LinearPlant, gains: Array) -> Array:
     """Select, from gains (..., n) on the state, those (..., 5) on the entries `Lqg.needs`."""
-    names = plant.model.states
-    selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
+    selected = gains[..., [plant.model.states.index(name) for name in (*OUTPUTS, "driver")]]
     selected[..., -1] *= plant.decay
     return selected
 
@@ -258,8 +233,8 @@ def _select_gains(plant: LinearPlant, gains: Array) -> Array:
 class Lqg(Controller):
     """The optimal policy of a linear scenario without end, for the env of `wrap_optimal_estimate`.
 
-    It differs from `Optimum` in the last steps, whose cost has no future, and takes the first angle
-    for a later one. But for that, `Optimum.compute_cost` of `gains` is its cost.
+    It differs from `Optimum` in the last steps, and takes the first angle for a later one. But for
+    that, `Optimum.compute_cost` of `gains` is its cost.
 
     Args:
         env: Env, single or vector, with the optimal estimate in its observation.

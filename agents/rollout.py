@@ -44,11 +44,9 @@ class EpisodeStep(NamedTuple):
 
 
 def iterate_steps(
-    env: CarEnv | CarVectorEnv,
-    agent: Any = None,
-    seeds: Any = None,
+    env: CarEnv | CarVectorEnv, agent: Any = None, seeds: Any = None,
     options: dict[str, Any] | None = None,
-) -> Iterator[EpisodeStep]:
+) -> Iterator[EpisodeStep]:  # fmt: skip
     """Iterate over the steps of each row's first episode, until the last row's is over.
 
     Args:
@@ -59,15 +57,10 @@ def iterate_steps(
 
     Yields:
         The reset, then every step.
-
-    Raises:
-        TypeError: The agent has no `predict`.
     """
     if not (agent is None or hasattr(agent, "predict")):
-        raise TypeError(
-            f"an agent has stable-baselines3's predict, got {type(agent).__name__}; make_agent "
-            "builds one from a name"
-        )
+        text = f"an agent has stable-baselines3's predict, got {type(agent).__name__}"
+        raise TypeError(f"{text}; make_agent builds one from a name")
     obs, info = env.reset(seed=seeds, options=options)
     _check_full_scale(env, agent)
     running = np.ones(getattr(env, "num_envs", 1), np.bool_)
@@ -130,22 +123,18 @@ _INFO_UNITS = {
     **dict.fromkeys(("beta", "psi", "beta_ref", "steer", "phi"), "rad"),
     **{"v_x": "m/s", "v_y": "m/s", "y_l": "m", "X": "m", "Y": "m"},
 }
-TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
-"""The true states in a log, named as estimators name them."""
+TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")  # states in a log, as estimators' are
 _DEGREES = 180.0 / np.pi
-_ESTIMATE, _REFERENCE = "estimate, 1 std", "reference"
 _ESTIMATE_COLOUR = "#56B4E9"
-_STYLES: dict[str, dict[str, Any]] = {
-    _ESTIMATE: {"color": _ESTIMATE_COLOUR, "lw": 1.0},
-    _REFERENCE: {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2},
+_STYLES: dict[str, dict[str, Any]] = {  # by the curve's label; others are of what is true
+    "estimate, 1 std": {"color": _ESTIMATE_COLOUR, "lw": 1.0},
+    "reference": {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2},
 }
 _TRUE_STYLE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_BETA = {"obs_beta_hat": "estimate, 1 std", "beta_ref": "reference", "beta": "true"}
 _PANELS = {  # labels of the curves by column, and the factor to the unit, by the axis's label
-    "sideslip angle / deg": (
-        {"obs_beta_hat": _ESTIMATE, "beta_ref": _REFERENCE, "beta": "true"},
-        _DEGREES,
-    ),
-    "yaw rate / (deg/s)": ({"gamma_ref": _REFERENCE, "gamma": "true"}, _DEGREES),
+    "sideslip angle / deg": (_BETA, _DEGREES),
+    "yaw rate / (deg/s)": ({"gamma_ref": "reference", "gamma": "true"}, _DEGREES),
     "yaw moment / (N m)": ({"yaw_moment": "delivered"}, 1.0),
     "steering angle / deg": ({"steer": "front wheels"}, _DEGREES),
 }
@@ -213,9 +202,8 @@ class Rollout:
 
         units = {name: {"unit": self.units[name]} for name in self.columns}
         fields = [pa.field(name, pa.float64(), metadata=unit) for name, unit in units.items()]
-        table = pa.table(list(self.columns.values()), schema=pa.schema(fields))
         with atomic_file(path) as file:
-            pq.write_table(table, file)
+            pq.write_table(pa.table([*self.columns.values()], schema=pa.schema(fields)), file)
 
     def plot(self) -> "Figure":
         """Plot sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
@@ -244,11 +232,9 @@ class Rollout:
 
 
 def rollout(
-    env: CarEnv | str,
-    agent: Any = None,
-    seed: int | None = 0,
+    env: CarEnv | str, agent: Any = None, seed: int | None = 0,
     options: dict[str, Any] | None = None,
-) -> Rollout:
+) -> Rollout:  # fmt: skip
     """Run one episode.
 
     Args:
@@ -259,21 +245,15 @@ def rollout(
 
     Returns:
         Columns by name, their units, and the log.
-
-    Raises:
-        TypeError: A vector env, or an env of another package.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as new_env:
             return rollout(new_env, agent, seed, options)
     if not (isinstance(env, gym.Env) and env.has_wrapper_attr("layout")):
-        raise TypeError(
-            f"rollout runs one env of this package, got {short_repr(env)}; "
-            "agents.rollout.evaluate_episodes runs a vector env"
-        )
+        text = f"rollout runs one env of this package, got {short_repr(env)}"
+        raise TypeError(f"{text}; agents.rollout.evaluate_episodes runs a vector env")
     base: Any = env.unwrapped
-    layout = env.get_wrapper_attr("layout")
-    rows, records = [], []
+    layout, rows, records = env.get_wrapper_attr("layout"), [], []
     for step in iterate_steps(env, agent, seed, options):
         motion = base.motion
         info = step.info | {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
@@ -288,12 +268,10 @@ def rollout(
     has_layout = not has_foreign_wrapper(env)  # else entries have no name and no unit
     entries = {f"obs_{entry.name}": entry.unit for entry in layout} if has_layout else {}
     names += list(entries) or [f"obs_{i}" for i in range(step.obs.size)]
-    table = np.array(rows).T
     # wrappers may put a prefix before beta's estimates in `info`
     estimates = {name: "rad" for name in names if name.endswith(("beta_hat", "beta_std"))}
-    units = {name: _INFO_UNITS.get(name, "-") for name in names} | estimates
-    units |= entries
-    columns = dict(zip(names, table, strict=True))
+    units = {name: _INFO_UNITS.get(name, "-") for name in names} | estimates | entries
+    columns = dict(zip(names, np.array(rows).T, strict=True))
     record = concatenate(records)
     t = record.ticks * record.dt  # the truth between rows is interpolated
     truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}

@@ -1,6 +1,7 @@
 """Stable-baselines3's `VecEnv` over the native vector env: one call for all rows."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NoReturn, cast
 
 import gymnasium as gym
@@ -14,7 +15,6 @@ from ..envs.task import GAMMA_SCALE, STEER_SCALE, ObservationEntry, make_info, m
 from ..envs.vector import StabilityVectorEnv
 from ..envs.vehicle.dynamics import Motion
 from ..estimators.vector import estimate as vector_estimate
-from ..estimators.vector.estimate import EstimateObservation
 from ..estimators.wrappers import estimate as single_estimate
 from ..estimators.wrappers import truth as single_truth
 from .env_info import CarVectorEnv, get_layout
@@ -55,13 +55,9 @@ class _VecEnvRow:
         self._env, self._i = env, i
         self._set: dict[str, object] = {}
 
-    def _iterate_layers(self) -> Iterator[CarVectorEnv]:
-        """Iterate from the outermost wrapper to the bare vector env."""
-        layer = self._env
-        while isinstance(layer, VectorWrapper):
-            yield layer
-            layer = layer.env
-        yield layer
+        self._layers = [env]  # from the outermost wrapper to the bare vector env
+        while isinstance(self._layers[-1], VectorWrapper):
+            self._layers.append(self._layers[-1].env)
 
     def get_wrapper_attr(self, name: str) -> Any:
         """Get an attribute of this row from the outermost layer that has it."""
@@ -71,7 +67,7 @@ class _VecEnvRow:
             return getattr(self, name)
         attribute = f"single_{name}" if name in _SPACES else _OTHER_NAMES.get(name, name)
         if name in (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES):
-            for layer in self._iterate_layers():
+            for layer in self._layers:
                 if attribute in vars(layer) or hasattr(type(layer), attribute):
                     value = getattr(layer, attribute)
                     value = value[self._i] if name in _ROW_ATTRIBUTES else value
@@ -81,19 +77,17 @@ class _VecEnvRow:
 
     def has_wrapper_attr(self, name: str) -> bool:
         """Return whether `get_wrapper_attr` finds an attribute."""
-        try:
+        with suppress(AttributeError):
             self.get_wrapper_attr(name)
-        except AttributeError:
-            return False
-        return True
+            return True
+        return False
 
     def set_wrapper_attr(self, name: str, value: object, **_: object) -> None:
         """Set a value beside the env, under a name that the env does not have."""
         if name not in self._set and self.has_wrapper_attr(name):
-            raise AttributeError(
-                f"{name!r} is the environment's and is not set from outside; options of reset "
-                "(`set_options`) change the scenario, vehicle, friction, state and duration"
-            )
+            text = "options of reset (`set_options`) change the scenario, vehicle, friction, state"
+            error = f"{name!r} is the environment's and is not set from outside"
+            raise AttributeError(f"{error}; {text} and duration")
         self._set[name] = value
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -109,7 +103,7 @@ class _VecEnvRow:
     def is_wrapped(self, wrapper_class: type) -> bool:
         """Return whether a layer has this class, or is the vector twin of it."""
         wanted = _TWINS.get(wrapper_class, wrapper_class)
-        return any(isinstance(layer, wanted) for layer in self._iterate_layers())
+        return any(isinstance(layer, wanted) for layer in self._layers)
 
 
 class _EmptyInfo(dict[str, object]):
@@ -134,25 +128,20 @@ class _NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
     It equals its `DummyVecEnv` around single environments with the same seeds, bit for bit, but for
-    `infos`: where no episode ends it holds one empty dict that all rows share (`EMPTY_INFO`). Where
-    one ends, its row has the whole info of the last step, `terminal_observation` and
-    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset. `set_options` takes
-    the options of a single env's `reset`, for all rows or a list of them.
+    `infos`: where no episode ends it holds one empty dict that all rows share (`EMPTY_INFO`).
+    `set_options` takes the options of a single env's `reset`, for all rows or a list of them.
     """
 
     def __init__(self, vector_env: CarVectorEnv) -> None:
         mode = vector_env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(
-                "stable-baselines3 expects rows to be reset in the step that ends them: build the "
-                f"vector env with autoreset_mode='SameStep', not {mode}"
-            )
+            text = "stable-baselines3 expects rows to be reset in the step that ends them: build"
+            raise ValueError(f"{text} the vector env with autoreset_mode='SameStep', not {mode}")
         self.vector_env, self._base = vector_env, cast("StabilityVectorEnv", vector_env.unwrapped)
         self._rows = [_VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
         self._actions: Any = None
-        super().__init__(
-            vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space
-        )
+        spaces = vector_env.single_observation_space, vector_env.single_action_space
+        super().__init__(vector_env.num_envs, *spaces)
         self.metadata = dict(vector_env.metadata)
 
     @property
@@ -199,8 +188,7 @@ class _NativeVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """Get a frame of each row, with render_mode="rgb_array"."""
-        frames: Any = self.vector_env.render()
-        return frames or ()
+        return cast("Any", self.vector_env.render()) or ()
 
     def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
         """Render all rows as one frame (height, width, 3); None for "human"."""
@@ -258,17 +246,15 @@ def scale_layout(layout: Sequence[ObservationEntry]) -> tuple[ObservationEntry, 
     Returns:
         Entries without units.
     """
-    return tuple(
-        ObservationEntry(name, "-", low / float(scale), high / float(scale))
-        for (name, _, low, high), scale in zip(layout, get_scales(layout), strict=True)
-    )
+    rows = zip(layout, get_scales(layout).tolist(), strict=True)
+    return tuple(ObservationEntry(name, "-", a / s, b / s) for (name, _, a, b), s in rows)
 
 
 class ScaledVecEnv(VecEnvWrapper):
-    """Observations over fixed scales and rewards per second, outside of the monitor.
+    """Observations over fixed scales, such as 0.05 rad, and rewards per second.
 
-    Both are of order one, as stable-baselines3's defaults expect. The monitor and `infos` have the
-    costs as they are.
+    Both are of order one, as stable-baselines3's defaults expect. The monitor inside and `infos`
+    have the costs as they are.
 
     Args:
         venv: Monitor around the bridge.
@@ -293,22 +279,16 @@ class ScaledVecEnv(VecEnvWrapper):
 
 
 def make_vec_env(
-    env_id: str,
-    num_envs: int = 1,
-    seed: int | None = None,
+    env_id: str, num_envs: int = 1, seed: int | None = None,
     estimator: str | Mapping[str, object] | None = None,
-    env_kwargs: Mapping[str, object] | None = None,
-    monitor_file: str | None = None,
-    info_keywords: Sequence[str] = (),
-    wrapper_class: _Wrapping | None = None,
-    scaled: bool = True,
-) -> VecMonitor | ScaledVecEnv:
+    env_kwargs: Mapping[str, object] | None = None, monitor_file: str | None = None,
+    info_keywords: Sequence[str] = (), wrapper_class: _Wrapping | None = None, scaled: bool = True,
+) -> VecMonitor | ScaledVecEnv:  # fmt: skip
     """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
-    Observations are over fixed scales, such as 0.05 rad, and rewards are per second: what learns
-    with stable-baselines3's defaults needs numbers of order one. Episodes of the monitor keep their
-    costs. With `scaled=False` it has the bits of a `DummyVecEnv` of single environments with the
-    same seeds. Its `infos` hold one empty dict for all rows but those whose episode ends.
+    Observations and rewards are those of `ScaledVecEnv`. With `scaled=False` it has the bits of a
+    `DummyVecEnv` of single environments with the same seeds. Its `infos` hold one empty dict for
+    all rows but those whose episode ends.
 
     Args:
         env_id: Id of an env with a native vector env.
@@ -326,7 +306,7 @@ def make_vec_env(
         `VecEnv` that monitors episodes.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
-    bridge = _NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
+    bridge = _NativeVecEnv(wrapper_class(env) if wrapper_class else env)
     bridge.action_space.seed(seed)
     bridge.seed(seed)
     monitor = VecMonitor(bridge, monitor_file, tuple(info_keywords))
@@ -334,19 +314,15 @@ def make_vec_env(
         return monitor
     layout = get_layout(bridge.vector_env)
     if (len(layout),) != bridge.observation_space.shape:
-        raise ValueError(
-            f"observations have {bridge.observation_space.shape} entries and the layout "
-            f"{len(layout)}: scaled=False leaves them alone"
-        )
+        shapes = f"{bridge.observation_space.shape} entries and the layout {len(layout)}"
+        raise ValueError(f"observations have {shapes}: scaled=False leaves them alone")
     return ScaledVecEnv(monitor, layout)
 
 
 def make_native_env(
-    env_id: str,
-    num_envs: int,
-    estimator: str | Mapping[str, object] | None = None,
+    env_id: str, num_envs: int, estimator: str | Mapping[str, object] | None = None,
     env_kwargs: Mapping[str, object] | None = None,
-) -> CarVectorEnv:
+) -> CarVectorEnv:  # fmt: skip
     """Make the vector env that `make_vec_env` bridges, with its estimator around it.
 
     Args:
@@ -357,23 +333,18 @@ def make_native_env(
 
     Returns:
         Vector env, wrapped if there is an estimator.
-
-    Raises:
-        ValueError: The id has no native vector env.
     """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry
     if not (isinstance(kind, type) and issubclass(kind, StabilityVectorEnv)):
-        raise ValueError(
-            f"{env_id} has no native vector env of this package; for single environments there is "
-            "stable_baselines3.common.env_util.make_vec_env"
-        )
+        text = f"{env_id} has no native vector env of this package; for single environments there"
+        raise ValueError(f"{text} is stable_baselines3.common.env_util.make_vec_env")
     arguments: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
     env: CarVectorEnv = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
     estimator = estimator if isinstance(estimator, Mapping) else {"estimator": estimator}
-    return EstimateObservation(env, **estimator)
+    return vector_estimate.EstimateObservation(env, **estimator)
 
 
 def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:

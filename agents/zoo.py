@@ -1,9 +1,7 @@
 """The folder in which rl-baselines3-zoo leaves a training, and where its `enjoy` looks for one.
 
-`LOGS/ALGO/ENV_N/` holds `best_model.zip`, `ENV.zip` (the last model), `evaluations.npz` (as
-stable-baselines3's `EvalCallback` writes it) and `ENV/` with `config.yml` and `args.yml`; in ENV a
-dash stands for the id's slash.
-"""
+`LOGS/ALGO/ENV_N/` holds `best_model.zip`, `ENV.zip` (the last model), `evaluations.npz` (as of
+stable-baselines3's `EvalCallback`) and `ENV/` with `config.yml` and `args.yml`."""
 
 import re
 from collections.abc import Mapping
@@ -43,11 +41,9 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
 
 
 def describe(
-    folder: Path,
-    settings: Mapping[str, object],
-    estimator_kwargs: Mapping[str, object] | None,
+    folder: Path, settings: Mapping[str, object], estimator_kwargs: Mapping[str, object] | None,
     arguments: Mapping[str, Any],
-) -> None:
+) -> None:  # fmt: skip
     """Make a training's folder with the files that `enjoy` reads before it loads a model.
 
     Args:
@@ -83,17 +79,13 @@ def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, length
         return
     with atomic_file(folder / f"{_make_file_name(env_id)}.zip") as file:
         model.save(file)
-    evaluation: dict[str, Any] = {
-        "timesteps": np.array([model.num_timesteps]),
-        "results": -costs[None],
-        "ep_lengths": lengths[None].astype(np.int64),
-    }
+    evaluation: dict[str, Any] = {"timesteps": np.array([model.num_timesteps])}
+    evaluation |= {"results": -costs[None], "ep_lengths": lengths[None].astype(np.int64)}
     path = folder / EVALUATIONS
     if path.exists():
         with np.load(path, allow_pickle=False) as saved:
             before = saved["timesteps"] < model.num_timesteps
-            evaluation = {
-                name: np.concatenate([saved[name][before], evaluation[name]]) for name in evaluation
-            }
+            for name, values in evaluation.items():
+                evaluation[name] = np.concatenate([saved[name][before], values])
     with atomic_file(path) as file:
         np.savez(file, **evaluation)

@@ -118,8 +118,8 @@ def test_rows_and_a_session_are_read() -> None:
     )
     assert read_json(OLD / "rows.json") == [row]
     assert controller.Session(OLD / "session.slip").setup["estimator"] == "exact-kf"
-    (block,) = controller.Session(OLD / "session.slip").blocks
-    found = [messages.decode(arrival.data) for batch in block.batches for arrival in batch]
+    ((batches, _),) = controller.Session(OLD / "session.slip").blocks
+    found = [messages.decode(arrival.data) for batch in batches for arrival in batch]
     kinds = [getattr(each, "kind", each) for each in found]
     assert kinds == [messages.DatagramKind.INERTIAL, messages.DatagramKind.END]
 

@@ -21,6 +21,7 @@ from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip
 from ...envs.vehicle.tyres import MAGIC_FORMULA
 from .preview import PlanParams, PlanState, PreviewStep
 
+_Errors = tuple[Scalar, Scalar]
 N_INPUTS = 2  # in a sweep: fractions of moment and added steering; the latter is 0 if unused
 _rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
 _motor_torques, _sideslip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
@@ -32,16 +33,12 @@ _uncapped_cost_rate = as_python(
     compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
 )
 
-_COMMANDS = ("command_l", "command_r")
-_TORQUES = ("T_l", "T_r", *_COMMANDS)
-
 
 def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
     """List the states that matter to an episode's cost, in the order of `PlanState`."""
-    road = fixed.road
-    active = {"v_x", "v_y", "gamma", "T_l", "T_r"}
+    road, active = fixed.road, {"v_x", "v_y", "gamma", "T_l", "T_r"}
     if fixed.task.moment_rate or fixed.task.torque_slew:
-        active |= {*_COMMANDS}
+        active |= {"command_l", "command_r"}
     if fixed.kind.roll:
         active |= {"phi", "phi_dot"}
     if fixed.kind.law == MAGIC_FORMULA and fixed.car.relaxation:
@@ -55,21 +52,16 @@ def _list_active_states(fixed: PlanParams) -> tuple[str, ...]:
     return tuple(name for name in PlanState._fields if name in active)
 
 
-def _compute_node_errors(
-    fixed: PlanParams, x: PlanState, known: PreviewStep
-) -> tuple[Scalar, Scalar]:
+def _compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> _Errors:
     """Compute the errors of sideslip angle (rad) and yaw rate (rad/s) at a step's start."""
-    kind = fixed.kind
+    kind, beta_ref, gamma_ref = fixed.kind, known.beta_ref, known.gamma_ref
     beta = _sideslip(x.v_x, x.v_y, kind.small_angle)
-    beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
     if kind.reference != LAGGED and not kind.has_errors:
         beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
     return beta - beta_ref, x.gamma - gamma_ref
 
 
-def _compute_node_cost(
-    fixed: PlanParams, errors: tuple[Scalar, Scalar], known: PreviewStep
-) -> Scalar:
+def _compute_node_cost(fixed: PlanParams, errors: _Errors, known: PreviewStep) -> Scalar:
     """Compute the weighted cost of a step's first errors, without the cap."""
     return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
 
@@ -93,10 +85,8 @@ def _compute_moments(
 def _advance(
     fixed: PlanParams, x: PlanState, action: Sequence[Scalar], known: PreviewStep
 ) -> tuple[PlanState, Scalar]:
-    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort.
-
-    The driver's acceleration is that of the step's start; added steering acts by its mean.
-    """
+    """Advance a plan by one Runge-Kutta step of the env's plant: next state, cost of effort."""
+    # the driver's acceleration is that of the step's start; added steering acts by its mean
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
     speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
@@ -124,10 +114,8 @@ def _advance(
     motion = _rk4(motion, loads, forces, car, road, q * TICK, kind)
     # a rate is taken over `RATE_TICKS`, in shorter periods over one of them
     span = min(q, RATE_TICKS)
-    held, command, moment = (
-        _yaw_moment(*sides, car)
-        for sides in ((x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r))
-    )
+    sides = (x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r)
+    held, command, moment = (_yaw_moment(left, right, car) for left, right in sides)
     moments = _compute_moments(fixed, held, moment, range(-span, 0))
     moments += _compute_moments(fixed, command, moment, range(q))
     effort, steering_tick = 0.0, fixed.steering_tick
@@ -136,17 +124,17 @@ def _advance(
         change = (moments[tick + span] - moments[tick]) / (span * TICK)
         shares = moments[tick + span], added, kind.reference, task.moment_rate * change * change
         effort += TICK * _uncapped_cost_rate(0.0, 0.0, *shares)
-    new_torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
+    torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
     new_integral = x.integral + q * (integral - x.integral)
     new_added = _apply_lag(mean_added, x.added, steering.end)
-    new_actuators = (*new_torques, new_integral, slewing, new_added, *commands)
-    return PlanState._make((*motion, *new_actuators)), effort
+    return PlanState(*motion, *torques, new_integral, slewing, new_added, *commands), effort
 
 
 def _get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
     """Get the SI unit of each state in the solver, in which all are of order one."""
-    small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1, "slip_f": 0.1, "slip_r": 0.1}
-    return [fixed.car.T_max if name in _TORQUES else small.get(name, 1.0) for name in names]
+    scales = {"phi_dot": 0.5} | dict.fromkeys(("phi", "slewing", "added", "slip_f", "slip_r"), 0.1)
+    scales |= dict.fromkeys(("T_l", "T_r", "command_l", "command_r"), float(fixed.car.T_max))
+    return [scales.get(name, 1.0) for name in names]
 
 
 @dataclass(frozen=True)
@@ -195,8 +183,8 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     names = _list_active_states(fixed)
     scale, size = np.array(_get_state_scales(fixed, names)), len(names)
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
-    zero = PlanState(*(0.0,) * len(PlanState._fields))
-    x = zero._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
+    values = {name: scale[i] * w[i] for i, name in enumerate(names)}
+    x = PlanState(*(values.get(name, 0.0) for name in PlanState._fields))
     step_inputs = PreviewStep(*ca.vertsplit(known))
     state, effort = _advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
     next_state = ca.vertcat(*(getattr(state, name) for name in names)) / scale
@@ -213,7 +201,7 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
 
 
-def linearise_run(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation:
+def linearise(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation:
     """Linearise every period of a run; an input that the action lacks has a unit Hessian alone.
 
     Args:
@@ -224,11 +212,11 @@ def linearise_run(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisa
     Returns:
         Derivatives along the run, in scaled states and fractions of full scale.
     """
-    size, K, width = len(problem.names), problem.fixed.periods, problem.fixed.width
-    points = np.zeros((size + width, K + 1))
+    size, K = len(problem.names), problem.fixed.periods
+    n_used, n = size + problem.fixed.width, size + N_INPUTS
+    points = np.zeros((n_used, K + 1))
     points[:size] = (run.states[:, problem.state_indices] / problem.scale).T
     points[size:, :K] = run.actions.T
-    n_used, n = size + width, size + N_INPUTS
     F, g, H = (np.nan_to_num(value.full()) for value in problem.differentiate(points, known))
     identities = np.tile(np.eye(n), (K + 1, 1, 1))
     result = Linearisation(np.zeros((K, size, n)), np.zeros((K + 1, n)), identities)

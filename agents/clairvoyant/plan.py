@@ -1,10 +1,8 @@
 """The clairvoyant oracle: the best actions for a known car, road and all future disturbances.
 
-Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within
-the limits, and runs of the env that try the new actions with the pass's gains. A result costs what
-the env computes, failures included. It is a local optimum, sought from several starts.
-
-Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
+Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within the
+limits, and runs of the env with the pass's gains. A result costs what the env computes. It is a
+local optimum, sought from several starts. Source: Tassa, Mansard, Todorov, ICRA 2014.
 """
 
 import math
@@ -23,14 +21,7 @@ from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
 from ..rollout import iterate_steps
-from .linearisation import (
-    N_INPUTS,
-    IlqrProblem,
-    Linearisation,
-    PlanRun,
-    linearise_run,
-    make_problem,
-)
+from .linearisation import N_INPUTS, IlqrProblem, Linearisation, PlanRun, linearise, make_problem
 from .preview import Forecast, PlanParams, PlanState, make_forecast, read_plan_state
 
 if TYPE_CHECKING:
@@ -99,7 +90,7 @@ def _compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> L
     clip_angle = as_python(limit_angle, ARRAYS)
     low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
     high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
-    position = run.states[:K, PlanState._fields.index("slewing")] / task.authority
+    position = PlanState(*run.states[:K].T).slewing / task.authority
     max_change = task.slew * fixed.ticks / task.authority
     slope = problem.scale[column] / task.authority
     return Limits(low, high, position - max_change, position + max_change, column, slope)
@@ -107,8 +98,8 @@ def _compute_limits(problem: IlqrProblem, forecast: Forecast, run: PlanRun) -> L
 
 def _compute_commanded_share(fixed: PlanParams, states: Array) -> Array:
     """Compute the motors' commanded yaw moment as a fraction of full scale, shape (K,)."""
-    left, right = (states[:, PlanState._fields.index(name)] for name in ("command_l", "command_r"))
-    share = 0.5 * (right - left) * fixed.car.d_r / (fixed.car.r * fixed.task.yaw_scale)
+    x = PlanState(*states.T)
+    share = 0.5 * (x.command_r - x.command_l) * fixed.car.d_r / (fixed.car.r * fixed.task.yaw_scale)
     return np.asarray(np.clip(share, -1.0, 1.0))
 
 
@@ -120,8 +111,7 @@ def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
     y = (Q[0, 1] * q[0] - Q[0, 0] * q[1]) / det
     if low[0] < x < high[0] and low[1] < y < high[1]:
         return x, y, True, True
-    min_cost, best, free = math.inf, np.zeros(2), np.zeros(2, np.bool_)
-    d = np.zeros(2)
+    min_cost, best, free, d = math.inf, np.zeros(2), np.zeros(2, np.bool_), np.zeros(2)
     for i in range(2):
         for side in range(2):
             other = 1 - i
@@ -130,29 +120,20 @@ def _solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
             d[other] = min(max(interior, low[other]), high[other])
             cost = q @ d + 0.5 * (d @ (Q @ d))
             if cost < min_cost:
-                min_cost = cost
-                best[:], free[:] = d, False
+                min_cost, best[:], free[:] = cost, d, False
                 free[other] = d[other] == interior
     return best[0], best[1], free[0], free[1]
 
 
 @jit
 def _run_backward_pass(
-    linearisation: Linearisation,
-    limits: Limits,
-    inputs: Matrix,
-    length: int,
-    damping: float,
-    d: Matrix,
-    G: Matrix,
-) -> None:
-    """Run the backward pass over a run's linearisation, with damping on the diagonal of Quu.
-
-    Fills d (K, 2) and G (K, 2, size), with zeros behind the run's length: an input u of the run
-    becomes u + d + G dx, with dx the scaled state less the run's. G = -Quu^-1 Qux where both inputs
-    are free. Where the rate limits the steering, the limit moves with the last command: so does the
-    gain.
-    """
+    linearisation: Linearisation, limits: Limits, inputs: Matrix, length: int, damping: float,
+    d: Matrix, G: Matrix,
+) -> None:  # fmt: skip
+    """Run the backward pass over a run's linearisation, with damping on the diagonal of Quu."""
+    # Fills d (K, 2) and G (K, 2, size), with zeros behind the run's length: an input u of the run
+    # becomes u + d + G dx, with dx the scaled state less the run's. G = -Quu^-1 Qux where both are
+    # free. Where the rate limits the steering, the limit moves with the last command: so does G.
     # The cost to go from the next period's state is v'dx + dx'V dx / 2. With this period's cost,
     # in the state and the inputs, it is q'(dx, du) + (dx, du)'Q (dx, du) / 2.
     size = linearisation.F.shape[1]
@@ -186,11 +167,9 @@ def _run_backward_pass(
 
 
 def _simulate_run(
-    env: gym.Env[Actions, Actions],
-    seed: int,
-    actions: Array | Actions,
+    env: gym.Env[Actions, Actions], seed: int, actions: Array | Actions,
     feedback: tuple[Array, Array] | None = None,
-) -> PlanRun:
+) -> PlanRun:  # fmt: skip
     """Simulate an episode; feedback: states (K + 1, n), gains (K, width, n) on the miss."""
     env.reset(seed=seed)
     base = _get_base(env)
@@ -200,11 +179,9 @@ def _simulate_run(
     for k in range(len(applied)):
         if feedback is not None:
             planned, gains = feedback
-            corrected = actions[k] - gains[k] @ (states[k] - planned[k])
-            applied[k] = np.clip(corrected, -1.0, 1.0)
+            applied[k] = np.clip(actions[k] - gains[k] @ (states[k] - planned[k]), -1.0, 1.0)
         _, reward, terminated, truncated, _ = env.step(applied[k])
-        cost -= float(reward)
-        length = k + 1
+        cost, length = cost - float(reward), k + 1
         states[length] = read_plan_state(base.packed_state)
         if terminated or truncated:
             break
@@ -223,9 +200,8 @@ def _solve_ilqr(
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
     problem, best = make_problem(forecast.fixed), _simulate_run(env, seed, actions)
-    damping, n_stalled = _FIRST_DAMPING, 0
+    damping, n_stalled, kind = _FIRST_DAMPING, 0, forecast.fixed.kind
     for iteration in range(MAX_ITERATIONS):
-        kind = forecast.fixed.kind
         if kind.has_driver or kind.has_errors:  # what answers to the newest run
             env.reset(seed=seed)
             forecast = make_forecast(_get_base(env), best.actions)
@@ -240,17 +216,13 @@ def _solve_ilqr(
 
 
 def _run_line_search(
-    env: gym.Env[Actions, Actions],
-    seed: int,
-    problem: IlqrProblem,
-    forecast: Forecast,
-    run: PlanRun,
-    damping: float,
-) -> tuple[PlanRun, float]:
+    env: gym.Env[Actions, Actions], seed: int, problem: IlqrProblem, forecast: Forecast,
+    run: PlanRun, damping: float,
+) -> tuple[PlanRun, float]:  # fmt: skip
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_inputs(problem, run)
-    linearisation = linearise_run(problem, forecast.known, nominal_run)
+    linearisation = linearise(problem, forecast.known, nominal_run)
     limits = _compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
     inputs[:, : fixed.width] = nominal_run.actions
@@ -263,10 +235,9 @@ def _run_line_search(
             candidate = nominal_run.actions + length * d[:, : fixed.width]
             trial = _simulate_run(env, seed, candidate, (nominal_run.states, gains))
             if trial.cost < run.cost:
-                whole, short = STEP_LENGTHS[0], STEP_LENGTHS[-1]
-                factors = {whole: 1.0 / _DAMPING_FACTOR, short: _DAMPING_FACTOR}
-                factor = factors.get(length, 1.0)
-                return trial, max(damping * factor, _DAMPING_LIMITS[0])
+                first, *_, last = STEP_LENGTHS
+                factors = {first: 1.0 / _DAMPING_FACTOR, last: _DAMPING_FACTOR}
+                return trial, max(damping * factors.get(length, 1.0), _DAMPING_LIMITS[0])
         damping *= _DAMPING_FACTOR
     return run, damping
 
@@ -277,8 +248,7 @@ def _use_achieved_inputs(problem: IlqrProblem, run: PlanRun) -> PlanRun:
     if fixed.task.torque_slew:
         actions[:, 0] = _compute_commanded_share(fixed, run.states[1:])
     if fixed.width == N_INPUTS:
-        column = PlanState._fields.index("slewing")
-        actions[:, 1] = run.states[1:, column] / fixed.task.authority
+        actions[:, 1] = PlanState(*run.states[1:].T).slewing / fixed.task.authority
     return replace(run, actions=actions)
 
 
@@ -302,8 +272,7 @@ def compute_clairvoyant(
     Args:
         env: Single env.
         seed: Seed of the episode.
-        starts: Actions after the lead-in, shape (K, width), by method; without any the plan starts
-            from zeros.
+        starts: Actions after the lead-in, shape (K, width), by method; None: zeros alone.
 
     Returns:
         Actions of the least cost, and the costs of all candidates.
@@ -323,8 +292,8 @@ def compute_clairvoyant(
         costs[f"from {name}"] = run.cost
     winner = min(costs, key=lambda label: costs[label])
     statuses = {name: status for name, (_, status) in plans.items()}
-    actions, cost, seconds = candidates[winner], costs[winner], time.process_time() - start_time
-    return ClairvoyantResult(actions, cost, winner, costs, statuses, seconds)
+    best, seconds = (candidates[winner], costs[winner]), time.process_time() - start_time
+    return ClairvoyantResult(*best, winner, costs, statuses, seconds)
 
 
 def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Actions:
@@ -336,14 +305,11 @@ def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Act
         seed: Seed of the episode.
 
     Returns:
-        Actions after the lead-in in fractions of full scale, shape (K, width), zeros after a
-        failure.
+        Fractions of full scale after the lead-in, shape (K, width), zeros after a failure.
     """
-    base = _get_base(env)
-    _, *steps = iterate_steps(env, agent, seed)
-    steps = steps[_count_lead_steps(base) :]
+    base, (_, *steps) = _get_base(env), iterate_steps(env, agent, seed)
     actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
-    for k, step in enumerate(steps):
+    for k, step in enumerate(steps[_count_lead_steps(base) :]):
         actions[k] = step.action
     return actions
 

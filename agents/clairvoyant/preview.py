@@ -13,11 +13,7 @@ from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
 from ...envs.numerics.primitives import Scalar
 from ...envs.record import Array
-from ...envs.scenarios.driver import (
-    SpeedProfile,
-    compute_acceleration_command,
-    compute_wind,
-)
+from ...envs.scenarios.driver import SpeedProfile, compute_acceleration_command, compute_wind
 from ...envs.task import REPORT, ReferenceParams
 from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
@@ -105,14 +101,10 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
     Args:
         base: Unwrapped env at the manoeuvre's start.
-        actions: Actions of a run, shape (K, width), to which driver, measured reference and place
-            on the road react; None: zeros.
+        actions: Actions of a run, shape (K, width), to which driver and place react; None: zeros.
 
     Returns:
         Forecast from the manoeuvre's start to the episode's end.
-
-    Raises:
-        ValueError: The env is elsewhere in its episode.
     """
     n = base.control_period
     snapshot = base.get_state()
@@ -149,35 +141,26 @@ def read_plan_state(z: Array) -> PlanState:
 
 def _make_plan_params(base: Any, p: Array, switches: Array, n: int) -> PlanParams:
     """Make the parameters of an episode in steps of n ticks."""
-    vehicle, lags = base.vehicle, base.scenario.lags
-    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    task, speed_profile = read(p, P.task), read(p, P.speed_profile)._replace(end=FOREVER)
-    speed_profile = speed_profile._replace(speed=0.0, acceleration=0.0, start=0.0, surge=0.0)
-    return PlanParams(
-        read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
-        read(p, P.road),
-        speed_profile,
-        make_lag(motor, n * TICK),
-        make_lag(steering, n * TICK),
-        make_lag(motor, TICK),
-        make_lag(steering, TICK),
-        read(p, P.target),
-        task,
-        as_python(make_step_variant)(p, switches),
-        base.action_space.shape[0],
-        n,
-        -int((task.lead_in - task.duration) // n),
-    )
+    x, delays = base.vehicle, (0.0, 0.0)
+    if base.scenario.lags:
+        delays = x.motor_lag, x.steering_lag
+    road, target, task = read(p, P.road), read(p, P.target), read(p, P.task)
+    car = read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0)
+    profile = read(p, P.speed_profile)._replace(end=FOREVER, speed=0.0, acceleration=0.0)
+    profile = profile._replace(start=0.0, surge=0.0)
+    lags: Any = [make_lag(delay, period) for period in (n * TICK, TICK) for delay in delays]
+    kind, width = as_python(make_step_variant)(p, switches), base.action_space.shape[0]
+    periods = -int((task.lead_in - task.duration) // n)
+    return PlanParams._make((car, road, profile, *lags, target, task, kind, width, n, periods))
 
 
 def _simulate_actions(base: Any, snapshot: dict[str, Any], actions: Array, n: int) -> Array:
     """Simulate the packed states at every tick by the env, shape (K n + 1, STATE_WIDTH)."""
-    z = snapshot["state"]
+    names = ("params", "state", "switches", "rows", "packets")
+    p, z, switches, rows, packets = (snapshot[name] for name in names)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
-    p, switches = snapshot["params"], snapshot["switches"]
     obs, report = np.empty(len(base.layout), np.float32), np.zeros(len(REPORT))
-    record = snapshot["rows"], snapshot["packets"]
-    row = EpisodeArrays(p, z, switches, obs, *record, report, bounds, make_window(1))
+    row = EpisodeArrays(p, z, switches, obs, rows, packets, report, bounds, make_window(1))
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     states = np.empty((n * len(actions) + 1, len(z)))
     for state, action in zip(states, held_actions, strict=False):
@@ -187,21 +170,12 @@ def _simulate_actions(base: Any, snapshot: dict[str, Any], actions: Array, n: in
 
 
 def _compute_preview(
-    p: Array,
-    fixed: PlanParams,
-    ticks: npt.NDArray[np.int64],
-    states: Array,
-    command: Array,
+    p: Array, fixed: PlanParams, ticks: npt.NDArray[np.int64], states: Array, command: Array
 ) -> Array:
     """Compute the columns of `PreviewStep`, shape (len(PreviewStep), periods + 1)."""
     n, last = fixed.ticks, len(command) - 1
     nodes = np.arange(0, last, n)
     angle = states[:, Z.drive.delta_f] - states[:, Z.drive.added]
-
-    def compute_wheel_angle(places: npt.NDArray[np.int64], rest: float) -> Array:
-        """Compute the front wheels' angle without the added one, after a tick's lag."""
-        return np.asarray(as_python(apply_lag)(command[places], angle[places], rest))
-
     lag, middle = fixed.steering_tick, nodes + n // 2
     wind = read(p, P.wind)
     wind_forces = np.array([compute_wind(float(tick), wind) for tick in ticks[:-1]])
@@ -214,10 +188,8 @@ def _compute_preview(
     patch = 1.0 + wave.share * np.sin(wave.rate * states[middle, Z.motion.s] + wave.phase)
     numbers = car.C_f, car.C_r, car.mu * patch, car.mu_r * patch
     factors = (change.front, change.rear, change.friction, change.friction)
-    tyres = [
-        np.where(is_changed, factor * number, number)
-        for factor, number in zip(factors, numbers, strict=True)
-    ]
+    pairs = zip(factors, numbers, strict=True)
+    tyres = [np.where(is_changed, factor * number, number) for factor, number in pairs]
     # the direction of a nominal car's path, gamma + beta'; another road's does not turn so
     beta, gamma = states[:, Z.nominal_motion.beta], states[:, Z.nominal_motion.gamma]
     turns = gamma[:-1] + np.diff(beta) / TICK
@@ -226,33 +198,25 @@ def _compute_preview(
     # the last one, which counts whole, half a tick more. This is exact for n = 1.
     weights = np.full(len(nodes), n * TICK)
     weights[0] = 0.5 * (n - 1) * TICK
-    table = (
-        compute_wheel_angle(nodes, lag.start),
-        compute_wheel_angle(middle, lag.middle if n % 2 else lag.start),
-        compute_wheel_angle(nodes + n - 1, lag.end),
-        command[nodes],
-        *mean_forces.T,
-        *tyres,
-        *set_points.T,
-        turns.reshape(-1, n).mean(axis=1),
-        weights,
-        *states[np.ix_(nodes, Z.refs)].T,
-        np.ones(len(nodes)),
-    )
-    known = np.array(PreviewStep._make(table))
+    rests = lag.start, lag.middle if n % 2 else lag.start, lag.end
+    places = zip((nodes, middle, nodes + n - 1), rests, strict=True)
+    # the front wheels' angle without the added one, after a tick's lag
+    wheels = [as_python(apply_lag)(command[i], angle[i], rest) for i, rest in places]
+    turn, refs = turns.reshape(-1, n).mean(axis=1), states[np.ix_(nodes, Z.refs)].T
+    inputs = *wheels, command[nodes], *mean_forces.T, *tyres, *set_points.T
+    known = np.array([*inputs, turn, weights, *refs, np.ones(len(nodes))])
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
-    end[PreviewStep._fields.index("command")] = command[last]
-    end[PreviewStep._fields.index("beta_ref") :, 0] = *states[last, list(Z.refs)], 0.0
-    is_complete = ticks[-1] == fixed.task.duration
-    end[PreviewStep._fields.index("weight")] = 0.5 * (n + 1) * TICK if is_complete else 0.0
+    column, is_complete = PreviewStep._fields.index, ticks[-1] == fixed.task.duration
+    end[column("command")] = command[last]
+    end[column("beta_ref") :, 0] = *states[last, list(Z.refs)], 0.0
+    end[column("weight")] = 0.5 * (n + 1) * TICK if is_complete else 0.0
     return np.hstack([known, end])
 
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
     # at v_x = 0, k_p = 0 leaves the feedforward alone, and k_p = 1 /s adds the speed to it
-    profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
-    feedforward = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
-    profile = profile._replace(k_p=1.0)
-    total = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
+    profiles = [speed_profile._replace(hold=1.0, k_p=k_p, k_i=0.0) for k_p in (0.0, 1.0)]
+    commands = [compute_acceleration_command(tick, 0.0, 0.0, x, np.inf)[0] for x in profiles]
+    feedforward, total = commands
     return total - feedforward, feedforward

@@ -2,7 +2,6 @@
 
 import math
 from abc import ABC, abstractmethod
-from functools import cached_property
 from numbers import Real
 from typing import Any
 
@@ -13,8 +12,8 @@ from ...envs.engine.config import make_car
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import ARRAYS, Scalar
 from ...envs.record import Array
+from ...envs.task import REFERENCES, make_reference_params
 from ...envs.vehicle.actuators import compute_torque_limit
-from ...envs.vehicle.dynamics import CarParams
 from ...envs.vehicle.linear import Bicycle
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..env_info import AnyEnv, get_env_facts
@@ -28,63 +27,47 @@ class Controller(ABC):
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
-    (N, memory). A controller serves a single env or all rows of a vector env, which then share its
-    design.
+    (N, memory). A controller serves a single env or all rows of a vector env, with one design.
 
-    Where a needed entry is not finite the action is NaN and the memory stays as it was, which makes
-    a failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
+    A missing entry is a ValueError. Where an entry is not finite the action is NaN and the memory
+    stays as it was, which makes a failed estimator visible: an env with `on_bad_action="fail"` ends
+    the episode, others raise.
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
         grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
             force. None: no such limit. Friction is `true_friction`, else the nominal car's.
-
-    Attributes:
-        needs: Entries of the observation that the controller reads.
-        memory: Numbers of memory for each row.
-
-    Raises:
-        ValueError: A needed entry is missing, `grip` is not positive, or rows have different
-            nominals.
     """
 
-    needs: tuple[str, ...] = ()
-    memory = 0
+    needs: tuple[str, ...] = ()  # entries of the observation that the controller reads
+    memory = 0  # numbers of memory for each row
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
+    vehicle: Vehicle  # the car that the controller is designed for
     _design: tuple[Any, ...]  # the last argument of a compiled law
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = get_env_facts(env)
         names = facts.names
         self.grip = None if grip is None else check_positive("grip", grip)
-        reads_friction = grip is not None or self.knows_friction
-        self._true_friction = reads_friction and FRICTION in names
+        self._true_friction = (grip is not None or self.knows_friction) and FRICTION in names
         if self._true_friction:
             self.needs = (*self.needs, FRICTION)
         missing = [name for name in self.needs if name not in names]
         if missing:
-            raise ValueError(
-                f"{type(self).__name__} needs {', '.join(missing)} in the observation"
-                f"{_describe_wrapper(missing)}"
-            )
+            text = f"{type(self).__name__} needs {', '.join(missing)} in the observation"
+            raise ValueError(text + _describe_wrapper(missing))
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
-        self._n_entries = len(names)  # of an observation
+        self._n_entries, self.width = len(names), facts.width  # of an observation, of an action
         self.nominal = self.vehicle = facts.nominal
         self.full_scale, self.authority = facts.full_scale, facts.authority
         self.control_period, self.reference = facts.control_period, facts.reference
-        self.width = facts.width
-
-    vehicle: Vehicle
-    """The car that the controller is designed for."""
+        self._reference_kind = REFERENCES.index(facts.reference)
+        self._target = make_reference_params(facts.nominal)
 
     def __repr__(self) -> str:
         grip = "" if self.grip is None else f", grip {self.grip:g}"
         reads = ", ".join(self.needs) or "nothing"
         return f"<{type(self).__name__} for {self.vehicle.name}{grip}; reads {reads}>"
-
-    @cached_property
-    def _car(self) -> CarParams:
-        return make_car(self.vehicle)
 
     @property
     def _bicycle(self) -> Bicycle:
@@ -100,7 +83,7 @@ class Controller(ABC):
         car, max_share = self.vehicle, np.ones(len(inputs))
         # the motors' power is a limit at the measured speed (columns 0 and 1, the front wheels)
         if car.motor_power > 0.0:
-            max_share = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
+            max_share = _torque_limit(inputs[:, :2].mean(axis=1), make_car(car)) / car.motor_torque
         if self.grip is None:
             return max_share
         load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
@@ -111,9 +94,7 @@ class Controller(ABC):
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        """Compute the action and the next memory, in place.
-
-        A NaN in an action means that the law failed.
+        """Compute the action and the next memory, in place; NaN in an action: the law failed.
 
         Args:
             inputs: Entries of `needs`, finite, shape (N, len(needs)).
@@ -122,9 +103,7 @@ class Controller(ABC):
                 and, where the env steers, added steering as a fraction of the vehicle's authority.
         """
 
-    def _mark_not_finite(  # noqa: B027
-        self, rows: npt.NDArray[np.bool_], state: Array
-    ) -> None:
+    def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:  # noqa: B027
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
@@ -136,12 +115,9 @@ class Controller(ABC):
         """
 
     def predict(
-        self,
-        observation: npt.NDArray[np.float32],
-        state: Array | None = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[npt.NDArray[np.float32], Array]:
+        self, observation: npt.NDArray[np.float32], state: Array | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None, deterministic: bool = True,
+    ) -> tuple[npt.NDArray[np.float32], Array]:  # fmt: skip
         """Compute the action for an observation or a batch.
 
         Args:
@@ -152,9 +128,6 @@ class Controller(ABC):
 
         Returns:
             Action in [-1, 1], shape (width,) or (N, width), and the next state.
-
-        Raises:
-            ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
         if obs.shape[-1] != self._n_entries or obs.ndim > 2:
@@ -166,14 +139,11 @@ class Controller(ABC):
         action = np.zeros((len(batch), self.width))
         inputs = batch[:, self._columns].astype(np.float64)
         bad = np.asarray(~np.isfinite(inputs).all(axis=1))
+        before, inputs[bad] = memory[bad], 0.0
+        self._law(inputs, memory, action)
         if bad.any():
-            before = memory[bad]
-            inputs[bad] = 0.0
-            self._law(inputs, memory, action)
             memory[bad], action[bad] = before, np.nan
             self._mark_not_finite(bad, memory)
-        else:
-            self._law(inputs, memory, action)
         shares = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (shares[0] if obs.ndim == 1 else shares), memory
 
@@ -188,7 +158,7 @@ def _describe_wrapper(missing: list[str]) -> str:
 
 
 def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
-    """Return a number that must be positive and finite.
+    """Return a number that must be positive and finite; TypeError or ValueError for another.
 
     Args:
         name: Name of the option, for the message.
@@ -197,10 +167,6 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
 
     Returns:
         The number as a float.
-
-    Raises:
-        TypeError: It is no number.
-        ValueError: The number is out of range.
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} is a number, got {value!r}")

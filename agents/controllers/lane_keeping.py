@@ -1,8 +1,6 @@
 """Lane keeping on curved roads: motion and position together, by front steering and yaw moment.
 
-Uneven-delay's aim: sideslip angle, yaw rate, heading and offset of one vision filter serve it.
-
-The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
+Uneven-delay's aim (docs/PAPERS.md): sideslip angle, yaw rate, heading and offset serve it.
 """
 
 import math
@@ -22,30 +20,20 @@ from ..design.sampled_model import SPEEDS, DesignModel, interpolate_gains
 from ..env_info import AnyEnv
 from .base import Controller, check_positive
 
-Inputs = namedtuple(
-    "Inputs",
-    "wheel_left wheel_right torque_left torque_right steer steer_command beta_hat gamma_hat "
-    "psi_hat y_l_hat",
-)
-"""Columns of the law's inputs."""
-
+# Columns of the law's inputs.
+Inputs = namedtuple("Inputs", "wheel_left wheel_right torque_left torque_right steer steer_command "
+                              "beta_hat gamma_hat psi_hat y_l_hat")  # fmt: skip
+# States of the lane model: the inputs move the first seven, the others move by themselves. psi is
+# relative to the road (rad), y the offset of the centre of gravity from the road's centre line (m),
+# integral its integral (m s), N_z a fraction of full scale.
 Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
-"""States of the lane model: the inputs move the first seven, the others move by themselves.
-
-psi is relative to the road (rad). y is the offset of the centre of gravity from the road's centre
-line (m), and integral is its integral (m s). N_z is a fraction of full scale.
-"""
+# The integral of y (m s), what the curvature is computed from (low-passed gamma / V in 1/m, and
+# low-passed psi in rad), and whether the episode has started (1).
 Memory = namedtuple("Memory", "integral rate heading started")
-"""The integral of y (m s), what the curvature is computed from (low-passed gamma / V in 1/m, and
-low-passed psi in rad), and whether the episode has started (1)."""
 
-IN = Inputs(*range(10))
-AT = Lane(*range(9))
-LAST = Memory(*range(4))
+IN, AT, LAST = Inputs(*range(10)), Lane(*range(9)), Memory(*range(4))
 MOVED = Lane._fields[: AT.driver]
-HASTE = 3.0
-"""Weight of ((command - applied angle) / reach)^2, reach = steering_rate (T + steering_lag): keeps
-the command within the actuator's rate."""
+HASTE = 3.0  # weight of the steering's haste in the cost, which `_make_lane_model` explains
 _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
@@ -73,8 +61,7 @@ def _make_lane_model(
     # haste ((command - applied angle) / reach)^2, with the angle `reach` that the actuator's rate
     # covers in a period and a lag: without it a linear law commands too fast a steering.
     C = np.zeros((6, n))
-    for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
-        C[row, state] = 1.0
+    C[range(6), (AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)] = 1.0
     C[1, AT.kappa], C[5, AT.driver] = -speed, -1.0  # gamma - V kappa; the added steering alone
     command_error = np.zeros((1, n + 2))  # the steering command less the applied angle
     command_error[0, [AT.delta_f, AT.driver, n + 1]] = -1.0, 1.0, 1.0
@@ -86,8 +73,8 @@ def _make_lane_model(
     cost_matrix = cost_outputs.T @ W @ cost_outputs
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
     Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
-    inputs_cost = R[inputs, inputs], N[:, inputs]
-    return DesignModel(G, H[:, inputs], Q, *inputs_cost, Lane._fields, len(MOVED))
+    moved = len(MOVED)
+    return DesignModel(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], Lane._fields, moved)
 
 
 @jit
@@ -139,9 +126,6 @@ class LaneKeeping(Controller):
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
         haste: Weight of the steering command less the applied angle, as for `HASTE`.
-
-    Raises:
-        ValueError: The action does not steer, an entry is missing, or an option is out of range.
     """
 
     needs = Inputs._fields
@@ -158,15 +142,11 @@ class LaneKeeping(Controller):
         speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
         design, car = (self.control_period, self.full_scale, haste, inputs), self.nominal
         gains = [_make_lane_model(car, speed, *design).solve()[0] for speed in speeds]
-        self._design = (
-            np.ascontiguousarray(np.array(gains)[:, None, None]),
-            (np.array(speeds), np.zeros(1), np.zeros(1)),
-            0.5 * car.rear_track / car.wheel_radius / self.full_scale,
-            car.preview,
-            check_positive("curvature_time", curvature_time),
-            self.control_period * TICK,
-            self.authority,
-        )
+        table = np.ascontiguousarray(np.array(gains)[:, None, None])
+        axes, time = (np.array(speeds), np.zeros(1), np.zeros(1)), self.control_period * TICK
+        share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
+        filter_time = check_positive("curvature_time", curvature_time)
+        self._design = table, axes, share, car.preview, filter_time, time, self.authority
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _lane_keeping_law(inputs, state, action, self._design)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from ...envs.numerics.jit import copy_into, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
 from ...envs.record import Array
-from ...envs.task import REFERENCES
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
@@ -20,18 +19,15 @@ from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_g
 from ..env_info import AnyEnv, get_env_facts
 from .base import Controller, check_positive
 
-Inputs = namedtuple(
-    "Inputs",
-    "wheel_left wheel_right torque_left torque_right steer steer_command beta_ref gamma_ref "
-    "beta_hat gamma_hat disturbance_1 disturbance_2 front_stiffness rear_stiffness",
-)
-"""Columns of the law's inputs; beta_ref stands in for those that `Lqr` does without."""
+# Columns of the law's inputs; beta_ref stands in for those that `Lqr` does without.
+Inputs = namedtuple("Inputs", "wheel_left wheel_right torque_left torque_right steer steer_command "
+                              "beta_ref gamma_ref beta_hat gamma_hat disturbance_1 disturbance_2 "
+                              "front_stiffness rear_stiffness")  # fmt: skip
 IN = Inputs(*range(14))
 TRUE_PARAMETERS = (
     *("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness"),
     *("friction", "motor_left", "motor_right"),
-)
-"""Parameters of the true car, of which the observation has true_<name>; the last are its motors."""
+)  # parameters of the true car, of which the observation has true_<name>; the last are its motors
 _MAX_CARS = 1024  # for which the gains are kept
 
 
@@ -52,16 +48,10 @@ def make_design_state(x: Vector, share: Scalar, z: Vector) -> None:
 
 @jit
 def _lqr_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    max_share: Vector,
-    sliding_slip: Vector,
-    design: tuple[Any, ...],
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, sliding_slip: Vector, design: Any
 ) -> None:
     """Compute the actions of LQR within the limits, and the next `Lqr.memory`."""
-    # sliding_slip: slip angle at which the front tyres slide (rad), max_share: largest yaw moment
-    # as a fraction of full scale; both (N,)
+    # max_share: largest yaw moment (of full scale), sliding_slip: that of the front tyres (rad)
     table, axes, scheduled, share, authority, slew, front_arm = design
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z, first = np.empty((m, n + m)), np.empty(n), m - 1
@@ -100,11 +90,11 @@ class Lqr(Controller):
     """u = -K(v) x for the nominal vehicle as `make_design_model` predicts it.
 
     x has the estimates beta_hat and gamma_hat (without the latter the gyro), the applied torques
-    and steering, the driver's command, and the references. It has the disturbances F_d_hat, N_d_hat
-    or d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is
-    LQG. Where the env steers, an input may pass its limit, or the steering its rate. Both inputs
-    are then optimal within these limits, if none were met later. The memory is the steering last
-    added and, where the yaw moment's rate costs, its fraction at the last decision and its command.
+    and steering, the driver's command, the references, and the disturbances F_d_hat, N_d_hat or
+    d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is LQG.
+    Where the env steers, both inputs are optimal within their limits and the steering's rate, if
+    none were met later. The memory is the steering last added and, where the yaw moment's rate
+    costs, its fraction at the last decision and its command.
 
     Args:
         env: Env of the controller.
@@ -117,25 +107,15 @@ class Lqr(Controller):
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
         knows_car: Whether the observation has each row's `TRUE_PARAMETERS`: gains are designed for
             that car, and commands corrected for its motors.
-
-    Raises:
-        ValueError: An entry is missing, or an option is out of range.
     """
 
     min_period = 1  # ticks, of the period that the gains are designed for
 
     def __init__(
-        self,
-        env: AnyEnv,
-        disturbance_time: float = 0.3,
-        vehicle: VehicleSource | None = None,
-        stiffness: Sequence[str] = (),
-        span: tuple[float, float] = (0.5, 1.6),
-        knots: int = 7,
-        steer_weight: float = 1.0,
-        grip: float | None = None,
-        knows_car: bool = False,
-    ) -> None:
+        self, env: AnyEnv, disturbance_time: float = 0.3, vehicle: VehicleSource | None = None,
+        stiffness: Sequence[str] = (), span: tuple[float, float] = (0.5, 1.6), knots: int = 7,
+        steer_weight: float = 1.0, grip: float | None = None, knows_car: bool = False,
+    ) -> None:  # fmt: skip
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
@@ -144,18 +124,14 @@ class Lqr(Controller):
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if set(pair) <= set(names)), "none")
         substitutes = ("beta_ref", "beta_ref")
-        self.needs = (
-            *Inputs._fields[: IN.gamma_hat],
-            "gamma_hat" if "gamma_hat" in names else "gyro",
-            *pairs.get(kind, substitutes),
-            *(stiffness or substitutes),
-            *self._list_extra_entries(names),
-        )
-        self._car_columns = (
-            slice(len(self.needs), len(self.needs) + len(TRUE_PARAMETERS)) if knows_car else None
-        )
+        yaw_rate = "gamma_hat" if "gamma_hat" in names else "gyro"
+        extra = *pairs.get(kind, substitutes), *(stiffness or substitutes)
+        self.needs = *Inputs._fields[: IN.gamma_hat], yaw_rate, *extra
+        self.needs += self._list_extra_entries(names)
+        self._car_columns: slice | None = None
         self._by_car: dict[bytes, Lqr] = {}
         if knows_car:
+            self._car_columns = slice(len(self.needs), len(self.needs) + len(TRUE_PARAMETERS))
             self.needs += tuple(f"true_{name}" for name in TRUE_PARAMETERS)
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else make_vehicle(vehicle)
@@ -163,16 +139,11 @@ class Lqr(Controller):
         self._steer_unit = self.authority  # of the added steering that is remembered
         self.remembered = 2 if rate > 0.0 else 0  # numbers at the end of the memory
         self.memory = self.width - 1 + self.remembered
-        self.design_spec = DesignSpec(
-            max(self.control_period, self.min_period),
-            self.full_scale,
-            self.width == 2,
-            REFERENCES.index(self.reference),
-            kind,
-            check_positive("disturbance_time", disturbance_time),
-            check_positive("steer_weight", steer_weight),
-            rate,
-        )
+        period = max(self.control_period, self.min_period)
+        time = check_positive("disturbance_time", disturbance_time)
+        weight = check_positive("steer_weight", steer_weight)
+        plant = period, self.full_scale, self.width == 2
+        self.design_spec = DesignSpec(*plant, self._reference_kind, kind, time, weight, rate)
         factors = np.geomspace(*span, knots) if stiffness else np.zeros(0)
         nominals = car.front_stiffness, car.rear_stiffness
         self._design_gains(car, *(tuple((nominal * factors).tolist()) for nominal in nominals))
@@ -181,13 +152,12 @@ class Lqr(Controller):
         self, car: Vehicle, fronts: Sequence[float] = (), rears: Sequence[float] = ()
     ) -> None:
         """Design the gains for a car, on knots of the stiffnesses (N/rad) or for its own."""
+        self.vehicle, self.scheduled = car, bool(fronts)
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
-        self.vehicle = car
         speeds = SPEEDS[::2] if fronts or self._car_columns else SPEEDS  # many tables: half of it
         self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
-        self.scheduled = bool(fronts)
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
@@ -216,7 +186,7 @@ class Lqr(Controller):
         return KS
 
     def curvature(self, speed: float) -> Array:
-        """Compute S, shape (width, width): an action that is off by e costs e' S e more, if linear.
+        """Compute S, shape (width, width): an action that is off by e costs e' S e more.
 
         Args:
             speed: Speed (m/s).
@@ -243,7 +213,6 @@ class Lqr(Controller):
     def _design_anew(self, car: Vehicle) -> "Lqr":
         """Make the same controller for another car."""
         other = copy.copy(self)
-        other.__dict__.pop("_car", None)  # a cached property
         other._design_gains(car)
         return other
 
@@ -284,8 +253,7 @@ class Lqr(Controller):
         stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness
         load = car.mass * GRAVITY * car.rear_arm / (2.0 * car.wheelbase)  # N, of a front tyre
         # tan(slip angle) = 3 mu F_z / C, small angles
-        sliding_slip: Array = 3.0 * self._get_friction(inputs) * load / np.maximum(stiffness, 1.0)
-        return sliding_slip
+        return np.asarray(3.0 * self._get_friction(inputs) * load / np.maximum(stiffness, 1.0))
 
 
 @jit

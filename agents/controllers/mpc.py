@@ -18,24 +18,17 @@ from .lqr import IN, Lqr, make_design_state
 MIN_STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
 _RHO = 0.1  # OSQP's step size at the start of every call, whatever the last one ended with
-_SETTINGS = {
-    "verbose": False,
-    "adaptive_rho": 1,  # after so many iterations, not after a time
-    "adaptive_rho_interval": 50,
-    "rho": _RHO,
-    "eps_abs": 1e-4,  # of full scale
-    "eps_rel": 1e-4,
-    "check_termination": 10,
-    "polishing": False,
-}
+_SETTINGS = {  # tolerances of full scale; rho adapts after so many iterations, not after a time
+    "verbose": False, "adaptive_rho": 1, "adaptive_rho_interval": 50, "rho": _RHO, "eps_abs": 1e-4,
+    "eps_rel": 1e-4, "check_termination": 10, "polishing": False,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _QuadraticProgram:
     """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
 
-    Inputs stand step by step, as fractions of their limits. The cost is scaled so that the mean of
-    P's diagonal is 1.
+    Inputs are fractions of their limits, step by step. The mean of P's diagonal is 1.
     """
 
     P: Array  # Hessian, (h m, h m)
@@ -56,17 +49,17 @@ def _condense_program(
         rows, next_rows = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
         Sx[next_rows], Su[next_rows] = model.G @ Sx[rows], model.G @ Su[rows]
         Su[next_rows, i * m : (i + 1) * m] += model.H
-    Q, R = np.kron(np.eye(horizon + 1), model.Q), np.kron(np.eye(horizon), model.R)
+    steps = np.eye(horizon)
+    Q, R = np.kron(np.eye(horizon + 1), model.Q), np.kron(steps, model.R)
     Q[-n:, -n:] = model.solve()[1]
-    N = np.vstack([np.kron(np.eye(horizon), model.N), np.zeros((n, horizon * m))])
+    N = np.vstack([np.kron(steps, model.N), np.zeros((n, horizon * m))])
     scale = np.tile(limits[: len(design_spec.inputs)], horizon)
     P = scale[:, None] * (Su.T @ Q @ Su + Su.T @ N + N.T @ Su + R) * scale
     F = scale[:, None] * ((Su.T @ Q + N.T) @ Sx)
     size = float(np.diag(P).mean())
     A = np.eye(horizon * m)
     if m > 1:
-        changes = np.eye(horizon) - np.eye(horizon, k=-1)
-        A = np.vstack([A, np.kron(changes, [[0.0, 1.0]])])
+        A = np.vstack([A, np.kron(steps - np.eye(horizon, k=-1), [[0.0, 1.0]])])
     return _QuadraticProgram(0.5 * (P + P.T) / size, F / size, A)
 
 
@@ -74,9 +67,8 @@ class Mpc(Lqr):
     """Predictive control: `lqr`'s cost over a horizon with limits, then as if there were none.
 
     Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
-    Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`. The
-    memory is the last fraction of added steering and the last solution, from which the next starts,
-    and what `Lqr` remembers of the yaw moment.
+    Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`. Each
+    solution starts from the last one, which the memory holds.
 
     Args:
         env: Env of the controller.
@@ -89,26 +81,17 @@ class Mpc(Lqr):
         status: Status of each row in the last call: "solved", "solved inaccurate" (ten times the
             tolerance of 1e-4 of full scale), or why there is no solution and the action is NaN.
         solve_time: Time of the solver for each row (s).
-
-    Raises:
-        ModuleNotFoundError: The extras `mpc` and `design` are not installed.
-        ValueError: An entry is missing, or an option is out of range.
     """
 
     def __init__(
-        self,
-        env: AnyEnv,
-        horizon: int = 30,
-        iterations: int = 20000,
-        disturbance_time: float = 0.3,
-        grip: float | None = None,
-    ) -> None:
+        self, env: AnyEnv, horizon: int = 30, iterations: int = 20000,
+        disturbance_time: float = 0.3, grip: float | None = None,
+    ) -> None:  # fmt: skip
         try:
             import osqp
         except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                "predictive control needs OSQP: pip install 'sideslip[mpc]'"
-            ) from None
+            text = "predictive control needs OSQP: pip install 'sideslip[mpc]'"
+            raise ModuleNotFoundError(text) from None
         for name, value in (("horizon", horizon), ("iterations", iterations)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} is a positive whole number, got {value!r}")
@@ -128,11 +111,8 @@ class Mpc(Lqr):
         end = 1 + inputs + self._rows
         self.memory = end + self.remembered
         self._primal, self._dual = slice(1, 1 + inputs), slice(1 + inputs, end)
-        self._dual_limits = slice(1 + inputs, 1 + 2 * inputs)
-        self._dual_rate = slice(1 + 2 * inputs, end)
         self._ready_for: dict[float, tuple[_QuadraticProgram, Any]] = {}
-        self.status: list[str] = []
-        self.solve_time: list[float] = []
+        self.status, self.solve_time = list[str](), list[float]()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the solvers, which cannot be copied and are set up anew."""
@@ -185,8 +165,8 @@ class Mpc(Lqr):
         row_action[:] = solution.x[:m]
         memory[0] = solution.x[1] if m > 1 else 0.0
         memory[self._primal] = self._shift_solution(solution.x, m)
-        memory[self._dual_limits] = self._shift_solution(solution.y[:count], m)
-        memory[self._dual_rate] = self._shift_solution(solution.y[count:], 1)
+        duals = [(solution.y[:count], m), (solution.y[count:], 1)]  # of limits, of the rate
+        memory[self._dual] = np.concatenate([self._shift_solution(*dual) for dual in duals])
         return str(solution.info.status), float(solution.info.run_time)
 
     def _shift_solution(self, values: Array, width: int) -> Array:
@@ -202,14 +182,8 @@ class Mpc(Lqr):
 
             design = self.prediction, self.horizon, self.authority
             program, solver = _condense_program(self.nominal, speed, *design), self._osqp.OSQP()
-            solver.setup(
-                csc_matrix(np.triu(program.P)),
-                np.zeros(len(program.P)),
-                csc_matrix(program.A),
-                -np.ones(self._rows),
-                np.ones(self._rows),
-                max_iter=self.iterations,
-                **_SETTINGS,
-            )
+            P, A = csc_matrix(np.triu(program.P)), csc_matrix(program.A)
+            gradient, limits = np.zeros(len(program.P)), (-np.ones(self._rows), np.ones(self._rows))
+            solver.setup(P, gradient, A, *limits, max_iter=self.iterations, **_SETTINGS)
             self._ready_for[speed] = program, solver
         return self._ready_for[speed]

@@ -1,8 +1,4 @@
-"""Nonlinear model predictive control by Gauss-Newton iterations, and control adapted to tyres.
-
-The prediction is the plant's own compiled code. The adaptive controllers follow the tyres that a
-filter estimates on the way.
-"""
+"""Nonlinear model predictive control by Gauss-Newton iterations, and control adapted to tyres."""
 
 import math
 from collections import namedtuple
@@ -16,18 +12,13 @@ from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
-from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
+from ...envs.task import LAGGED, ReferenceParams, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource
 from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
-from ..design.prediction import (
-    PredictionModel,
-    PredictionStart,
-    PredictionTask,
-    make_prediction_model,
-)
+from ..design.prediction import PredictionModel, PredictionStart, PredictionTask, make_prediction
 from ..design.sampled_model import interpolate_gains
 from ..env_info import AnyEnv, list_plant_kinds
 from .base import check_positive
@@ -42,9 +33,9 @@ TYRES = ("front_tyres_hat", "rear_tyres_hat")
 INVERSE_FRICTION = "inverse_friction_hat"
 _MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 
+# Added steering last commanded (rad) and status; the plan's variables follow, and what
+# `Lqr` remembers of the yaw moment.
 Memory = namedtuple("Memory", "added_command status")
-"""Added steering last commanded (rad) and index in `STATUSES`; the plan's variables follow, and
-what `Lqr` remembers of the yaw moment."""
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)
 
@@ -57,8 +48,8 @@ class Design(NamedTuple):
     gains: Matrix  # K of `GainTables`, (..., m, n)
     terminal: Matrix  # T of `GainTables`, (..., 4, n)
     axes: tuple[Vector, ...]  # knots of speed, front and rear stiffness
-    blocks: Vector  # steps of each block
     scheduled: int  # 1: gains follow the stiffnesses of the observation
+    blocks: Vector  # steps of each block
     disturbed: int  # disturbances of the observation: 0 none, 1 forces, 2 rates
     steps: float  # steps of the prediction in a control period
     iterations: int  # of a decision
@@ -90,10 +81,8 @@ def _interpolate_regulator(
     table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector,
     remembered: int,
 ) -> Matrix:  # fmt: skip
-    """Interpolate a table's rows, shape (rows, 9 + remembered), for the states of `prediction`.
-
-    `per`: what turns F_d and N_d into the table's own disturbances, forces or rates.
-    """
+    """Interpolate a table's rows, shape (rows, 9 + remembered), for the states of `prediction`."""
+    # per: what turns F_d and N_d into the table's own disturbances, forces or rates
     values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9 + remembered))
     interpolate_gains(table, axes, v, front, rear, values)
     n = values.shape[1] - remembered
@@ -109,14 +98,9 @@ def _interpolate_regulator(
 
 @jit
 def _prepare_prediction(
-    design: Design,
-    x: Vector,
-    friction: Scalar,
-    roll: Vector,
-    added_command: Scalar,
-    max_moment: Scalar,
-    before: Vector,
-) -> PredictionTask:
+    design: Design, x: Vector, friction: Scalar, roll: Vector, added_command: Scalar,
+    max_moment: Scalar, before: Vector,
+) -> PredictionTask:  # fmt: skip
     """Prepare the predictions of a row's decision."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
     # added_command: the last one of added steering (rad), max_moment: fraction of full scale,
@@ -127,11 +111,9 @@ def _prepare_prediction(
     rear = x[IN.rear_stiffness] if design.scheduled else model.car.C_r
     car = _replace_tyres(model.car, front, rear, friction)
     gamma, driver, refs = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
-    steady = (
-        compute_reference(driver, v, design.target, LAGGED)
-        if model.kind.reference == LAGGED
-        else refs
-    )
+    steady = refs
+    if model.kind.reference == LAGGED:
+        steady = compute_reference(driver, v, design.target, LAGGED)
     per = (car.m * v, car.I) if disturbed == 2 else (1.0, 1.0)
     F_d = x[IN.disturbance_1] * per[0] if disturbed else 0.0
     N_d = x[IN.disturbance_2] * per[1] if disturbed else 0.0
@@ -141,23 +123,14 @@ def _prepare_prediction(
     rolls = float(model.kind.roll)  # 1: the car rolls
     sine, cosine = sincos(min(max(x[IN.beta_hat], -_MAX_SIDESLIP), _MAX_SIDESLIP))
     v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
+    motion = Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * phi_rate)
+    T_l, T_r, n = x[IN.torque_left], x[IN.torque_right], len(before)
     start = PredictionStart(
-        car,
-        Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * phi_rate),
-        x[IN.torque_left],
-        x[IN.torque_right],
-        x[IN.steer],
-        added_command,
-        driver,
-        (x[IN.torque_left] + x[IN.torque_right]) / (car.m * car.r),
-        refs,
-        steady,
-        DisturbanceForces(F_d, N_d, 0.0),
-        max_moment,
-        before[0] if len(before) > 0 else 0.0,
-        before[1] if len(before) > 0 else 0.0,
-    )
-    per_force, n = (1.0 / per[0], 1.0 / per[1]), len(before)
+        car, motion, T_l, T_r, x[IN.steer], added_command, driver, (T_l + T_r) / (car.m * car.r),
+        refs, steady, DisturbanceForces(F_d, N_d, 0.0), max_moment,
+        before[0] if n > 0 else 0.0, before[1] if n > 0 else 0.0,
+    )  # fmt: skip
+    per_force = 1.0 / per[0], 1.0 / per[1]
     K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force, n)
     terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force, n)
     return PredictionTask(model, start, K, terminal, design.blocks)
@@ -165,14 +138,9 @@ def _prepare_prediction(
 
 @jit
 def _nmpc_law(
-    x: Vector,
-    state: Matrix,
-    action: Matrix,
-    max_moment: Vector,
-    friction: Vector,
-    rolls: Vector,
+    x: Vector, state: Matrix, action: Matrix, max_moment: Vector, friction: Vector, rolls: Vector,
     design: Design,
-) -> None:
+) -> None:  # fmt: skip
     """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
@@ -185,8 +153,7 @@ def _nmpc_law(
         if state[row, LAST.status] == SOLVED:
             _shift_plan(plan, blocks, m, design.steps)
             extra_iterations = 0
-        iterations = design.iterations + extra_iterations
-        J, share, added_command = update_plan(task, plan, iterations)
+        J, share, added_command = update_plan(task, plan, design.iterations + extra_iterations)
         if np.isfinite(J):
             state[row, PLAN:end], state[row, LAST.added_command] = plan, added_command
             if state.shape[1] > end:
@@ -210,11 +177,8 @@ class Nmpc(Lqr):
     motors and limits are those of the nominal car, or of the true one where the observation has
     them (`stiffness`, `true_friction`). The driver's command and acceleration are held. The plan is
     added to `lqr`'s action, within the limits of moment, `grip`, steering and its rate. Where no
-    limit is met and the car is linear the action is `lqr`'s. Each decision starts from the last
-    plan.
-
-    It reads the entries of `lqr`, and phi_hat and phi_rate_hat where they are there. The memory is
-    `Memory` and the plan. Where no prediction is finite the action is NaN.
+    limit is met and the car is linear the action is `lqr`'s. It also reads phi_hat and phi_rate_hat
+    where they are there. Where no prediction is finite the action is NaN.
 
     Args:
         env: Env of the controller.
@@ -228,64 +192,45 @@ class Nmpc(Lqr):
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
         knows_car: Whether each row's car is in the observation, as for `Lqr`.
-
-    Raises:
-        ValueError: An entry is missing, an option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP
     knows_friction = True
 
     def __init__(
-        self,
-        env: AnyEnv,
-        horizon: float = 0.5,
-        iterations: int = 2,
-        disturbance_time: float = 0.3,
-        vehicle: VehicleSource | None = None,
-        stiffness: Sequence[str] = (),
-        span: tuple[float, float] = (0.5, 1.6),
-        knots: int = 7,
-        steer_weight: float = 10.0,
-        grip: float | None = None,
-        knows_car: bool = False,
-    ) -> None:
+        self, env: AnyEnv, horizon: float = 0.5, iterations: int = 2, disturbance_time: float = 0.3,
+        vehicle: VehicleSource | None = None, stiffness: Sequence[str] = (),
+        span: tuple[float, float] = (0.5, 1.6), knots: int = 7, steer_weight: float = 10.0,
+        grip: float | None = None, knows_car: bool = False,
+    ) -> None:  # fmt: skip
         options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, knows_car
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
-        spec, target = self.design_spec, make_reference_params(self.nominal)
+        spec = self.design_spec
         steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
         blocks = _make_blocks(steps, MAX_VARIABLES // self.width)
         self.memory = PLAN + self.width * len(blocks) + self.remembered
-        plants = list_plant_kinds(env)
-        plant, *others = plants
+        self._plant, *others = list_plant_kinds(env)
         if others:
-            raise ValueError(
-                "the rows of a vector env share one prediction, but their plants differ"
-            )
-        self._plant = plant
+            raise ValueError("rows of a vector env share one prediction, but their plants differ")
         disturbed = ("none", "forces", "rates").index(spec.disturbances)
-        lasting = target, blocks, disturbed, self.control_period / spec.period, iterations
+        lasting = blocks, disturbed, self.control_period / spec.period, iterations
         self.design = self._make_design(*lasting)
 
-    def _make_design(
-        self, target: ReferenceParams, blocks: Array, disturbed: int, steps: float, iterations: int
-    ) -> Design:
+    def _make_design(self, *lasting: Any) -> Design:
         """Make the parts of all decisions from the gains and what lasts when these change."""
-        spec, tables = self.design_spec, (self.table[..., : -self.width], self._terminal)
-        model = make_prediction_model(self.vehicle, self._plant, spec, target, self.authority)
+        tables, target = (self.table[..., : -self.width], self._terminal), self._target
+        plant = self.vehicle, self._plant, self.design_spec
+        model = make_prediction(*plant, target, self.authority)
         gains, terminal = map(np.ascontiguousarray, tables)
-        scheduled = int(self.scheduled)
-        shared = self.axes, blocks, scheduled, disturbed, steps, iterations
-        return Design(model, target, gains, terminal, *shared)
+        return Design(model, target, gains, terminal, self.axes, int(self.scheduled), *lasting)
 
     def _design_anew(self, car: Vehicle) -> "Nmpc":
         fitted = fit_fiala(car) if self._plant.tyres == "magic-formula" else car
-        other, last = super()._design_anew(fitted), self.design
+        other = super()._design_anew(fitted)
         assert isinstance(other, Nmpc)
-        lasting = last.target, last.blocks, last.disturbed, last.steps, last.iterations
-        other.design = other._make_design(*lasting)
+        other.design = other._make_design(*self.design[-4:])
         return other
 
     def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -310,10 +255,9 @@ class Nmpc(Lqr):
     def _compute_actions(self, inputs: Array, state: Array, action: Array) -> None:
         rolls = np.full((len(inputs), 2), np.nan)
         if self._rolling:
-            rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])
-        friction = np.ascontiguousarray(self._get_friction(inputs))
-        max_moment = self._compute_max_moment(inputs)
-        _nmpc_law(inputs, state, action, max_moment, friction, rolls, self.design)
+            rolls = inputs[:, len(IN) : len(IN) + 2]
+        limits = self._compute_max_moment(inputs), np.ascontiguousarray(self._get_friction(inputs))
+        _nmpc_law(inputs, state, action, *limits, np.ascontiguousarray(rolls), self.design)
 
 
 class AdaptiveLqr(Lqr):

@@ -1,14 +1,13 @@
 """tie-vision's two-degree-of-freedom controller: feedforward (24) and a PI on the sideslip angle.
 
-Both are designed from the nominal vehicle and scheduled by the measured speed, the mean of the two
-front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
-
-The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
+Both are designed from the nominal vehicle (docs/PAPERS.md has the papers' short names) and
+scheduled by the mean of the two front wheel speeds: the PI on a grid of speeds.
 """
 
 import math
 from collections import namedtuple
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,33 +15,117 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
-from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
-from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
+from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
+from ...envs.vehicle.parameters import Vehicle
 from ..env_info import AnyEnv
 from .base import Controller, check_positive, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
+POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
+PLACEMENTS = ("radius", "real")
 FEEDFORWARDS = ("reference", "zero-slip")
 
+# Columns of the laws' inputs; the feedforward reads the first three alone.
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
-"""Columns of the laws' inputs; the feedforward reads the first three alone."""
+# The PI's integral (N m), decisions until the next update, and the yaw moment (of full scale) held.
 Memory = namedtuple("Memory", "integral wait share")
-"""The PI's integral (N m), decisions until the next update, and the yaw moment held until then
-(fraction of full scale)."""
+IN, LAST = Inputs(*range(5)), Memory(*range(3))
 
-IN = Inputs(*range(5))
-LAST = Memory(*range(3))
+
+class PI(NamedTuple):
+    """Gains of the yaw moment on the error of the sideslip angle."""
+
+    k_p: float  # proportional gain (N m/rad)
+    k_i: float  # integral gain (N m/(rad s))
+
+
+def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
+    """Design a PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole`.
+
+    With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
+    s^2 + p_2 s + k k_p. Of complex poles (a passenger car's from about 23 km/h on) p_1 and p_2 both
+    are the real part, and the zero cancels no pole. Gains are capped at the full yaw moment for
+    0.01 rad: k is nearly zero near the speed where the yaw moment does not move beta.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        pole: Radius or place of the closed-loop poles (rad/s).
+        placement: "radius": k k_p = pole^2 puts both poles on that circle, a smaller one where
+            their damping would be below a half. "real": k k_p = pole (p_2 - pole) puts one of two
+            real poles there, or both at p_2 / 2 where pole is beyond p_2.
+
+    Returns:
+        Gains k_p (N m/rad) and k_i (N m/(rad s)).
+    """
+    _check(pole, placement)
+    model = make_bicycle_model(vehicle, speed)
+    # det(sI - A + b c) - det(sI - A) is the numerator of G = c (sI - A)^-1 b with c = [1, 0] and b
+    # of the yaw moment: k = a12 b22
+    closed = model.A - model.B[:, 1:] @ [[1.0, 0.0]]
+    k = float((np.poly(closed) - np.poly(model.A))[-1])
+    p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
+    product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
+    if placement == "radius":
+        product = min(pole, p_2) ** 2
+    k_p = _limit_gain(vehicle, product / k) if k != 0.0 else 0.0
+    return PI(k_p, k_p * max(p_1, 0.0))
+
+
+def _check(pole: float, placement: str) -> None:
+    if placement not in PLACEMENTS:
+        raise ValueError(f"placement is one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    if not 0.0 < pole < math.inf:
+        raise ValueError(f"pole is a positive number in rad/s, got {pole!r}")
+
+
+def _limit_gain(vehicle: Vehicle, k_p: float) -> float:
+    max_gain = vehicle.yaw_moment_limit / 0.01
+    return min(max(float(k_p), -max_gain), max_gain)
+
+
+def _sample_pi(vehicle: Vehicle, speed: float, period: float, pole: float, placement: str) -> PI:
+    """Design the PI of `design_pi` for a sampled loop, with the moment held between."""
+    # The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
+    # (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product
+    # of the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period.
+    _check(pole, placement)
+    model = make_bicycle_model(vehicle, speed)
+    p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
+    a_1, a_2 = math.exp(-max(p_1, 0.0) * period), math.exp(-p_2 * period)
+    A_d, B_d = model.discretise(period)  # tie-vision's G and H, (9)
+    b_1, b_0 = B_d[0, 1], A_d[0, 1] * B_d[1, 1] - A_d[1, 1] * B_d[0, 1]
+    if b_1 + b_0 == 0.0:
+        return PI(0.0, 0.0)
+    if placement == "real":
+        z = math.exp(-(pole if pole < p_2 else 0.5 * p_2) * period)
+        k_p = -(z - a_2) * (z - 1.0) / (b_1 * z + b_0)
+    else:
+        radius = min(pole, p_2)
+        continuous = radius**2 / float(model.A[0, 1] * model.B[1, 1])
+
+        def compute_excess(factor: float) -> float:
+            k_p = factor * continuous
+            poles = np.roots([1.0, k_p * b_1 - 1.0 - a_2, a_2 + k_p * b_0]).astype(complex)
+            return float(np.prod(np.log(poles)).real - (radius * period) ** 2)
+
+        from scipy.optimize import brentq  # slow to load
+
+        # a grid in steps of 0.05; the smallest root counts: beyond it a pole may leave z > 0
+        factors = np.linspace(0.0, 4.0, 81)
+        upper = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
+        factor = 4.0 if upper is None else brentq(compute_excess, upper - 0.05, upper)
+        k_p = continuous * factor
+    k_p = _limit_gain(vehicle, k_p)
+    return PI(k_p, k_p * (1.0 - a_1) / period)
 
 
 @jit
 def _compute_denominator(car: Bicycle, V: Scalar) -> Scalar:
-    """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
-
-    At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
-    a speed, m V^2 = 2 (l_r C_r - l_f C_f).
-    """
+    """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes."""
+    # zero, at m V^2 = 2 (l_r C_r - l_f C_f), is where the yaw moment does not move a steady beta
     mV2, excess = car.m * V * V, car.l_f * car.C_f - car.l_r * car.C_r
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
@@ -88,10 +171,7 @@ def _feedforward_law(x: Matrix, action: Matrix, design: tuple[Any, ...]) -> None
 def _two_dof_law(
     x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
-    """Compute the actions from `Inputs` x and update the `Memory` state.
-
-    `max_share` is the largest yaw moment (fraction of full scale). `follows`: 1 for "reference".
-    """
+    """Compute the actions from `Inputs` x and update the `Memory` state."""
     follows, car, k_p, k_i, full_scale, wait, dt = design
     for n in range(len(x)):
         if state[n, LAST.wait] > 0.0:
@@ -140,29 +220,19 @@ class TwoDof(Controller):
         gain: Factor on the PI's gains.
         pole: Pole of the closed loop (rad/s), as for `design_pi`.
         placement: Rule of the pole, as for `design_pi`.
-        sampled: Whether to place the poles of the sampled loop (`sample_pi`).
+        sampled: Whether to place the poles of the sampled loop.
         grip: Grip limit, as for `Controller`.
-        feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip" is
-            (24).
-
-    Raises:
-        ValueError: A rate, placement or feedforward is unknown, or beta_hat is missing.
+        feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
     """
 
     needs = Inputs._fields
     memory = len(Memory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        rate: str = "control",
-        gain: float = 1.0,
-        pole: float = POLE,
-        placement: str = PLACEMENTS[0],
-        sampled: bool = False,
-        grip: float | None = None,
+        self, env: AnyEnv, rate: str = "control", gain: float = 1.0, pole: float = POLE,
+        placement: str = PLACEMENTS[0], sampled: bool = False, grip: float | None = None,
         feedforward: str = FEEDFORWARDS[0],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(env, grip)
         if feedforward not in FEEDFORWARDS:
             known = ", ".join(FEEDFORWARDS)
@@ -173,15 +243,11 @@ class TwoDof(Controller):
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
         factor = check_positive("gain", gain, allow_zero=True)
-        if sampled:
-            pis = [sample_pi(self.nominal, float(v), dt, pole, placement) for v in SPEEDS]
-        else:
-            pis = [design_pi(self.nominal, float(v), pole, placement) for v in SPEEDS]
-        table = factor * np.array([(pi.k_p, pi.k_i) for pi in pis])
-        self.k_p, self.k_i = np.ascontiguousarray(table.T)
-        car = self._bicycle
-        follows = int(feedforward == FEEDFORWARDS[0])
-        self._design = follows, car, self.k_p, self.k_i, self.full_scale, wait, dt
+        design = partial(_sample_pi, period=dt) if sampled else design_pi
+        pis = [design(self.nominal, float(v), pole=pole, placement=placement) for v in SPEEDS]
+        self.k_p, self.k_i = np.ascontiguousarray((factor * np.array(pis)).T)
+        follows, gains = int(feedforward == FEEDFORWARDS[0]), (self.k_p, self.k_i)
+        self._design = follows, self._bicycle, *gains, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

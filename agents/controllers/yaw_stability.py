@@ -1,8 +1,7 @@
 """Controllers of yaw rate and sideslip angle: ESC, sliding mode, and following of a model.
 
 The laws compute the nominal car's plant at the measured speed, the mean of the two front wheels'.
-
-The papers' short names, such as dakf-stability, are those of docs/PAPERS.md.
+Papers' short names, such as dakf-stability, are those of docs/PAPERS.md.
 """
 
 import math
@@ -15,15 +14,7 @@ import numpy as np
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
-from ...envs.task import (
-    LAGGED,
-    LIMITED,
-    REFERENCES,
-    ZERO_SLIP,
-    ReferenceParams,
-    compute_reference,
-    make_reference_params,
-)
+from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
 from ...envs.vehicle.parameters import Vehicle
@@ -52,8 +43,7 @@ class BicyclePlant(NamedTuple):
 @jit
 def _compute_plant(car: Bicycle, V: Scalar) -> BicyclePlant:
     """Compute the plant of a nominal car at a speed (m/s)."""
-    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(car, V)
-    return BicyclePlant(a11, a12, a21, a22, b11, b21, b22)
+    return BicyclePlant(*compute_bicycle_coefficients(car, V))
 
 
 @jit
@@ -75,22 +65,17 @@ def _solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> tuple[S
     return delta_f, (second - plant.b21 * delta_f) / plant.b22
 
 
-_plant, _drift = as_python(_compute_plant), as_python(_compute_drift)
-_inputs = as_python(_solve_inputs)
-
+# Columns of the law's inputs; the last one only where the sideslip angle is bounded.
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
-"""Columns of the law's inputs; the last one only where the sideslip angle is bounded."""
 ESC_IN = EscInputs(*range(5))
 
 
-def _compute_yaw_gains(
-    vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH
-) -> tuple[float, float]:
+def _compute_yaw_gains(vehicle: Vehicle, speed: float, bandwidth: float) -> tuple[float, float]:
     """Compute k_p (N m s/rad) and k_i (N m/rad) of the yaw moment on the yaw rate's error."""
     # both poles at the bandwidth (rad/s): s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2;
     # where the yaw equation's own damping is more, k_p is zero
     I = vehicle.yaw_inertia  # noqa: E741
-    a22 = _plant(Bicycle(*map(float, vehicle.lateral)), speed).a22
+    a22 = as_python(_compute_plant)(Bicycle(*map(float, vehicle.lateral)), speed).a22
     return max(I * (2.0 * bandwidth + a22), 0.0), I * bandwidth * bandwidth
 
 
@@ -143,56 +128,37 @@ class Esc(Controller):
         slip: Bound of the sideslip angle (rad).
         stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: An option is out of range.
     """
 
     memory = 1
 
     def __init__(
-        self,
-        env: AnyEnv,
-        bandwidth: float = BANDWIDTH,
-        band: float = 0.02,
-        slip: float = 0.05,
-        stiffness: float | None = None,
-        grip: float | None = None,
-    ) -> None:
+        self, env: AnyEnv, bandwidth: float = BANDWIDTH, band: float = 0.02, slip: float = 0.05,
+        stiffness: float | None = None, grip: float | None = None,
+    ) -> None:  # fmt: skip
         bounded = "beta_hat" in get_env_facts(env).names
         self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
         super().__init__(env, grip)
         bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
         if not 0.0 <= band < math.inf:
             raise ValueError(f"band is zero or more, in rad/s, got {band!r}")
-        self._design = (
-            make_reference_params(self.nominal),
-            np.array(SPEEDS),
-            np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
-            float(band),
-            slip,
-            self.full_scale / slip
-            if stiffness is None
-            else check_positive("stiffness", stiffness, allow_zero=True),
-            int(bounded),
-            self.full_scale,
-            self.control_period * TICK,
-        )
+        if stiffness is None:
+            stiffness = self.full_scale / slip
+        bound = slip, check_positive("stiffness", stiffness, allow_zero=True), int(bounded)
+        gains = np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS])
+        scales, table = (self.full_scale, self.control_period * TICK), (np.array(SPEEDS), gains)
+        self._design = self._target, *table, float(band), *bound, *scales
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _esc_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
 
-SlidingModeInputs = namedtuple(
-    "SlidingModeInputs",
-    "wheel_left wheel_right steer_command steer beta_ref gamma_ref beta_hat gamma_hat",
-)
-"""Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate."""
+# Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate.
+SlidingModeInputs = namedtuple("SlidingModeInputs", "wheel_left wheel_right steer_command steer "
+                               "beta_ref gamma_ref beta_hat gamma_hat")  # fmt: skip
+# The references of the last decision, for their derivatives, and whether there was one.
 SlidingModeMemory = namedtuple("SlidingModeMemory", "beta_ref gamma_ref known")
-"""The references of the last decision, for their derivatives, and whether there was one."""
-
-SLIDING_IN = SlidingModeInputs(*range(8))
-SLIDING_LAST = SlidingModeMemory(*range(3))
+SLIDING_IN, SLIDING_LAST = SlidingModeInputs(*range(8)), SlidingModeMemory(*range(3))
 
 
 @jit
@@ -233,10 +199,9 @@ def _sliding_mode_law(
             beta_ref_rate = (beta_ref - state[n, SLIDING_LAST.beta_ref]) / dt
             gamma_ref_rate = (gamma_ref - state[n, SLIDING_LAST.gamma_ref]) / dt
         s = gamma - gamma_ref + xi * (beta - beta_ref)
-        drift_rates = _compute_drift(plant, beta, gamma)
-        s_rate = drift_rates[1] + plant.b21 * delta - gamma_ref_rate
-        # s' without the yaw moment
-        s_rate += xi * (drift_rates[0] + plant.b11 * delta - beta_ref_rate)
+        beta_rate, gamma_rate = _compute_drift(plant, beta, gamma)
+        s_rate = gamma_rate + plant.b21 * delta - gamma_ref_rate  # s' without the yaw moment
+        s_rate += xi * (beta_rate + plant.b11 * delta - beta_ref_rate)
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, SLIDING_LAST.beta_ref], state[n, SLIDING_LAST.gamma_ref] = beta_ref, gamma_ref
@@ -250,8 +215,7 @@ class SlidingMode(Controller):
     The equivalent control of the nominal car at the measured speed keeps s constant. Within the
     boundary layer s decays at `rate`, outside at rate x layer (rad/s2). xi makes beta's error decay
     at `pole`. Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps beta_ref.
-    Reads beta_hat, and gamma_hat or else the gyro.
-    Source: Rajamani, Vehicle Dynamics and Control, 8.3.
+    Reads beta_hat, and gamma_hat or else the gyro. Source: Rajamani, Vehicle Dynamics, 8.3.
 
     Args:
         env: Env of the controller, with beta_hat in its observation.
@@ -264,55 +228,35 @@ class SlidingMode(Controller):
     memory = len(SlidingModeMemory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        pole: float = 15.0,
-        rate: float = 40.0,
-        layer: float = 0.2,
+        self, env: AnyEnv, pole: float = 15.0, rate: float = 40.0, layer: float = 0.2,
         grip: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         yaw_rate = "gamma_hat" if "gamma_hat" in get_env_facts(env).names else "gyro"
         self.needs = (*SlidingModeInputs._fields[: SLIDING_IN.gamma_hat], yaw_rate)
         super().__init__(env, grip)
         self.pole, self.rate = check_positive("pole", pole), check_positive("rate", rate)
-        self._design = (
-            self._bicycle,
-            make_reference_params(self.nominal),
-            REFERENCES.index(self.reference),
-            self.pole,
-            self.rate,
-            check_positive("layer", layer),
-            self.full_scale,
-            self.control_period * TICK,
-        )
+        surface = self.pole, self.rate, check_positive("layer", layer)
+        scales = self.full_scale, self.control_period * TICK
+        self._design = self._bicycle, self._target, self._reference_kind, *surface, *scales
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
 
-ModelInputs = namedtuple(
-    "ModelInputs",
-    "wheel_left wheel_right steer_command beta_ref gamma_ref beta_hat gamma_hat d1_hat d2_hat",
-)
-"""Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
+# Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`.
+ModelInputs = namedtuple("ModelInputs", "wheel_left wheel_right steer_command beta_ref gamma_ref "
+                         "beta_hat gamma_hat d1_hat d2_hat")  # fmt: skip
+# Integrals of steering (rad) and yaw moment (N m), the driver's last command (rad), if any.
 ModelMemory = namedtuple("ModelMemory", "delta_f_sum N_z_sum driver known")
-"""The integrals of steering (rad) and yaw moment (N m), the driver's last steering command (rad),
-and whether there was one."""
-
-MODEL_IN = ModelInputs(*range(9))
-MODEL_LAST = ModelMemory(*range(4))
+MODEL_IN, MODEL_LAST = ModelInputs(*range(9)), ModelMemory(*range(4))
 
 
 @jit
 def _model_following_law(
     x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
-    """Compute the actions from `ModelInputs` x and update the `ModelMemory` state.
-
-    max_share: largest yaw moment as a fraction of full scale (N,). design: nominal car, reference
-    parameters, index of the reference, K_beta and K_gamma (rad/s), 1 or 0 for (26), full scale
-    (N m), authority (rad), control period (s).
-    """
+    """Compute the actions from `ModelInputs` x and update the `ModelMemory` state."""
+    # K: K_beta and K_gamma (rad/s), rejection: 1 or 0 for (26), max_share: of full scale
     car, target, kind, K, rejection, full_scale, authority, dt = design
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, MODEL_IN.wheel_left] + x[n, MODEL_IN.wheel_right]), _MIN_SPEED)
@@ -344,8 +288,7 @@ def _model_following_law(
         steer = min(max(delta_f, driver - authority), driver + authority)
         limit = max_share[n] * full_scale
         moment = min(max(N_z, -limit), limit)
-        drift_rates = _compute_drift(plant, p_beta, p_gamma)
-        # I of (31), forward Euler
+        drift_rates = _compute_drift(plant, p_beta, p_gamma)  # I of (31), forward Euler
         steps = _solve_inputs(plant, -drift_rates[0] * dt, -drift_rates[1] * dt)
         delta_f_sum = integrate_antiwindup(delta_f_sum, steps[0], delta_f, steer)
         N_z_sum = integrate_antiwindup(N_z_sum, steps[1], N_z, moment)
@@ -362,29 +305,22 @@ class ModelFollowing(Controller):
     env's, but "zero-slip" takes the yaw rate that keeps beta_ref. Derivatives follow the steering
     at one speed, as the speed's noise would drown a difference. "lagged" has those of its lag.
 
-    Anti-windup is conditional integration of each input: an integral holds while its input is at
-    the limit (yaw moment: full scale; steering: the authority around the driver's) and the error
-    would push it further out.
+    An integral holds while its input is at the limit (yaw moment: full scale; steering: the
+    authority around the driver's) and the error would push it further out.
 
     Args:
         env: Env of the controller, whose action steers.
         bandwidth: K_beta and K_gamma (rad/s).
         rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
     """
 
     memory = len(ModelMemory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        bandwidth: Sequence[float] = MODEL_BANDWIDTH,
-        rejection: bool = True,
+        self, env: AnyEnv, bandwidth: Sequence[float] = MODEL_BANDWIDTH, rejection: bool = True,
         grip: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         substitutes = {} if "gamma_hat" in get_env_facts(env).names else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
             substitutes |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
@@ -395,16 +331,8 @@ class ModelFollowing(Controller):
         K = [float(value) for value in bandwidth]
         if len(K) != 2 or not all(0.0 < value < math.inf for value in K):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
-        self._design = (
-            self._bicycle,
-            make_reference_params(self.nominal),
-            REFERENCES.index(self.reference),
-            np.array(K),
-            float(rejection),
-            self.full_scale,
-            self.authority,
-            self.control_period * TICK,
-        )
+        car = self._bicycle, self._target, self._reference_kind, np.array(K), float(rejection)
+        self._design = *car, self.full_scale, self.authority, self.control_period * TICK
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _model_following_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

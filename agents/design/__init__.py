@@ -1,1 +1,1 @@
-"""Models and gains for controllers: the nominal and the sampled car, PI, schedules, predictions."""
+"""Models and gains for controllers: the nominal and the sampled car, schedules, predictions."""

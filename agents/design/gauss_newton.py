@@ -48,10 +48,8 @@ def _simulate_batch(task: PredictionTask, batch: PlanBatch) -> None:
 
 @jit
 def _compute_normal_equations(batch: PlanBatch, A: Matrix, g: Vector) -> None:
-    """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences.
-
-    Column 0 of the batch is the plan itself; in column i + 1 its variable i is perturbed.
-    """
+    """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences."""
+    # column 0 of the batch is the plan itself; in column i + 1 its variable i is perturbed
     n, residuals = len(g), batch.residuals
     slope = np.empty(n)  # a row of D
     A[:], g[:] = 0.0, 0.0
@@ -69,11 +67,8 @@ def _compute_normal_equations(batch: PlanBatch, A: Matrix, g: Vector) -> None:
 
 @jit
 def _solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vector) -> None:
-    """Solve (A + damping diag A + 1e-9 I) d = -g by Cholesky's factors; d is zero where they fail.
-
-    A (n, n) is positive semidefinite; a variable without an effect does not move. L (n, n) is
-    scratch for the lower factor.
-    """
+    """Solve (A + damping diag A + 1e-9 I) d = -g by Cholesky's factors; zero where they fail."""
+    # a variable without an effect does not move; L (n, n) is scratch for the lower factor
     n = len(g)
     d[:] = 0.0
     for i in range(n):
@@ -113,12 +108,8 @@ def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
 
 
 @jit
-def update_plan(
-    task: PredictionTask, plan: Vector, iterations: int
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Improve a plan by Gauss-Newton iterations.
-
-    The plan is never costlier, as predicted, than it was or than zeros.
+def update_plan(task: PredictionTask, plan: Vector, iterations: int) -> tuple[Scalar, ...]:
+    """Improve a plan, which is never costlier, as predicted, than it was or than zeros.
 
     Args:
         task: Model, start, regulator and blocks.
@@ -129,8 +120,8 @@ def update_plan(
         Cost J of the improved plan, not finite where no plan's was and the plan is unchanged; its
         first yaw moment (fraction of full scale) and added steering (rad).
     """
-    n, n_terminal = len(plan), len(task.terminal)
-    batch = _make_plan_batch(n, task.blocks, _N_CANDIDATES, n_terminal)
+    n = len(plan)
+    batch = _make_plan_batch(n, task.blocks, _N_CANDIDATES, len(task.terminal))
     A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):

@@ -1,12 +1,11 @@
 """Predictions of nonlinear predictive control: the plant's own source, many plans at once.
 
-A plan is added to the linear regulator's action, constant in blocks of steps. The sum is limited
-as the plant limits it. So the plan of zeros is the regulator itself, which is optimal where the
-car is linear and no limit is met. As many plans as a SIMD value has lanes are simulated at once.
+A plan, constant in blocks of steps, is added to the linear regulator's action, and the sum limited
+as the plant limits it. So the plan of zeros is the regulator itself, optimal where the car is
+linear and no limit is met. As many plans as a SIMD value has lanes are simulated at once.
 
-The regulator's nine states, in this order, are the columns of K and T: beta, gamma, yaw moment
-(fraction of full scale), delta_f, driver's angle, beta_ref, gamma_ref, F_d, N_d. Where the moment's
-rate costs there are two more: its fraction a step ago, and the command from then on.
+The regulator's states, the columns of K and T, are beta, gamma, yaw moment (of full scale),
+delta_f, driver's angle, beta_ref, gamma_ref, F_d, N_d and, where its rate costs, `_REMEMBERED`.
 """
 
 import math
@@ -111,9 +110,7 @@ class PredictionTask(NamedTuple):
 class PlanBatch(NamedTuple):
     """Plans side by side and their results, one column for each."""
 
-    # fractions of the inputs' full scale, for every block that of the yaw moment and, where the car
-    # steers, that of the authority; shape (variables, count)
-    plans: Matrix
+    plans: Matrix  # fractions of moment and, where the car steers, authority; (variables, count)
     perturbations: Matrix  # added to commands behind their limits, for differences; likewise
     limits: Matrix  # 1 or -1 where a block starts at a limit, (variables, count)
     residuals: Matrix  # their squares sum to J and the terminal cost, (residuals, count)
@@ -121,17 +118,14 @@ class PlanBatch(NamedTuple):
 
 
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Compute mean and standard deviation, over a step's ticks, of a lag's remaining fraction.
-
-    This rho is what a lag leaves of the deviation from a command. The mean square of
-    command + deviation rho is (command + deviation mean)^2 + (deviation std)^2.
-    """
+    """Compute mean and standard deviation, over a step's ticks, of a lag's remaining part rho."""
+    # the mean square of command + deviation rho is (command + deviation mean)^2 + (deviation std)^2
     tick = make_lag(time_constant, TICK)
     rho = tick.mean * tick.end ** np.arange(ticks)
     return float(rho.mean()), float(rho.std())
 
 
-def make_prediction_model(
+def make_prediction(
     vehicle: Vehicle, plant: PlantKind, spec: DesignSpec, target: ReferenceParams, authority: float
 ) -> PredictionModel:
     """Make the model of a car in a design's periods, with its cost.
@@ -152,25 +146,15 @@ def make_prediction_model(
         small, law, spec.kind, roll, has_driver=0, lag=2,
         has_load_shift=has_load_shift(small, law, roll), road=0, has_errors=0,
     )  # fmt: skip
-    ticks, disturbance_time = spec.period, math.inf
-    if spec.disturbances == "forces":
-        disturbance_time = spec.disturbance_time
-    step = ticks * TICK
+    ticks, step = spec.period, spec.period * TICK
+    disturbance_time = spec.disturbance_time if spec.disturbances == "forces" else math.inf
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if plant.lags else (0.0, 0.0)
     return PredictionModel(
-        make_car(vehicle),
-        RoadParams(0.0, 0.0, 1.0),
-        kind,
-        make_lag(motor, step),
-        make_lag(steering, step),
-        _compute_lag_moments(motor, ticks),
-        _compute_lag_moments(steering, ticks),
-        step,
-        spec.full_scale,
-        authority,
-        vehicle.steering_rate * step,
-        vehicle.steering_stop,
-        float(plant.yaw_first),
+        make_car(vehicle), RoadParams(0.0, 0.0, 1.0), kind,
+        make_lag(motor, step), make_lag(steering, step),
+        _compute_lag_moments(motor, ticks), _compute_lag_moments(steering, ticks),
+        step, spec.full_scale, authority,
+        vehicle.steering_rate * step, vehicle.steering_stop, float(plant.yaw_first),
         math.exp(-step / disturbance_time),
         target.rest**ticks if spec.kind == LAGGED else 1.0,
         1.0 / BETA_SCALE,
@@ -178,13 +162,13 @@ def make_prediction_model(
         math.sqrt(EFFORT_WEIGHT),
         math.sqrt(spec.steer_weight * EFFORT_WEIGHT) / STEER_SCALE,
         math.sqrt(spec.moment_rate / (step * RATE_TICKS * TICK * EFFORT_WEIGHT)),
-    )
+    )  # fmt: skip
 
 
+# Residuals of a step: errors of sideslip angle and yaw rate, then of the yaw moment and of added
+# steering the mean over the step and the standard deviation within it. Where the moment's rate
+# costs, two more have those of the moment's change since the step before.
 N_RESIDUALS = 6
-"""Residuals of a step: error of the sideslip angle, error of the yaw rate, then for the yaw moment
-and for added steering the mean over the step and the standard deviation within it. Where the
-moment's rate costs, two more have those of the moment's change since the step before."""
 N_TERMINAL = 4  # residuals behind the last step, of what is to come
 
 
@@ -219,13 +203,9 @@ def _detect_limit(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 @inline
 def _multiply_row(
-    M: Matrix,
-    row: int,
-    model: PredictionModel,
-    driver: Scalar,
-    state: _PredictionState,
+    M: Matrix, row: int, model: PredictionModel, driver: Scalar, state: _PredictionState,
     beta: Scalar,
-) -> Scalar:
+) -> Scalar:  # fmt: skip
     """Multiply a row of M, K or T of shape (rows, 9 or 11), by the states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     first = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
@@ -239,20 +219,12 @@ def _multiply_row(
 
 @inline
 def _compute_commands(
-    model: PredictionModel,
-    start: PredictionStart,
-    K: Matrix,
-    state: _PredictionState,
-    beta: Scalar,
-    moment_share: Scalar,
-    steer_share: Scalar,
-) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Compute the commands within their limits, and 1 or -1 at a limit of either.
-
-    The plan adds `moment_share` (of full scale) and `steer_share` (of the authority) to the
-    regulator's action. Commands are the yaw moment (fraction of full scale) and the added steering
-    (rad).
-    """
+    model: PredictionModel, start: PredictionStart, K: Matrix, state: _PredictionState,
+    beta: Scalar, moment_share: Scalar, steer_share: Scalar,
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
+    """Compute the commands within their limits, and 1 or -1 at a limit of either."""
+    # The plan adds `moment_share` (of full scale) and `steer_share` (of the authority) to the
+    # regulator's action. Commands are the yaw moment (of full scale) and the added steering (rad).
     max_moment = start.max_moment
     regulator_share = 0.0 - _multiply_row(K, 0, model, start.driver, state, beta)
     share = _clip_symmetric(regulator_share, max_moment) + moment_share
@@ -272,16 +244,11 @@ def _compute_commands(
 
 @inline
 def _predict_step(
-    model: PredictionModel,
-    start: PredictionStart,
-    state: _PredictionState,
-    share: Scalar,
-    added_command: Scalar,
-    share_beyond: Scalar,
-    steer_beyond: Scalar,
-) -> tuple[_PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:
+    model: PredictionModel, start: PredictionStart, state: _PredictionState, share: Scalar,
+    added_command: Scalar, share_beyond: Scalar, steer_beyond: Scalar,
+) -> tuple[_PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:  # fmt: skip
     """Predict one step with held commands: the state after it, and the effort's four residuals."""
-    kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
+    kind, motor, steering = model.kind, model.motor, model.steering
     car, driver = start.car, start.driver
     max_torque = compute_torque_limit(state.motion.v_x, car)
     N_z = share * model.full_scale
@@ -290,18 +257,16 @@ def _predict_step(
     T_l, T_r = T_l - torque_beyond, T_r + torque_beyond
     added_target = limit_angle(added_command, driver, model.stop) + steer_beyond
     steer = driver + added_target
-    angles = (
-        apply_lag(steer, state.delta_f, steering.start),
-        apply_lag(steer, state.delta_f, steering.middle),
-        apply_lag(steer, state.delta_f, steering.end),
-    )
+    first = apply_lag(steer, state.delta_f, steering.start)
+    middle = apply_lag(steer, state.delta_f, steering.middle)
+    last = apply_lag(steer, state.delta_f, steering.end)
     loads = (
-        compute_lagged_load(angles[0], T_l, T_r, state, motor.start, car, kind),
-        compute_lagged_load(angles[1], T_l, T_r, state, motor.middle, car, kind),
-        compute_lagged_load(angles[2], T_l, T_r, state, motor.end, car, kind),
+        compute_lagged_load(first, T_l, T_r, state, motor.start, car, kind),
+        compute_lagged_load(middle, T_l, T_r, state, motor.middle, car, kind),
+        compute_lagged_load(last, T_l, T_r, state, motor.end, car, kind),
     )
-    push, road = DisturbanceForces(state.F_d, state.N_d, 0.0), model.road
-    motion = rk4(state.motion, loads, push, car, road, h, kind)
+    push = DisturbanceForces(state.F_d, state.N_d, 0.0)
+    motion = rk4(state.motion, loads, push, car, model.road, model.step, kind)
     per_torque = 0.5 * car.d_r / car.r / model.full_scale
     target_share, share_before = per_torque * (T_r - T_l), per_torque * (state.T_r - state.T_l)
     added_before = state.delta_f - driver
@@ -312,26 +277,18 @@ def _predict_step(
         model.per_steer * model.steering_rest[1] * (added_before - added_target),
     )
     next_state = _PredictionState(
-        motion,
-        apply_lag(T_l, state.T_l, motor.end),
-        apply_lag(T_r, state.T_r, motor.end),
-        apply_lag(steer, state.delta_f, steering.end),
-        added_command,
+        motion, apply_lag(T_l, state.T_l, motor.end), apply_lag(T_r, state.T_r, motor.end),
+        last, added_command,
         apply_lag(start.steady[0], state.beta_ref, model.ref_decay),
         apply_lag(start.steady[1], state.gamma_ref, model.ref_decay),
-        model.decay * state.F_d,
-        model.decay * state.N_d,
-        share_before,
-        target_share,
-    )
+        model.decay * state.F_d, model.decay * state.N_d, share_before, target_share,
+    )  # fmt: skip
     return next_state, efforts
 
 
 @inline
 def _compute_changes(
-    model: PredictionModel,
-    ago: _PredictionState,
-    efforts: tuple[Scalar, Scalar, Scalar, Scalar],
+    model: PredictionModel, ago: _PredictionState, efforts: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> tuple[Scalar, Scalar]:
     """Compute residuals of the moment's change: mean, and deviation within the step from `ago`."""
     mean = apply_lag(ago.command_before, ago.share_before, model.motor_rest[0])
@@ -359,18 +316,11 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
         start_motion.phi + zero, start_motion.phi_dot + zero, zero, zero,
     )  # fmt: skip
     state = _PredictionState(
-        motion,
-        start.T_l + zero,
-        start.T_r + zero,
-        start.delta_f + zero,
-        start.added_command + zero,
-        start.refs[0] + zero,
-        start.refs[1] + zero,
-        start.push.F_d + zero,
-        start.push.N_d + zero,
-        start.share_before + zero,
-        start.command_before + zero,
-    )
+        motion, start.T_l + zero, start.T_r + zero, start.delta_f + zero,
+        start.added_command + zero, start.refs[0] + zero, start.refs[1] + zero,
+        start.push.F_d + zero, start.push.N_d + zero,
+        start.share_before + zero, start.command_before + zero,
+    )  # fmt: skip
     beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
     n_step = N_RESIDUALS + len(terminal) - N_TERMINAL
     row, last = 0, n_step * (blocks.sum() - 1)
@@ -395,15 +345,14 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             state, efforts = _predict_step(
                 model, start, state, share, added_command, share_beyond, steer_beyond
             )
-            beta = compute_sideslip_angle(
-                state.motion.v_x, state.motion.v_y, model.kind.small_angle
-            )
+            motion = state.motion
+            beta = compute_sideslip_angle(motion.v_x, motion.v_y, model.kind.small_angle)
             # J sums the ticks after the start: trapezoid rule over the ends of the steps, plus half
             # a tick because the last tick counts whole
             node = math.sqrt(model.step if row < last else 0.5 * (model.step + TICK))
             span = math.sqrt(model.step)
             store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)
-            gamma_error = state.motion.gamma - state.gamma_ref
+            gamma_error = motion.gamma - state.gamma_ref
             store_element(residuals, node * model.per_gamma * gamma_error, row + 1)
             store_element(residuals, span * efforts[0], row + 2)
             store_element(residuals, span * efforts[1], row + 3)

@@ -17,32 +17,20 @@ import numpy as np
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
-from ...envs.task import (
-    BETA_SCALE,
-    EFFORT_WEIGHT,
-    GAMMA_SCALE,
-    RATE_TICKS,
-    STEER_SCALE,
-    ZERO_SLIP,
-)
+from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, RATE_TICKS, STEER_SCALE, ZERO_SLIP
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import make_lag
 from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 
+# States that the inputs move; N_z is the delivered fraction of full scale, angles are in rad.
 DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
-"""States that the inputs move; N_z is the delivered fraction of full scale, angles are in rad."""
-_HELD = ("driver", "beta_ref", "gamma_ref")
-"""Quantities held constant: the driver's steering in rad and the references."""
+_HELD = ("driver", "beta_ref", "gamma_ref")  # held constant: driver's steering (rad), references
+# Where the moment's rate costs: its fraction a period ago, and the command from then on.
 _REMEMBERED = ("N_z before", "N_z commanded before")
-"""Where the moment's rate costs: its fraction a period ago, and the command from then on."""
-_DISTURBANCES: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "forces": ("F_d", "N_d"),
-    "rates": ("d1", "d2"),
-}
-"""Disturbances by kind: an Ornstein-Uhlenbeck force and moment in N and N m, as `exact-kf` knows
-them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (14)."""
+# Disturbances by kind: an Ornstein-Uhlenbeck force and moment in N and N m, as `exact-kf` knows
+# them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (14).
+_DISTURBANCES = {"none": (), "forces": ("F_d", "N_d"), "rates": ("d1", "d2")}
 
 
 @dataclass(frozen=True)
@@ -67,12 +55,9 @@ class DesignSpec:
     @property
     def cost_weights(self) -> tuple[float, ...]:
         """Weights of sideslip angle, yaw rate, yaw moment and added steering in the cost."""
-        return (
-            1.0 / BETA_SCALE**2,
-            0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
-            EFFORT_WEIGHT,
-            self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0,
-        )
+        gamma = 0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2
+        steer = self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0
+        return 1.0 / BETA_SCALE**2, gamma, EFFORT_WEIGHT, steer
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -99,13 +84,6 @@ class DesignModel:
         d, last = len(DYNAMIC), n - (self.n_moved - len(DYNAMIC))
         return [*range(d), *range(last, n), *range(d, last)]
 
-    def sort_states(self) -> "DesignModel":
-        """Move the states that inputs move to the front."""
-        order = self.order
-        grid, names = np.ix_(order, order), tuple(f"state {i}" for i in order)
-        matrices = self.G[grid], self.H[order], self.Q[grid], self.R, self.N[order]
-        return DesignModel(*matrices, names, self.n_moved)
-
     def solve(self) -> tuple[Array, Array]:
         """Solve for the regulator u = -K x of least cost, and its cost to go x'Vx.
 
@@ -117,9 +95,10 @@ class DesignModel:
         """
         from scipy.linalg import solve, solve_discrete_are
 
-        if _REMEMBERED[0] in self.states:
-            K, V = self.sort_states().solve()
-            back = np.argsort(self.order)
+        if _REMEMBERED[0] in self.states:  # those that inputs move go to the front
+            order, back, grid = self.order, np.argsort(self.order), np.ix_(self.order, self.order)
+            matrices = self.G[grid], self.H[order], self.Q[grid], self.R, self.N[order]
+            K, V = DesignModel(*matrices, tuple(f"state {i}" for i in order), self.n_moved).solve()
             return K[:, back], V[np.ix_(back, back)]
         G, H, Q, R, N, d = self.G, self.H, self.Q, self.R, self.N, self.n_moved
         A, B, W = G[:d, :d], H[:d], G[d:, d:]
@@ -152,8 +131,7 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
     n, m = H1.shape
     W = TICK * np.diag(design_spec.cost_weights)
     step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
-    cost_matrix = np.zeros((n + m, n + m))
-    shares = []  # delivered in each tick, by states and inputs
+    cost_matrix, shares = np.zeros((n + m, n + m)), []  # delivered in each tick
     for _ in range(design_spec.period):
         transition = np.vstack([np.hstack([G, H]), np.hstack([np.zeros((m, n)), np.eye(m)])])
         cost_outputs = np.hstack([C, D]) @ transition
@@ -171,16 +149,13 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
 
 
 def _compute_rate_cost(vehicle: Vehicle, design_spec: DesignSpec, shares: Array) -> Array:
-    """Compute the cost (n + m, n + m) of the moment's rate from a period's shares (period, n + m).
-
-    A rate is taken over `RATE_TICKS`, in shorter periods over one of them.
-    """
+    """Compute the cost (n + m, n + m) of the moment's rate from shares (period, n + m)."""
+    # a rate is taken over `RATE_TICKS`, in shorter periods over one of them
     ticks, width = shares.shape
     lag, span = make_lag(vehicle.motor_lag, TICK), min(ticks, RATE_TICKS)
     rest = lag.mean * lag.end ** np.arange(ticks)
-    before = np.zeros((ticks, width))
-    first = len(design_spec.states) - len(_REMEMBERED)
-    before[:, first], before[:, first + 1] = rest, 1.0 - rest
+    before, n = np.zeros((ticks, width)), len(design_spec.states)
+    before[:, n - 2], before[:, n - 1] = rest, 1.0 - rest
     changes = shares - np.vstack([before, shares])[ticks - span : 2 * ticks - span]
     weight = design_spec.moment_rate * TICK / (span * TICK) ** 2
     return np.asarray(weight * changes.T @ changes)
@@ -226,15 +201,12 @@ def make_tick_model(
     return G, H, C, D
 
 
-def _discretise_plane(
-    vehicle: Vehicle, speed: float, design_spec: DesignSpec
-) -> tuple[Array, Array]:
+def _discretise_plane(vehicle: Vehicle, speed: float, spec: DesignSpec) -> tuple[Array, Array]:
     """Discretise beta and gamma over a tick: from the plane (2, 6) and the disturbances (2, 2)."""
     # The plane's columns: beta, gamma, both actuators, both commands. An actuator without lag is
     # its command.
     model = make_bicycle_model(vehicle, speed)
-    scale = np.array([design_spec.full_scale, 1.0])
-    B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
+    B = model.B[:, ::-1] * np.array([spec.full_scale, 1.0])  # N_z, delta_f, as the inputs stand
     A = np.zeros((4, 4))
     A[:2, :2] = model.A
     inputs = np.zeros((4, 4))  # commands of both actuators, then the disturbances
@@ -245,13 +217,12 @@ def _discretise_plane(
         else:
             inputs[:2, i] = B[:, i]
     per = (1.0 / (vehicle.mass * speed), 1.0 / vehicle.yaw_inertia)
-    inputs[:2, 2:] = np.diag(per if design_spec.disturbances == "forces" else (1.0, 1.0))
+    inputs[:2, 2:] = np.diag(per if spec.disturbances == "forces" else (1.0, 1.0))
     G, H = LinearModel(A, inputs, np.eye(4), DYNAMIC, (), ()).discretise(TICK)
     return np.hstack([G[:2], H[:2, :2]]), H[:2, 2:]
 
 
-SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
-"""Speeds of the designs (m/s); gains are interpolated between and held beyond."""
+SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())  # m/s, of the designs
 
 
 @jit
@@ -270,8 +241,7 @@ def find_cell(axis: Vector, value: Scalar) -> tuple[int, Scalar]:
     i = 0
     while i < len(axis) - 2 and value >= axis[i + 1]:
         i += 1
-    share = (value - axis[i]) / (axis[i + 1] - axis[i])
-    return i, min(max(share, 0.0), 1.0)
+    return i, min(max((value - axis[i]) / (axis[i + 1] - axis[i]), 0.0), 1.0)
 
 
 @jit
@@ -308,17 +278,14 @@ class GainTables(NamedTuple):
 
 @lru_cache(maxsize=128)  # a table has at most 0.3 MB; a matrix comes back to a car often
 def make_gain_table(
-    vehicle: Vehicle,
-    design_spec: DesignSpec,
-    speeds: Sequence[float],
-    fronts: Sequence[float],
+    vehicle: Vehicle, spec: DesignSpec, speeds: Sequence[float], fronts: Sequence[float],
     rears: Sequence[float],
-) -> GainTables:
+) -> GainTables:  # fmt: skip
     """Make the regulators of a car over speeds and stiffnesses.
 
     Args:
         vehicle: Vehicle of the design.
-        design_spec: Parameters of the design.
+        spec: Parameters of the design.
         speeds: Speeds (m/s).
         fronts: Front stiffnesses (N/rad); empty: the vehicle's.
         rears: Rear stiffnesses (N/rad); empty: the vehicle's.
@@ -331,7 +298,7 @@ def make_gain_table(
     stiffnesses = fronts or (vehicle.front_stiffness,), rears or (vehicle.rear_stiffness,)
     for speed, front, rear in itertools.product(speeds, *stiffnesses):
         car = vehicle.replace(front_stiffness=front, rear_stiffness=rear)
-        model = make_design_model(car, speed, design_spec)
+        model = make_design_model(car, speed, spec)
         K, V = model.solve()
         # in one period another input costs (u + K x)'S(u + K x) more
         gains.append(np.hstack([K, model.R + model.H.T @ V @ model.H]))

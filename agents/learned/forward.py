@@ -1,8 +1,7 @@
 """A policy's network at one observation after another, compiled: frames, cells, dense layers.
 
-Cells are torch's GRU and LSTM, or moving averages of several time scales. Arrays lie one behind
-the other in one vector, weights transposed, so that a layer's sums grow input by input. Sums are
-in double precision and in one order, whatever the batch.
+Arrays lie one behind the other in one vector, weights transposed, so that a layer's sums grow input
+by input. Sums are in double precision and in one order, whatever the batch.
 """
 
 from collections.abc import Sequence
@@ -17,20 +16,18 @@ from ...envs.numerics.jit import jit, jit_nrt
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ...envs.record import Array
 
+# Gates in torch's order: reset, update, candidate; or input, forget, candidate, output.
 GATES = {"gru": 3, "lstm": 4}
-"""Gates of a kind of cell, in torch's order: reset, update, candidate; or input, forget,
-candidate, output."""
 _MAX_TIME = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
+# The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh.
 CELL_WEIGHTS = ("weight_in", "weight_state", "bias_in", "bias_state")
-"""The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecurrentCell:
     """One layer of cells, whose state is all zero where an episode begins.
 
-    Arrays are rounded to single precision, their gates one below the other. ValueError says that
-    the kind is another, or that shapes do not fit together.
+    Arrays are rounded to single precision, their gates one below the other.
     """
 
     parts: ClassVar[tuple[str, ...]] = CELL_WEIGHTS
@@ -76,8 +73,7 @@ class MovingAverages:
 
     A mean is that of the episode so far, and from its time on a leaky one: a new u counts for
     max(1 / steps so far, 1 - exp(-1 / time)). No gate decides what is kept, so that minutes of a
-    small signal add up; what is to be averaged, products too, the SiLU units make. ValueError says
-    that shapes do not fit together, or that a number is out of range.
+    small signal add up; what is to be averaged, products too, the SiLU units make.
     """
 
     kind: ClassVar[str] = "traces"
@@ -96,10 +92,8 @@ class MovingAverages:
         if self.n_silu not in range(len(self.bias_in) + 1):
             raise ValueError(f"of {len(self.bias_in)} units {self.n_silu} cannot be bent")
         if not self.times or not all(0.0 < time <= _MAX_TIME for time in self.times):
-            raise ValueError(
-                f"traces last one time or more, each above 0 steps and {_MAX_TIME:g} at most, got "
-                f"{self.times}"
-            )
+            rule = f"each above 0 steps and {_MAX_TIME:g} at most, got {self.times}"
+            raise ValueError(f"traces last one time or more, {rule}")
 
     @property
     def size(self) -> int:
@@ -130,10 +124,7 @@ def _round_arrays(layer: RecurrentCell | MovingAverages) -> None:
         object.__setattr__(layer, name, single.astype(np.float64))
 
 
-MemoryLayer = RecurrentCell | MovingAverages
-"""What a network has between its observation and its dense layers."""
-
-
+MemoryLayer = RecurrentCell | MovingAverages  # between an observation and the dense layers
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")
 OUTPUTS = ("tanh", "linear")
 _TANH, _RELU, _ELU, _LEAKY, _SILU = range(len(ACTIVATIONS))
@@ -279,14 +270,13 @@ def forward(net: PackedNetwork, x: Matrix, state: Matrix, out: Matrix) -> None:
         offset, position = 0, frames
         for c in range(len(net.cells)):
             gates, size = net.cells[c, 0], net.cells[c, 1]
+            n_state = size * (gates - 2) if gates else 1 + size * net.cells[c, 3]
+            memory = m[position : position + n_state]
             if gates == 0:
-                n_state = 1 + size * net.cells[c, 3]
-                memory = m[position : position + n_state]
                 z, offset = _step_averages(z, memory, net.cells[c], net.numbers, offset)
             else:
-                n_state = size * (gates - 2)
-                offset = _step_cell(z, m[position : position + n_state], gates, net.numbers, offset)
-                z = m[position : position + size].copy()
+                offset = _step_cell(z, memory, gates, net.numbers, offset)
+                z = memory[:size].copy()
             position += n_state
         for layer in range(last):
             y = np.empty(net.sizes[layer + 1])

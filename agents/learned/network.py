@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import Array
-from .forward import ACTIVATIONS as ACTIVATIONS
-from .forward import OUTPUTS, MemoryLayer, MovingAverages, PackedNetwork, forward
+from .forward import ACTIVATIONS, OUTPUTS, MemoryLayer, MovingAverages, PackedNetwork, forward
 
+SUFFIX = ".safetensors"
 Tensors = dict[str, npt.NDArray[Any]]
 
 
@@ -19,10 +19,7 @@ Tensors = dict[str, npt.NDArray[Any]]
 class Network:
     """action = output(W_n ... activation(W_0 z + b_0) ... + b_n), z = clip((x - mean) scale).
 
-    Weights and biases are rounded to single precision, in which networks are trained. Sums are in
-    double precision, so that a row's result depends on the batch around it by rounding of the
-    sixteenth digit only. ValueError says that shapes do not fit, that a number is not finite, or
-    that a name is unknown.
+    Weights and biases are rounded to single precision, in which networks are trained.
     """
 
     mean: Array  # of a frame before it is stacked, shape (inputs,), or of the stack
@@ -54,19 +51,15 @@ class Network:
     def _check_layers(self) -> None:
         """Check the shapes of all arrays, then that they are finite."""
         if not self.weights or len(self.weights) != len(self.biases):
-            raise ValueError(
-                f"a network has a bias a layer, got {len(self.weights)} weights "
-                f"and {len(self.biases)} biases"
-            )
+            counts = f"{len(self.weights)} weights and {len(self.biases)} biases"
+            raise ValueError(f"a network has a bias a layer, got {counts}")
         width = self._first.shape[-1]
         if width % self.history:
             raise ValueError(f"{width} inputs are not {self.history} frames of one width")
         shape = self.mean.shape
         if shape not in ((self.inputs,), (width,)) or self.scale.shape != shape:
-            raise ValueError(
-                f"mean and scale are (inputs,) or (history inputs,) with {self.inputs} inputs, "
-                f"got {shape} and {self.scale.shape}"
-            )
+            rule = f"(inputs,) or (history inputs,) with {self.inputs} inputs"
+            raise ValueError(f"mean and scale are {rule}, got {shape} and {self.scale.shape}")
         arrays = {"mean": self.mean, "scale": self.scale}
         for i, cell in enumerate(self.cells):
             if cell.weight_in.shape[1] != width:
@@ -75,9 +68,8 @@ class Network:
             arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in cell.parts}
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             if W.shape != (*b.shape, width) or b.ndim != 1:
-                raise ValueError(
-                    f"layer {i} takes {width} inputs, got weights {W.shape} and biases {b.shape}"
-                )
+                shapes = f"weights {W.shape} and biases {b.shape}"
+                raise ValueError(f"layer {i} takes {width} inputs, got {shapes}")
             width = len(b)
             arrays |= {f"the weights of layer {i}": W, f"the biases of layer {i}": b}
         for name, values in arrays.items():
@@ -132,9 +124,8 @@ class Network:
             cells[0] = replace(cells[0], weight_in=cells[0].weight_in[:, columns])
         else:
             weights[0] = weights[0][:, columns]
-        return replace(
-            self, mean=self.mean[selected], scale=self.scale[selected], weights=weights, cells=cells
-        )
+        mean, scale = self.mean[selected], self.scale[selected]
+        return replace(self, mean=mean, scale=scale, weights=weights, cells=cells)
 
     @cached_property
     def packed(self) -> PackedNetwork:
@@ -142,18 +133,12 @@ class Network:
         layers = zip(self.weights, self.biases, strict=True)
         numbers = [cell.numbers for cell in self.cells]
         numbers += [part.T.ravel() for layer in layers for part in layer]
-        return PackedNetwork(
-            self.mean,
-            self.scale,
-            np.inf if self.clip is None else float(self.clip),
-            self.inputs,
-            self.history,
-            np.array([cell.form for cell in self.cells], np.int64).reshape(-1, 4),
-            np.array([self.weights[0].shape[1], *map(len, self.biases)], np.int64),
-            ACTIVATIONS.index(self.activation),
-            OUTPUTS.index(self.output),
-            np.concatenate(numbers),
-        )
+        clip = np.inf if self.clip is None else float(self.clip)
+        cells = np.array([cell.form for cell in self.cells], np.int64).reshape(-1, 4)
+        sizes = np.array([self.weights[0].shape[1], *map(len, self.biases)], np.int64)
+        form = self.inputs, self.history, cells, sizes
+        kinds = ACTIVATIONS.index(self.activation), OUTPUTS.index(self.output)
+        return PackedNetwork(self.mean, self.scale, clip, *form, *kinds, np.concatenate(numbers))
 
     @property
     def description(self) -> dict[str, object]:
@@ -207,8 +192,7 @@ class Network:
 
         Args:
             x: Observations, shape (N, inputs).
-            state: Memory, shape (N, memory), updated in place; zero, or None, where an episode
-                begins.
+            state: Memory, shape (N, memory), updated; zero, or None, where an episode begins.
 
         Returns:
             Actions, shape (N, width).
@@ -217,6 +201,3 @@ class Network:
         out = np.empty((len(x), self.width))
         forward(self.packed, x, state, out)
         return out
-
-
-SUFFIX = ".safetensors"

@@ -29,8 +29,7 @@ from .network import SUFFIX as SUFFIX
 from .network import Network, Tensors
 
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
-MAX_BYTES = 2**26
-"""A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
+MAX_BYTES = 2**26  # a larger file is not opened, which bounds the tensors' sizes too
 ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
 FOLDER = Path(__file__).resolve().with_name("policies")
 
@@ -39,11 +38,7 @@ JsonMap = dict[str, Any]
 
 @dataclass(frozen=True)
 class Card:
-    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
-
-    Raises:
-        ValueError: A value has another type, or one that JSON does not have.
-    """
+    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only."""
 
     env_id: str  # id of the env
     observation: tuple[tuple[str, str], ...]  # (name, unit) of each entry that the network takes
@@ -60,16 +55,15 @@ class Card:
     cpu_seconds: float = 0.0  # of the training
     sideslip: str = __version__  # version of the package
     world_version: int = 0  # of the world it was trained in, 0 where nothing errs
+    # The salt of the test seeds, their number ("episodes"), and "cost": mean and 95 % interval of
+    # the policy and of each controller beside it. Of a class of tasks also its costs by scenario.
     evaluation: JsonMap = field(default_factory=dict)
-    """The salt of the test seeds, their number ("episodes"), and "cost": mean and 95 % interval of
-    the policy and of each controller beside it. Of a class of tasks also its costs by scenario."""
 
     def __post_init__(self) -> None:
         pairs: Any = self.observation
         rows: Any = pairs if isinstance(pairs, list | tuple) else [None]
-        if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows) or not all(
-            isinstance(word, str) for row in rows for word in row
-        ):
+        is_table = all(isinstance(row, list | tuple) and len(row) == 2 for row in rows)
+        if not (is_table and all(isinstance(word, str) for row in rows for word in row)):
             raise ValueError(f"observation is a list of (name, unit), got {pairs!r}")
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
@@ -85,13 +79,9 @@ class Card:
 
     @classmethod
     def from_env_id(
-        cls,
-        env_id: str,
-        env_options: Mapping[str, Any] | None = None,
-        estimator: str = "",
-        estimator_options: Mapping[str, Any] | None = None,
-        **rest: Any,
-    ) -> "Card":
+        cls, env_id: str, env_options: Mapping[str, Any] | None = None, estimator: str = "",
+        estimator_options: Mapping[str, Any] | None = None, **rest: Any,
+    ) -> "Card":  # fmt: skip
         """Make a card with the observation of an env and its estimator.
 
         Args:
@@ -138,28 +128,21 @@ class Card:
 
 
 def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
-    """Check that a foreign file names no code to import.
+    """Check that a foreign file names no code to import; ValueError where it does.
 
     Args:
         env_id: Id of a registered env.
         estimator: Name of an estimator, or "".
         estimator_options: Arguments of `EstimateObservation`, without an estimator.
-
-    Raises:
-        ValueError: The id or the estimator is an entry point or a file.
     """
     if "estimator" in estimator_options:
         raise ValueError("estimator_options holds an estimator, which is none of its options")
     if ":" in env_id:
-        raise ValueError(
-            f"env_id is that of a registered env, got {env_id!r}, which names a module: import it "
-            "first and give the id alone"
-        )
+        text = f"env_id is that of a registered env, got {env_id!r}, which names a module"
+        raise ValueError(f"{text}: import it first and give the id alone")
     if ":" in estimator or is_user_file(estimator):
-        raise ValueError(
-            f"estimator is a name, got the entry point {estimator!r}: "
-            "sideslip.register_estimator gives it one"
-        )
+        text = f"estimator is a name, got the entry point {estimator!r}"
+        raise ValueError(f"{text}: sideslip.register_estimator gives it one")
 
 
 @dataclass(frozen=True)
@@ -196,6 +179,10 @@ def is_policy(name: str) -> bool:
     return name.endswith(SUFFIX) or name in list_shipped()
 
 
+def _make_path(name: str | Path) -> Path:
+    return FOLDER / f"{name}{SUFFIX}" if str(name) in list_shipped() else Path(name)
+
+
 def hash_policy(name: str) -> str:
     """Compute the hash of a policy's file, "" for a name that is no policy's.
 
@@ -205,7 +192,7 @@ def hash_policy(name: str) -> str:
     Returns:
         SHA-256 in hexadecimal digits.
     """
-    path = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(name)
+    path = _make_path(name)
     exists = is_policy(name) and path.is_file()
     return hashlib.sha256(path.read_bytes()).hexdigest() if exists else ""
 
@@ -217,9 +204,6 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         path: Path that ends in `.safetensors`.
         network: Network to write.
         card: Card of its training.
-
-    Raises:
-        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -231,9 +215,8 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
 
 def _check_width(card: Card, network: Network) -> None:
     if (count := len(card.observation)) != network.inputs:
-        raise ValueError(
-            f"the card's observation has {count} entries, the network takes {network.inputs}"
-        )
+        taken = f"the network takes {network.inputs}"
+        raise ValueError(f"the card's observation has {count} entries, {taken}")
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -263,12 +246,11 @@ def load_policy(path: str | Path) -> Policy:
 
 def _find_file(path: str | Path) -> Path:
     """Find the file of a path or of a shipped policy's name."""
-    name = str(path)
-    file = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(path)
+    file = _make_path(path)
     if file.is_dir():
-        raise FileNotFoundError(f"policy {name} is a folder")
+        raise FileNotFoundError(f"policy {path} is a folder")
     if not file.is_file():
-        unknown = describe_unknown("policy", [name], list_shipped())
+        unknown = describe_unknown("policy", [str(path)], list_shipped())
         raise FileNotFoundError(f"there is no such file and {unknown}")
     return file
 
@@ -291,10 +273,8 @@ def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
     known = [str(version) for version in range(1, FORMAT + 1)]
     if metadata["format"] not in known:
-        raise ValueError(
-            f"the card has format {metadata['format'][:20]}, this sideslip reads "
-            f"{' and '.join(known)}: another sideslip made it"
-        )
+        text = f"the card has format {metadata['format'][:20]}, this sideslip reads"
+        raise ValueError(f"{text} {' and '.join(known)}: another sideslip made it")
     try:
         fields = json.loads(metadata["card"])
     except (ValueError, RecursionError) as error:
@@ -311,11 +291,8 @@ _NETWORK = {"hidden", "activation", "output", "clip", "action_width", "history",
 
 def _build_network(fields: Any, tensors: Tensors) -> Network:
     """Build the network that a card describes; ValueError where card and tensors do not fit."""
-    if (
-        not isinstance(fields, dict)
-        or set(fields) != _NETWORK
-        or type(fields["history"]) is not int
-    ):
+    is_table = isinstance(fields, dict) and set(fields) == _NETWORK
+    if not is_table or type(fields["history"]) is not int:
         raise ValueError(f"the card's network holds {', '.join(sorted(_NETWORK))}, got {fields!r}")
     for name, tensor in tensors.items():
         kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
@@ -324,19 +301,14 @@ def _build_network(fields: Any, tensors: Tensors) -> Network:
             raise ValueError(f"tensor {name} holds {text}, not one or more of {kind}")
     unused = dict(tensors)
     try:
-        cells = [
-            _build_cell(f"cell_{i}_", *cell, unused=unused)
-            for i, cell in enumerate(fields["cells"])
-        ]
+        numbered = enumerate(fields["cells"])
+        cells = [_build_cell(f"cell_{i}_", *cell, unused=unused) for i, cell in numbered]
         layers = range(len(fields["hidden"]) + 1)
-        network = Network(
-            unused.pop("mean"),
-            unused.pop("scale"),
-            [unused.pop(f"weight_{i}") for i in layers],
-            [unused.pop(f"bias_{i}") for i in layers],
-            **{name: fields[name] for name in ("activation", "output", "clip", "history")},
-            cells=cells,
-        )
+        weights = [unused.pop(f"weight_{i}") for i in layers]
+        biases = [unused.pop(f"bias_{i}") for i in layers]
+        form = {name: fields[name] for name in ("activation", "output", "clip", "history")}
+        arrays = unused.pop("mean"), unused.pop("scale"), weights, biases
+        network = Network(*arrays, **form, cells=cells)
     except KeyError as error:
         raise ValueError(f"the tensor {error} is missing") from None
     except (TypeError, IndexError):
@@ -357,20 +329,15 @@ def _build_cell(prefix: str, kind: str, _: int, *traces: Any, unused: Tensors) -
 
 
 class PolicyController(Controller):
-    """The deterministic action of a policy's network, clipped to [-1, 1].
+    """The deterministic action of a policy's network, clipped; ValueError for an unfit env.
 
-    The network's memory of an episode (frames, cells) is in the state of `predict`. It reads the
-    entries of its training by name, so a wider observation serves as well. Entries that never
-    varied in training are not read. Where the env steers and the policy does not, the added
-    steering is zero. Single and batch agree to rounding in double precision, before the action
-    becomes single precision (`Network`).
+    It reads the entries of its training by name, so a wider observation serves as well. Entries
+    that never varied in training are not read. Where the env steers and the policy does not, the
+    added steering is zero. Single and batch agree to rounding in double precision.
 
     Args:
         env: Env of the controller.
         policy: Shipped name, file's path, or `Policy`.
-
-    Raises:
-        ValueError: The env's entries, units, control period, world or action are not the policy's.
     """
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy) -> None:
@@ -379,36 +346,26 @@ class PolicyController(Controller):
         reads = self.policy.network.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
         units = {entry.name: entry.unit for entry in facts.layout}
-        wrong = [
-            f"{label} in {unit} (here {units[label]})"
-            for label, unit in entries
-            if units.get(label, unit) != unit
-        ]
-        if wrong:
-            raise ValueError(f"policy {name} was trained on {', '.join(wrong)}")
+        odd = [(label, unit) for label, unit in entries if units.get(label, unit) != unit]
+        trained = f"policy {name} was trained"
+        if odd:
+            wrong = [f"{label} in {unit} (here {units[label]})" for label, unit in odd]
+            raise ValueError(f"{trained} on {', '.join(wrong)}")
         if facts.control_period != card.control_period:
-            raise ValueError(
-                f"policy {name} was trained with a control period of {card.control_period} ticks, "
-                f"this env has {facts.control_period}"
-            )
+            text = f"{trained} with a control period of {card.control_period} ticks"
+            raise ValueError(f"{text}, this env has {facts.control_period}")
         if facts.moment_rate > 0.0 and card.world_version != WORLD_VERSION:
-            raise ValueError(
-                f"policy {name} was trained in world {card.world_version}, this env is of world "
-                f"{WORLD_VERSION}, whose sensors err: train it there"
-            )
+            text = f"this env is of world {WORLD_VERSION}, whose sensors err: train it there"
+            raise ValueError(f"{trained} in world {card.world_version}, {text}")
         if facts.width < self.policy.network.width:
-            raise ValueError(
-                f"policy {name} gives {self.policy.network.width} numbers, "
-                f"the env's action has {facts.width}"
-            )
+            text = f"policy {name} gives {self.policy.network.width} numbers"
+            raise ValueError(f"{text}, the env's action has {facts.width}")
         self.needs = tuple(label for label, _ in entries)
         try:
             super().__init__(env)
         except ValueError as error:
-            trained_on, available = (", ".join(names) for names in (dict(card.observation), units))
-            raise ValueError(
-                f"{error}. {name} was trained on {trained_on}; here are {available}"
-            ) from None
+            text, here = (", ".join(names) for names in (dict(card.observation), units))
+            raise ValueError(f"{error}. {name} was trained on {text}; here are {here}") from None
         self.network = self.policy.network.select_inputs(reads)
         self.memory = self.network.memory
 

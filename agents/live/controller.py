@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -47,8 +47,7 @@ _SETUP: dict[str, Any] = {
     **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
     "seed": int,
     "patience": (int, type(None)),
-}
-"""Types of a session's setup, by key."""
+}  # types of a session's setup, by key
 
 _reference, _filter_reference = as_python(compute_reference), as_python(filter_reference)
 
@@ -57,17 +56,9 @@ class OnboardController:
     """An estimator and an agent on the wires' data, equal to those in the env bit for bit.
 
     Args:
-        env: `EstimateObservation` with the sensors' clocks, the nominal car, the references and the
-            control period; it is not driven.
+        env: `EstimateObservation` with sensors' clocks, nominal car, references; it is not driven.
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
-
-    Attributes:
-        x: Estimated states, shape (n,); written anew by every tick.
-        std: Their standard deviations, shape (n,); likewise.
-
-    Raises:
-        TypeError: The env is not an `EstimateObservation`.
     """
 
     def __init__(
@@ -75,9 +66,8 @@ class OnboardController:
     ) -> None:
         if not isinstance(env, EstimateObservation):
             raise TypeError(f"it reads an EstimateObservation, got {type(env).__name__}")
-        base: Any = env.unwrapped
+        self.base = cast("Any", env.unwrapped)
         env.reset(seed=seed)
-        self.base = base
         self.facts, self.agent, self.outputs = get_env_facts(env), agent, env.outputs
         self.estimator: Any = env.estimator
         self.sensors, self.names = self.base.slow_sensors, env.estimator.names
@@ -88,9 +78,10 @@ class OnboardController:
         self._bounds = self.base.config.bounds
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
         self._estimates: tuple[Array, ...] = tuple(np.zeros((2, 1, len(self.names))))
+        # estimated states and their standard deviations, shape (n,), written anew by every tick
         self.x, self.std = (values[0] for values in self._estimates)
         self._begin(0)
-        row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
+        row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
             self.take(Tick(number, row, 0.0, packet, number == 0))
         self._begin(0)
@@ -127,17 +118,16 @@ class OnboardController:
             self._begin(tick.number)
         n, row = self.facts.control_period, tick.row
         if self._is_native:
-            packets = tick.packets
-            self.estimator.take(row.reshape(1, -1), 1, packets, len(packets), *self._estimates)
+            packets = tick.packets, len(tick.packets)
+            self.estimator.take(row.reshape(1, -1), 1, *packets, *self._estimates)
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
             self.x[:], self.std[:] = self.estimator.x, compute_std(self.estimator.P)
         self._rows[self._count] = row
         self._count += 1
-        if len(tick.packets):
-            self._packets.append(tick.packets)
-            for packet in tick.packets:
-                update_newest(self._z, packet, float(tick.number))
+        self._packets.append(tick.packets)
+        for packet in tick.packets:
+            update_newest(self._z, packet, float(tick.number))
         v = 0.5 * float(row[FAST.wheel_left] + row[FAST.wheel_right])
         before, params = self._refs, (self._target, self._kind)
         steady = _reference(tick.steer_next, v, *params)
@@ -159,13 +149,12 @@ class OnboardController:
 
     def _make_observation(self, number: int) -> npt.NDArray[np.float32]:
         """Make the observation (k,) that the env's agents would get at a tick."""
-        n_rows, outputs = self._count, self.outputs
-        packets = np.concatenate(self._packets)
+        n_rows, outputs, packets = self._count, self.outputs, np.concatenate(self._packets)
         self._rows[n_rows:] = self._rows[n_rows - 1]
-        shown = len(self._rows) if self._switches[FLAGS.all_samples] else n_rows
-        obs = np.empty(self._bounds.shape[1], np.float32)
         self._z[Z.clock.tick] = number
         switches, report = self._switches, np.zeros(len(REPORT))
+        shown = len(self._rows) if switches[FLAGS.all_samples] else n_rows
+        obs = np.empty(self._bounds.shape[1], np.float32)
         numbers = self._p, self._z, switches, obs, self._rows, packets, report, self._bounds
         observe(EpisodeArrays(*numbers, np.empty((0, 0))), shown, len(packets), self._refs)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
@@ -230,13 +219,6 @@ def _update_digest(onboard: OnboardController, digest: int) -> int:
     return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
 
 
-class _SessionBlock(NamedTuple):
-    """Batches of datagrams, and the checksum of all estimates after them."""
-
-    batches: list[list[Arrival]]
-    digest: int
-
-
 def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     """Parse the datagrams of each batch; None for data that no recorder wrote."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
@@ -271,8 +253,8 @@ class Session:
                 setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
                 if isinstance(setup, dict):
                     return setup
-        what = "no session of `sideslip live --record`, or only its beginning"
-        raise ValueError(f"{self.path} is {what}")
+        text = "no session of `sideslip live --record`, or only its beginning"
+        raise ValueError(f"{self.path} is {text}")
 
     @property
     def setup(self) -> dict[str, Any]:
@@ -281,13 +263,13 @@ class Session:
             setup = self._read_header(file)
         wrong = [name for name, x in _SETUP.items() if not isinstance(setup.get(name, ...), x)]
         if wrong:
-            text = f"its setup lacks {', '.join(wrong)}, or has it of another type"
-            raise ValueError(f"{self.path}: {text}")
+            text = f"{self.path}: its setup lacks {', '.join(wrong)}"
+            raise ValueError(f"{text}, or has it of another type")
         return setup
 
     @property
-    def blocks(self) -> Iterator[_SessionBlock]:
-        """The blocks up to the session's end, or to where it was cut or damaged."""
+    def blocks(self) -> Iterator[tuple[list[list[Arrival]], int]]:
+        """Batches of datagrams and the checksum of all estimates after them, as far as sound."""
         with open(self.path, "rb") as file:
             self._read_header(file)
             while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
@@ -296,10 +278,9 @@ class Session:
                 data = file.read(size) if is_sound else b""
                 if not is_sound or len(data) != size or zlib.crc32(data) != check:
                     return
-                batches = _parse_batches(data, count)
-                if batches is None:
+                if (batches := _parse_batches(data, count)) is None:
                     return
-                yield _SessionBlock(batches, digest)
+                yield batches, digest
 
     def replay(self, onboard: OnboardController, patience: int | None) -> _SessionReplay:
         """Replay the session.
@@ -314,12 +295,12 @@ class Session:
         synchroniser, digest, same = StreamSynchroniser(patience), 0, True
         ticks: list[int] = []
         estimates: list[Array] = []
-        for block in self.blocks:
-            for tick in chain.from_iterable(map(synchroniser.take, block.batches)):
+        for batches, block_digest in self.blocks:
+            for tick in chain.from_iterable(map(synchroniser.take, batches)):
                 onboard.take(tick)
                 digest = _update_digest(onboard, digest)
                 ticks.append(tick.number)
                 estimates.append(np.stack([onboard.x, onboard.std]))
-            same = same and digest == block.digest
+            same = same and digest == block_digest
         x, std = np.array(estimates).reshape(-1, 2, len(onboard.names)).swapaxes(0, 1)
         return _SessionReplay(np.array(ticks, np.int64), x, std, same)

@@ -31,8 +31,7 @@ _BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
 MAX_BATCH = 512  # datagrams of a batch: a flood of them does not stop the loop
 _SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
-clock = time.monotonic_ns
-"""Time of the monotonic clock, which is never set (ns)."""
+clock = time.monotonic_ns  # time of the monotonic clock, which is never set (ns)
 
 
 def wait_until(deadline: int) -> None:
@@ -48,14 +47,11 @@ def wait_until(deadline: int) -> None:
 
 
 class Port(AbstractContextManager["Port"]):
-    """A UDP port that listens on one of this machine's addresses, and numbers its datagrams.
+    """A UDP port that numbers its datagrams; OSError for one in use or an unknown host.
 
     Args:
         host: Host to bind.
         port: Number to bind, 0 for any.
-
-    Raises:
-        OSError: The port is in use or above 65535, or the host is unknown.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
@@ -66,21 +62,17 @@ class Port(AbstractContextManager["Port"]):
             self._socket.bind((host, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            in_use = getattr(error, "errno", None) == errno.EADDRINUSE
-            text = getattr(error, "strerror", None) or error
-            reason = "is in use" if in_use else f"is none: {text}"
-            raise OSError(f"UDP port {port} of {host} {reason}") from None
+            text = f"is none: {getattr(error, 'strerror', None) or error}"
+            if getattr(error, "errno", None) == errno.EADDRINUSE:
+                text = "is in use"
+            raise OSError(f"UDP port {port} of {host} {text}") from None
         self.address: Address = self._socket.getsockname()
         self._sent: dict[int, int] = {}
 
     def send(
-        self,
-        to: Address,
-        kind: DatagramKind,
-        stamp: int,
-        values: Sequence[float] = (),
+        self, to: Address, kind: DatagramKind, stamp: int, values: Sequence[float] = (),
         names: tuple[str, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Send a message.
 
         Args:
@@ -169,9 +161,8 @@ class _Histogram:
 
     def summarise(self) -> dict[str, float]:
         """Compute median, 99.9 % quantile and maximum (us)."""
-        if not self.number:
-            return {}
-        return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
+        times = {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
+        return times if self.number else {}
 
 
 @dataclass
@@ -222,20 +213,17 @@ class Loop:
         gc.disable()  # a collection takes hundreds of ms
         try:
             while not self._check_end(stop, start_time + duration):
-                if not deadline or self.step:
-                    batch = self.port.wait(_IDLE)
-                    if self._take(batch) and not self.step:
-                        deadline = clock() + PERIOD
-                else:
+                if deadline:
                     deadline = self._run_tick(deadline)
+                elif self._take(self.port.wait(_IDLE)) and not self.step:
+                    deadline = clock() + PERIOD
                 if not self.assembler.silent:
                     last_heard = time.monotonic()
                 elif time.monotonic() - last_heard > self.patience:
                     (host, port), limit = self.port.address, f"{self.patience:g} s"
                     if not self.statistics.ticks:
-                        raise TimeoutError(
-                            f"no inertial datagram came to {host}:{port} within {limit}"
-                        )
+                        text = f"no inertial datagram came to {host}:{port}"
+                        raise TimeoutError(f"{text} within {limit}")
                     self.ended = f"no inertial data for {limit}"
                     break
         finally:
@@ -244,11 +232,8 @@ class Loop:
             self.statistics.seconds = time.monotonic() - start_time
 
     def _check_end(self, stop: Callable[[], bool], end: float) -> bool:
-        reasons = {
-            "the drive is over": self.assembler.over,
-            "stopped": stop(),
-            "the time is over": time.monotonic() > end,
-        }
+        reasons = {"the drive is over": self.assembler.over, "stopped": stop()}
+        reasons["the time is over"] = time.monotonic() > end
         self.ended = next((reason for reason, holds in reasons.items() if holds), "")
         return bool(self.ended)
 
@@ -263,8 +248,7 @@ class Loop:
         statistics.work.add((end_time - wake_time) * 1e-3)
         if rows and batch:
             statistics.latency.add((end_time - batch[0].at) * 1e-3)
-        if rows == 1 and batch:
-            # the deadlines shall come LEAD behind the rows
+        if rows == 1 and batch:  # the deadlines shall come LEAD behind the rows
             phase_step = PHASE_GAIN * (batch[-1].at + LEAD - deadline)
             deadline += round(min(max(phase_step, -MAX_PHASE_STEP), MAX_PHASE_STEP))
         deadline += PERIOD
@@ -312,7 +296,7 @@ class Loop:
         statistics, counts = self.statistics, self.assembler.counts
         bad = sum(counts[reason] for reason in RejectReason)
         numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
-        times = statistics.jitter.newest, statistics.latency.newest, statistics.work.newest
+        times = (x.newest for x in (statistics.jitter, statistics.latency, statistics.work))
         health = statistics.deadlines, self.onboard.is_healthy
         return LoopStatus._make(map(float, (*numbers, *times, *health)))
 
@@ -339,12 +323,9 @@ class Loop:
         by = f"; packets that the estimator refused: {refused}" if refused else ""
         lines = [f"{ended}.", f"Ignored or bridged: {ignored or 'nothing'}{by}."]
         if m.deadlines:
-            jitter, latency = (
-                f"median {t['median']:.0f}, 99.9 % {t['p999']:.0f}, most {t['max']:.0f} us"
-                if (t := times.summarise())
-                else "unknown"
-                for times in (m.jitter, m.latency)
-            )
+            form = "median {median:.0f}, 99.9 % {p999:.0f}, most {max:.0f} us"
+            times = m.jitter.summarise(), m.latency.summarise()
+            jitter, latency = (form.format(**x) if x else "unknown" for x in times)
             missed = f"{m.misses} of {m.deadlines} deadlines missed"
             lines[0] = f"{ended}; {missed}, {m.per_million:.0f} per million."
             lines[1:1] = [f"Jitter {jitter}; packet to estimate {latency}."]

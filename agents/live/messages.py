@@ -1,13 +1,9 @@
 """The datagrams on a car's wires: a decoder that raises nothing, and the ticks that they make.
 
-docs/live.md has their format: a HEADER in network byte order, `count` doubles of FIELDS in SI units
-(of ESTIMATE the states, then their standard deviations) and, behind estimates, the states' names. A
-change of any of it is another VERSION, but for STATUS, which no other program gets.
-
-A fast row, an INERTIAL datagram, ends its tick; packets of slow sensors belong to the next row.
-They were captured their age before their stamp or, where that is 0, their age before that row.
-Lost and late datagrams are counted and bridged by the last row, held. Equal batches give equal
-ticks, so that a session can be replayed.
+docs/howto/live.md has their format, of which a change is another VERSION, but for STATUS, which no
+other program gets. A fast row, an INERTIAL datagram, ends its tick; packets of slow sensors belong
+to the next row, captured their age before their stamp or, where that is 0, before that row. Equal
+batches give equal ticks.
 """
 
 import math
@@ -80,6 +76,7 @@ class LoopStatus(NamedTuple):
 
 
 SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
+KINDS = {place: kind for kind, place in SENSORS.items()}
 FIELDS: dict[int, tuple[str, ...]] = {
     DatagramKind.INERTIAL: (*FAST._fields, "steer_next"),  # rad, the driver's command from now on
     **{  # age: s from capture to sending
@@ -104,9 +101,8 @@ class Message(NamedTuple):
     def encode(self) -> bytes:
         """Encode the message as a datagram."""
         kind, sequence, stamp, values, names = self
-        count = len(values)
-        head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)
-        return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
+        head = HEADER.pack(MAGIC, VERSION, kind, len(values), sequence & 0xFFFFFFFF, stamp)
+        return head + struct.pack(f"!{len(values)}d", *values) + ",".join(names).encode()
 
 
 def decode(data: bytes) -> Message | RejectReason:
@@ -148,15 +144,9 @@ def decode(data: bytes) -> Message | RejectReason:
 
 _INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-_STREAM_COUNTS = (
-    "lost",  # sequence numbers that never came
-    "restarted",  # senders that began anew
-    "held",  # ticks without a row
-    "late",  # rows behind their tick
-    "begun anew",  # gaps too long to be bridged
-    "dropped",  # packets that no row took
-)
-"""Counts beside those of `RejectReason`."""
+# Counts beside those of `RejectReason`: sequence numbers that never came, senders that began anew,
+# ticks without a row, rows behind their tick, gaps too long to bridge, packets that no row took.
+_STREAM_COUNTS = ("lost", "restarted", "held", "late", "begun anew", "dropped")
 
 
 class Arrival(NamedTuple):
@@ -282,8 +272,7 @@ class StreamSynchroniser:
                 captured = sent - round(age / TICK)
                 head = sensor, captured, tick.number, quality, message.sequence
                 packet[: PACKET.value + len(values)] = *head, *values
-            order = np.lexsort((packets[:, PACKET.sensor], packets[:, PACKET.captured]))
-            packets = packets[order]
+            packets = packets[np.lexsort(packets[:, [PACKET.sensor, PACKET.captured]].T)]
             self._waiting.clear()
         self._last = tick._replace(packets=packets)
         return self._last

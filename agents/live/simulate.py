@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import Z
-from ...envs.record import FAST, PACKET, Array
+from ...envs.record import FAST, PACKET
 from ...envs.recordings.dialect import to_metres
 from ...envs.recordings.sources import make_source
 from ...envs.sensors.slow import WIDTHS
@@ -23,16 +23,7 @@ from ...envs.ticks import TICK
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout
 from .loop import Port, clock, wait_until
-from .messages import (
-    MAX_AGE,
-    SENSORS,
-    TICK_US,
-    Address,
-    Arrival,
-    DatagramKind,
-    RejectReason,
-    decode,
-)
+from .messages import KINDS, MAX_AGE, TICK_US, Address, Arrival, DatagramKind, RejectReason, decode
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -44,7 +35,6 @@ _SLACK = 150_000  # ns before the next row is due, at which a control is too lat
 CONTROL_TIMEOUT = 60.0  # s that lock-step waits for a control
 MAX_HDOP = 99.0  # what receivers give without a fix
 _MAX_PAUSE = 10.0  # s between two epochs of a file
-_KINDS = {place: kind for kind, place in SENSORS.items()}
 
 
 @dataclass
@@ -60,15 +50,14 @@ class _WireAgent:
     periods: int = 0  # number of control periods
     _start_time: int = 0  # ns, when tick 0 is due
     _newest: int = -1  # stamp of the newest control
-    _action: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(1, np.float32))
 
     def __post_init__(self) -> None:
         self._facts = get_env_facts(self.env)
+        self._action = np.zeros(self._facts.width, np.float32)
 
     def predict(self, *_: object, **__: object) -> tuple[npt.NDArray[np.float32], None]:
         """Return the action, in fractions of full scale, that comes back for the newest record."""
         if not self.periods:
-            self._action = np.zeros(self._facts.width, np.float32)
             self._start_time = clock() + round(1e9 * TICK)
         tick = self.send()
         self.periods += 1
@@ -91,8 +80,11 @@ class _WireAgent:
             if not self.step:
                 wait_until(self._get_due_time(tick))
             for packet in record.packets[record.packets[:, PACKET.arrived] == tick]:
-                kind = _KINDS[int(packet[PACKET.sensor])]
-                self.port.send(self.to, kind, tick * TICK_US, _make_values(kind, packet))
+                sensor = int(packet[PACKET.sensor])
+                values = packet[PACKET.value : PACKET.value + WIDTHS[sensor]].tolist()
+                age = float((packet[PACKET.arrived] - packet[PACKET.captured]) * TICK)
+                values += [age, float(packet[PACKET.quality])]
+                self.port.send(self.to, KINDS[sensor], tick * TICK_US, values)
             values = [*row.tolist(), float(steer)]
             self.port.send(self.to, DatagramKind.INERTIAL, tick * TICK_US, values)
         return int(record.ticks[-1])
@@ -108,11 +100,9 @@ class _WireAgent:
         end = time.monotonic() + CONTROL_TIMEOUT
         while self._newest < stamp:
             if time.monotonic() > end:
-                raise TimeoutError(
-                    f"no control came within {CONTROL_TIMEOUT:g} s for the tick "
-                    f"{stamp // TICK_US}: does `sideslip live` run with --step at "
-                    f"{self.to[0]}:{self.to[1]}?"
-                )
+                text = f"no control came within {CONTROL_TIMEOUT:g} s for tick {stamp // TICK_US}"
+                place = f"--step at {self.to[0]}:{self.to[1]}"
+                raise TimeoutError(f"{text}: does `sideslip live` run with {place}?")
             self._read(self.port.wait(0.1))
 
     def _read(self, arrivals: list[Arrival]) -> None:
@@ -127,21 +117,10 @@ class _WireAgent:
                 self._newest = message.stamp
 
 
-def _make_values(kind: DatagramKind, packet: Array) -> list[float]:
-    """Make a packet's doubles: its values, its age (s) and its quality."""
-    age = (packet[PACKET.arrived] - packet[PACKET.captured]) * TICK
-    values = packet[PACKET.value : PACKET.value + WIDTHS[SENSORS[kind]]].tolist()
-    return [*values, float(age), float(packet[PACKET.quality])]
-
-
 def simulate(
-    env: gym.Env[Any, Any],
-    port: Port,
-    to: Address,
-    seed: int = 0,
-    step: bool = False,
+    env: gym.Env[Any, Any], port: Port, to: Address, seed: int = 0, step: bool = False,
     speed: float = 1.0,
-) -> tuple[Rollout, _WireAgent]:
+) -> tuple[Rollout, _WireAgent]:  # fmt: skip
     """Simulate one episode whose agent is at the other end of the wires.
 
     In lock-step the drive is that of `rollout` with the same agent, bit for bit; in real time it
@@ -157,9 +136,6 @@ def simulate(
 
     Returns:
         The episode, and the agent with its counts.
-
-    Raises:
-        ValueError: The control period is too long for lock-step.
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
@@ -179,9 +155,8 @@ class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
     def __init__(self, *arguments: object) -> None:
         context = get_context("spawn")
         self._pipe, child_pipe = context.Pipe()
-        self._process = context.Process(
-            target=_run_simulated_car, args=(child_pipe, *arguments), daemon=True
-        )
+        pipe = (child_pipe, *arguments)
+        self._process = context.Process(target=_run_simulated_car, args=pipe, daemon=True)
         self._process.start()
         child_pipe.close()
         self.result()  # it is ready

@@ -32,10 +32,8 @@ _PAGE = Path(__file__).with_name("page.html")
 _SECONDS = 20.0  # s, of the page's plots
 _RATE = 100  # estimates a second: the loop sends the viewer every tenth tick's
 _DEGREES = 57.29577951308232  # deg/rad
-_CONTENT_SECURITY_POLICY = (
-    "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
-    "frame-ancestors 'none'"
-)
+_CONTENT_SECURITY_POLICY = ("default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; "
+                            "connect-src 'self'; frame-ancestors 'none'")  # fmt: skip
 
 
 class _ViewerProtocol(asyncio.DatagramProtocol):
@@ -98,13 +96,9 @@ def _make_table(protocol: _ViewerProtocol, title: str) -> "Table":
 
 def _make_event(protocol: _ViewerProtocol, sent: int) -> tuple[str, int]:
     """Make JSON of the samples after so many, of all where none were sent; count them all."""
-    n_new = min(protocol.count - sent, len(protocol.samples))
-    event = {
-        "all": sent == 0,
-        "names": [[name, _get_unit(name)] for name in protocol.names],
-        "samples": list(protocol.samples)[len(protocol.samples) - n_new :],
-        "status": protocol.status._asdict(),
-    }
+    n_old = max(len(protocol.samples) - (protocol.count - sent), 0)
+    event = {"all": sent == 0, "names": [[name, _get_unit(name)] for name in protocol.names]}
+    event |= {"samples": list(protocol.samples)[n_old:], "status": protocol.status._asdict()}
     return json.dumps(event), protocol.count
 
 
@@ -130,10 +124,8 @@ async def _render_page(title: str, protocol: _ViewerProtocol, _: "web.Request") 
     nonce = secrets.token_urlsafe(16)
     page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
     text = page.replace("FIRST", event.replace("<", "\\u003c"))
-    headers = {
-        "Content-Security-Policy": _CONTENT_SECURITY_POLICY.format(nonce),
-        "Cache-Control": "no-store",
-    }
+    headers = {"Content-Security-Policy": _CONTENT_SECURITY_POLICY.format(nonce)}
+    headers["Cache-Control"] = "no-store"
     return web.Response(text=text, content_type="text/html", headers=headers)
 
 
@@ -199,10 +191,6 @@ class Viewer(AbstractContextManager["Viewer"]):
         title: Title above the estimates.
         page: Host and port of the page, port 0 for any; None: no page.
         screen: Whether the terminal has a table.
-
-    Raises:
-        OSError: The port is in use.
-        ModuleNotFoundError: aiohttp is not installed.
     """
 
     def __init__(self, title: str, page: Address | None, screen: bool) -> None:

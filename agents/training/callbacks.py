@@ -35,17 +35,15 @@ with require_extra("train", "training needs {}"):
     from stable_baselines3.common.logger import KVWriter
     from stable_baselines3.common.utils import get_device
 
-Checkpoint = Mapping[str, Any]
-"""The state of a checkpoint, in JSON types."""
+Checkpoint = Mapping[str, Any]  # the state of a checkpoint, in JSON types
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 _FORMAT = 3  # of a checkpoint
 _VARIABLES = "variables"  # tensors of no module, such as the logarithm of an entropy's weight
+# Keys of a resumed training's state, besides the tensors.
 _STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
-"""Keys of a resumed training's state, besides the tensors."""
 _WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
 _MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
-
 _WEIGHT_SEEDS, _EVALUATION_SEEDS = 2**63, 2**64  # `TrainingTask` has those of its drives
 
 
@@ -78,11 +76,7 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of a run, which may change when a training resumes.
-
-    Raises:
-        ValueError: `eval_freq` is below 1, or the device is none of torch's.
-    """
+    """The options of a run, which may change when a training resumes."""
 
     eval_freq: int = 250_000  # steps between two evaluations
     device: str = "cpu"  # torch's name of the device
@@ -100,8 +94,8 @@ class RunOptions:
             known = "a device is cpu, cuda or another of torch's, or auto"
             raise ValueError(f"{known}, got {self.device!r}") from None
         if self.device.startswith("cuda") and device.type != "cuda":
-            text = f"got {self.device!r}; auto takes one if there is"
-            raise ValueError(f"torch finds no CUDA device, {text}")
+            text = "torch finds no CUDA device, got"
+            raise ValueError(f"{text} {self.device!r}; auto takes one if there is")
 
 
 @dataclass(frozen=True)
@@ -127,21 +121,18 @@ class EvalCallback(BaseCallback):
     """
 
     def __init__(
-        self,
-        task: TrainingTask,
-        folder: Path,
-        run_options: RunOptions,
-        steps: int,
-        warm_start: WarmStart | None = None,
-        state: Checkpoint | None = None,
-    ) -> None:
+        self, task: TrainingTask, folder: Path, run_options: RunOptions, steps: int,
+        warm_start: WarmStart | None = None, state: Checkpoint | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.task, self.folder, self.run_options = task, folder, run_options
         self.warm_start, self.policy = warm_start, warm_start.policy if warm_start else None
-        name = self.policy.name if self.policy else ""
-        self.run_record = RunRecord(steps, run_options.eval_freq, run_options.command, name)
+        run = run_options.eval_freq, run_options.command
+        self.run_record = RunRecord(steps, *run, self.policy.name if self.policy else "")
         self.seeds = _make_evaluation_seeds(task.n_eval_envs)
         self.env = warm_start.env if warm_start else task.vector_env(task.n_eval_envs)
+        base: Any = self.env.unwrapped
+        self.period = float(base.control_period * base.dt)  # of control (s)
         self.evaluations = [Evaluation(*row) for row in (state or {}).get("evaluations", [])]
         self.scaling: StandardisedArguments | None = None
         self.writers: list[KVWriter] = []  # further ones of the log
@@ -155,12 +146,6 @@ class EvalCallback(BaseCallback):
         self.initial_costs = evaluate_episodes(self.env, driver, self.seeds)[0] if driver else None
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
-
-    @property
-    def period(self) -> float:
-        """Control period (s)."""
-        base: Any = self.env.unwrapped
-        return float(base.control_period * base.dt)
 
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""
@@ -181,18 +166,17 @@ class EvalCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         if self.run_options.report is not None:
-            ended = self.model.ep_info_buffer
-            cost = -float(np.mean([episode["r"] for episode in ended])) if ended else None
-            progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
-            self.run_options.report(progress)
+            rewards = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+            cost = -float(np.mean(rewards)) if rewards else None
+            steps, evaluations = self.model.num_timesteps, tuple(self.evaluations)
+            self.run_options.report(Progress(steps, cost, evaluations))
 
     def check(self) -> None:
         """Check that the weights are finite; FloatingPointError otherwise."""
         if not all(bool(weights.isfinite().all()) for weights in self.model.policy.parameters()):
-            raise FloatingPointError(
-                f"the weights are not finite after step {self.model.num_timesteps}; "
-                f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
-            )
+            text = f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
+            step = self.model.num_timesteps
+            raise FloatingPointError(f"the weights are not finite after step {step}; {text}")
 
     def evaluate(self) -> None:
         """Evaluate the policy, and write the checkpoint and the best policy so far."""
@@ -217,30 +201,24 @@ class EvalCallback(BaseCallback):
 
     def _save_best(self, current: Evaluation) -> None:
         """Write the policy's file with its card, and the model's zip."""
-        task = self.task
-        first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+        task, mixture = self.task, self.task.scenarios
         options = task.make_model_options(self.period)
         options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
         options |= {"reads": task.reads} if task.reads else {}
         if self.policy is not None:
             before = self.policy.card.algorithm_options
             options |= {"begun_with": self.policy.name}
-            options |= {"class": before["class"]} if "class" in before and task.scenarios else {}
-        options |= {"scenarios": task.scenarios} if task.scenarios else {}
-        if task.scenarios and self.policy is None:
+            options |= {"class": before["class"]} if "class" in before and mixture else {}
+        options |= {"scenarios": mixture} if mixture else {}
+        if mixture and self.policy is None:
             options |= {"weights": self.weights.round(3).tolist()}
+        env_options = task.env_options | ({"scenario": mixture[0]} if mixture else {})
         card = Card.from_env_id(
-            task.env_id,
-            task.env_options | first,
-            task.estimator,
-            task.estimator_options,
-            algorithm=task.algo,
-            algorithm_options=options,
-            command=self.run_options.command,
+            task.env_id, env_options, task.estimator, task.estimator_options,
+            algorithm=task.algo, algorithm_options=options, command=self.run_options.command,
             seeds={"training": task.seed, "from": task.first_seed},
-            steps=current.steps,
-            cpu_seconds=current.cpu_seconds,
-        )
+            steps=current.steps, cpu_seconds=current.cpu_seconds,
+        )  # fmt: skip
         network = convert_sb3_policy(self.model)
         network = self.warm_start.merge_network(network) if self.warm_start else network
         save_policy(self.folder / POLICY, network, card)
@@ -249,8 +227,7 @@ class EvalCallback(BaseCallback):
 
     def _save_checkpoint(self) -> None:
         """Save the model's parameters and optimisers, and the rest of the training's state."""
-        tensors: dict[str, torch.Tensor] = {}
-        groups: dict[str, Any] = {}
+        tensors, groups = dict[str, torch.Tensor](), dict[str, Any]()
         for part, state in self.model.get_parameters().items():
             if "param_groups" in state:  # an optimiser's
                 groups[part] = state["param_groups"]
@@ -260,23 +237,17 @@ class EvalCallback(BaseCallback):
                 tensors |= {f"{part}/{name}": value for name, value in state.items()}
         tensors |= {f"{_VARIABLES}/{k}": value for k, value in self._get_variables().items()}
         content = {
-            "format": _FORMAT,
-            "groups": groups,
-            "sideslip": __version__,
-            "task": asdict(self.task),
-            "steps": self.model.num_timesteps,
-            "aim": asdict(self.run_record),
-            "scaling": self.scaling,
-            "evaluations": self.evaluations,
-        }
+            "format": _FORMAT, "groups": groups, "sideslip": __version__, "task": asdict(self.task),
+            "steps": self.model.num_timesteps, "aim": asdict(self.run_record),
+            "scaling": self.scaling, "evaluations": self.evaluations,
+        }  # fmt: skip
         plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
         text = json.dumps(content, allow_nan=False)
         write_atomic(self.folder / CHECKPOINT, save(plain, {"checkpoint": text}))
 
     def _get_variables(self) -> dict[str, torch.Tensor]:
         """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
-        names = self.model._get_torch_save_params()[1]
-        return {name: getattr(self.model, name) for name in names}
+        return {name: getattr(self.model, name) for name in self.model._get_torch_save_params()[1]}
 
     def load_parameters(self) -> None:
         """Load the parameters and optimisers of the folder's checkpoint into the model."""
@@ -298,16 +269,13 @@ class EvalCallback(BaseCallback):
 
 
 def read_state(path: Path) -> Checkpoint:
-    """Read a training's state without the tensors.
+    """Read a training's state without the tensors; ValueError for no checkpoint of this format.
 
     Args:
         path: Checkpoint.
 
     Returns:
         State in JSON types.
-
-    Raises:
-        ValueError: The file is no checkpoint of this format, or is cut short.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -339,6 +307,5 @@ def _compute_scenario_weights(task: TrainingTask, first: int = _WEIGHT_SEEDS) ->
     rows = _WEIGHT_DRIVES * k
     env = make_native_env(task.env_id, rows, None, task.options(rows))
     costs, steps = evaluate_episodes(env, None, range(first, first + rows))
-    return _compute_equal_weights(
-        np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
-    )
+    rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
+    return _compute_equal_weights(np.array(rates))

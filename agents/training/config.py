@@ -1,7 +1,6 @@
 """The algorithms of `sideslip train`, their settings, and the task of a training.
 
-The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
-with seed 0.
+The settings in `hyperparams/`, in rl-baselines3-zoo's format, were chosen on YawVision-v0, seed 0.
 """
 
 import inspect
@@ -30,16 +29,14 @@ Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, control period for which the files give `gamma`
-WARM_START_ENTRY = "begun"  # the entry of training a policy further
-WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
 
 # Seeds of tests and of the calibration are below 2^63, those of `distill` beyond.
 _SCALING_SEEDS, _TRAINING_SEEDS, _SEEDS_PER_TRAINING = 2**65, 2**66, 2**40
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")  # no arguments of the class
 _SCHEDULED = ("learning_rate", "clip_range")  # may fall to zero, `_make_schedule`
-_LOG_ARGUMENTS = {"verbose", "tensorboard_log", "stats_window_size"}
 # arguments that a file of settings may not have: the training gives them
-_MANAGED_ARGUMENTS = {"env", "seed", "device", "source", "options"} | _LOG_ARGUMENTS
+_MANAGED_ARGUMENTS = {"env", "seed", "device", "source", "options", "verbose", "tensorboard_log",
+                      "stats_window_size"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -90,9 +87,6 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
 
     Returns:
         Values by name.
-
-    Raises:
-        ValueError: The file is no such YAML, or has neither entry.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -155,11 +149,7 @@ def _make_schedule(name: str, value: object) -> LinearSchedule | float:
 
 @dataclass(frozen=True)
 class TrainingTask:
-    """The task of a training, which stays the same when the training resumes.
-
-    Raises:
-        ValueError: A name is unknown, a number out of range, or fields contradict each other.
-    """
+    """The task of a training, which stays the same when the training resumes."""
 
     env_id: str = "sideslip/YawVision-v1"  # of a native vector env
     algo: str = "ppo"  # name in `ALGORITHMS`
@@ -188,10 +178,9 @@ class TrainingTask:
             if (count := getattr(self, name)) < 1:
                 raise ValueError(f"{name} is at least 1, got {count}")
             if count < len(self.scenarios):
-                raise ValueError(
-                    f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
-                    f"scenarios take as many environments, got {name} {count}"
-                )
+                text = f"{len(self.scenarios)} scenarios take as many environments"
+                rule = "an environment has one scenario for all its episodes"
+                raise ValueError(f"{rule}: {text}, got {name} {count}")
         for i, scenario in enumerate(self.scenarios):
             try:
                 make_scenario(scenario)
@@ -227,13 +216,11 @@ class TrainingTask:
         Returns:
             Options by name.
         """
-        if not self.scenarios:
-            return self.env_options
-        turns = itertools.islice(itertools.cycle(self.scenarios), num_envs)
-        return self.env_options | {"scenario": list(turns)}
+        turns = list(itertools.islice(itertools.cycle(self.scenarios), num_envs))
+        return self.env_options | ({"scenario": turns} if turns else {})
 
     def vector_env(self, num_envs: int) -> CarVectorEnv:
-        """Make a vector env of the task with its estimator, for other seeds than the training's.
+        """Make a vector env of the task with its estimator.
 
         Args:
             num_envs: Number of rows.
@@ -241,13 +228,10 @@ class TrainingTask:
         Returns:
             New vector env.
         """
-        options = self.options(num_envs)
-        return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
+        return make_native_env(self.env_id, num_envs, self.estimator_kwargs, self.options(num_envs))
 
     def make_model_options(self, seconds: float) -> Settings:
         """Make the arguments of the algorithm's class, in JSON types.
-
-        `gamma` discounts as much in a second as in the file, and a batch divides a rollout.
 
         Args:
             seconds: Control period (s).
@@ -256,14 +240,14 @@ class TrainingTask:
             Arguments by name.
         """
         options = {k: value for k, value in self.settings.items() if k not in _TRAINING_SETTINGS}
-        if "gamma" in options:
+        if "gamma" in options:  # which discounts as much in a second as in the file
             options["gamma"] = options["gamma"] ** (seconds / PERIOD)
         kind: Any = self.algorithm.load()
         rolls_out = issubclass(kind, OnPolicyAlgorithm)  # else n_steps are those of a return
-        if rolls_out and "n_steps" in options and "batch_size" in options:
+        if rolls_out and "n_steps" in options and "batch_size" in options:  # it divides a rollout
             rollout = self.num_envs * options["n_steps"]
-            max_size = min(options["batch_size"], rollout)
-            options["batch_size"] = max(n for n in range(1, max_size + 1) if rollout % n == 0)
+            sizes = range(1, min(options["batch_size"], rollout) + 1)
+            options["batch_size"] = max(n for n in sizes if rollout % n == 0)
         return options
 
     def make_model(
@@ -282,10 +266,9 @@ class TrainingTask:
         """
         options = self.make_model_options(seconds)
         options |= {key: _make_schedule(key, options[key]) for key in _SCHEDULED if key in options}
-        policy_kwargs = dict(options.get("policy_kwargs", {}))
-        if "activation_fn" in policy_kwargs:
-            policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
-        policy_kwargs["features_extractor_class"] = Standardised
-        policy_kwargs["features_extractor_kwargs"] = scaling._asdict()
-        options |= {"policy_kwargs": policy_kwargs, "stats_window_size": env.num_envs}
+        kwargs = dict(options.get("policy_kwargs", {}), features_extractor_class=Standardised)
+        if "activation_fn" in kwargs:
+            kwargs["activation_fn"] = list_activations()[kwargs["activation_fn"]]
+        kwargs["features_extractor_kwargs"] = scaling._asdict()
+        options |= {"policy_kwargs": kwargs, "stats_window_size": env.num_envs}
         return self.algorithm.load()(self.settings["policy"], env, **options, **rest)

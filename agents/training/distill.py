@@ -1,12 +1,10 @@
 """Distillation: a policy with memory imitates a teacher with more information, by DAgger.
 
-A teacher drives cars of its own, with any sensors, filter or truth, in lockstep with the
-student's: equal seeds and actions give equal motion to the last bit. In the first round the
-teacher acts, with coloured noise, in later ones the student; the teacher's action is always the
-label (Ross et al., AISTATS 2011).
-
-The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
-matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
+A teacher drives cars of its own, with any sensors, filter or truth, in lockstep with the student's.
+In the first round the teacher acts, with coloured noise, in later ones the student; the teacher's
+action is always the label (Ross et al., AISTATS 2011). The loss is what an action's error adds to
+the cost of the rest of the drive, by the Riccati matrix of the teacher's design, over the cost of
+the episode: the score's logarithm, linearised.
 """
 
 import itertools
@@ -27,6 +25,7 @@ from .student import Demonstrations, DistillConfig, Scaling, Student, compute_sc
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
 
+_Drives = Sequence[Demonstrations]
 _DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`
 _SEEDS_PER_TRAINING = 2**40
 _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
@@ -63,11 +62,9 @@ class _Batch(NamedTuple):
 
 
 def _imitate(
-    model: Student,
-    tasks: Sequence[DistillTask],
-    config: DistillConfig,
+    model: Student, tasks: Sequence[DistillTask], config: DistillConfig,
     make_policy: Callable[[Scaling, RoundResult], Policy],
-) -> Policy:
+) -> Policy:  # fmt: skip
     """Let a model drive and learn in rounds; `make_policy` makes the one that drives the next."""
     layout, needs, num_envs = tasks[0].cars.layout, tasks[0].teacher.needs, tasks[0].cars.num_envs
     seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, num_envs)
@@ -78,10 +75,8 @@ def _imitate(
         new_drives = []
         for task, max_cost in zip(tasks, max_costs, strict=True):
             first = next(seeds)
-            numbers = range(first, first + task.cars.num_envs)
-            new_drives.append(
-                _collect_demonstrations(task, policy, numbers, config.noise, max_cost)
-            )
+            numbers, limits = range(first, first + task.cars.num_envs), (config.noise, max_cost)
+            new_drives.append(_collect_demonstrations(task, policy, numbers, *limits))
         steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
         if scaling is None:
             scaling = model.fit_scaling(new_drives, layout, needs)
@@ -99,12 +94,9 @@ def _imitate(
 
 
 def _collect_demonstrations(
-    task: DistillTask,
-    policy: Policy | None,
-    seeds: Sequence[int],
-    noise: float,
+    task: DistillTask, policy: Policy | None, seeds: Sequence[int], noise: float,
     max_cost: float = np.inf,
-) -> Demonstrations:
+) -> Demonstrations:  # fmt: skip
     """Collect each seed's first episode, driven by a policy, or by the teacher with noise."""
     # noise: largest standard deviation on the teacher's actions. Episodes that cost more than
     # `max_cost` are weighted as if they cost that: failed ones keep their weight.
@@ -116,8 +108,7 @@ def _collect_demonstrations(
     teacher_obs, _ = twins.reset(seed=list(seeds))
     running = start = np.ones(len(seeds), np.bool_)
     coloured_noise, student_state, teacher_state = np.zeros((len(seeds), teacher.width)), None, None
-    costs, steps = np.zeros(len(seeds)), []
-    privileged_columns = _list_privileged_columns(task)
+    costs, steps, columns = np.zeros(len(seeds)), [], _list_privileged_columns(task)
     while running.any():
         label, teacher_state = teacher.predict(teacher_obs, teacher_state, start)
         if student is None:
@@ -128,7 +119,7 @@ def _collect_demonstrations(
         else:
             action, student_state = student.predict(obs, student_state, start)
         is_valid = running & np.isfinite(label).all(axis=1)
-        steps.append((obs, np.nan_to_num(label), teacher_obs[:, privileged_columns], is_valid))
+        steps.append((obs, np.nan_to_num(label), teacher_obs[:, columns], is_valid))
         teacher.record_action(teacher_state, action)
         obs, rewards, terminated, truncated, _ = cars.step(action)
         teacher_obs, teacher_rewards, *_ = twins.step(action)
@@ -137,11 +128,10 @@ def _collect_demonstrations(
         costs -= np.where(running, rewards, 0.0)
         start = np.logical_or(terminated, truncated)
         running = running & ~start
-    x, y, privileged, valid = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
+    x, y, privileged, valid = (np.stack(part, axis=1) for part in zip(*steps, strict=True))
     curvature = np.eye(teacher.width, dtype=np.float32)
     if isinstance(teacher, Lqr):  # S of its design at the mean speed, `Lqr.curvature`
-        names = [entry.name for entry in cars.layout]
-        speed = float(x[..., names.index("wheel_left")].mean())
+        speed = float(x[..., [e.name for e in cars.layout].index("wheel_left")].mean())
         curvature = teacher.curvature(speed).astype(np.float32)
     weights = (valid / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
     return Demonstrations(x, y, privileged, weights, curvature, costs)
@@ -154,12 +144,9 @@ def _list_privileged_columns(task: DistillTask) -> list[int]:
 
 
 def distill(
-    card: Card,
-    tasks: Sequence[DistillTask],
-    config: DistillConfig,
-    path: str | Path,
+    card: Card, tasks: Sequence[DistillTask], config: DistillConfig, path: str | Path,
     report: Callable[[RoundResult], None] = lambda _: None,
-) -> Policy:
+) -> Policy:  # fmt: skip
     """Train a policy on all tasks and write it to a file after every round.
 
     Args:
@@ -171,9 +158,6 @@ def distill(
 
     Returns:
         Policy of the last round: equal bits for equal arguments.
-
-    Raises:
-        ValueError: There is no task, or `auxiliary_weight` where the student sees everything.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")
@@ -183,8 +167,7 @@ def distill(
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
-    width = cars.single_action_space.shape[0]
-    model = Student(len(cars.layout), width, config, n_privileged)
+    model = Student(len(cars.layout), cars.single_action_space.shape[0], config, n_privileged)
 
     def save_round(scaling: Scaling, result: RoundResult) -> Policy:
         cpu_seconds = round(time.process_time() - start_time, 1)
@@ -200,9 +183,7 @@ def distill(
 class _EpisodeBatches:
     """Batches of episodes, cut into windows through which the state is carried."""
 
-    def __init__(
-        self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
-    ) -> None:
+    def __init__(self, drives: _Drives, scaling: Scaling, config: DistillConfig) -> None:
         self.drives, self.scaling = drives, scaling
         self.batch, self.window = config.batch, sys.maxsize if config.traces else _WINDOW
         self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
@@ -230,9 +211,7 @@ class _EpisodeBatches:
 class _StepBatches:
     """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
 
-    def __init__(
-        self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
-    ) -> None:
+    def __init__(self, drives: _Drives, scaling: Scaling, _: DistillConfig) -> None:
         parts = []
         for demo in drives:
             inputs, count = scaling.mix_inputs(demo.obs[demo.is_valid]), int(demo.is_valid.sum())
@@ -249,11 +228,7 @@ class _StepBatches:
 
 
 def _fit_model(
-    model: Any,
-    drives: Sequence[Demonstrations],
-    scaling: Scaling,
-    config: DistillConfig,
-    epochs: int,
+    model: Any, drives: _Drives, scaling: Scaling, config: DistillConfig, epochs: int
 ) -> float:
     """Fit a model to drives; return what its errors add to an episode, as a share of its cost."""
     # the mean over the episodes in the last epoch, without the auxiliary loss
@@ -279,10 +254,8 @@ def _fit_model(
             loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # by episode
             if config.auxiliary_weight:
                 auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
-                loss = (
-                    loss / zero_loss
-                    + config.auxiliary_weight * auxiliary_error / valid.sum().clamp(min=1)
-                )
+                auxiliary = config.auxiliary_weight * auxiliary_error / valid.sum().clamp(min=1)
+                loss = loss / zero_loss + auxiliary
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)

@@ -8,6 +8,7 @@ import json
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,7 +41,7 @@ _NORMALISER = "vecnormalize.pkl"
 def convert_sb3_policy(
     model: "BaseAlgorithm | BasePolicy", normaliser: "VecNormalize | None" = None, history: int = 1
 ) -> Network:
-    """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
+    """Convert the deterministic actor of a model to a network; ValueError for an unknown one.
 
     Args:
         model: Model or policy of a class of `_POLICIES`, `Standardised` its extractor at most.
@@ -49,17 +50,13 @@ def convert_sb3_policy(
 
     Returns:
         Network of the actor.
-
-    Raises:
-        ValueError: The model is none of these, or has actions beyond [-1, 1].
     """
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
         from .normalise import Standardised, read_normalisation
     policy = getattr(model, "policy", model)
-    actor = _find_actor(policy)
-    space = policy.action_space
+    actor, space = _find_actor(policy), policy.action_space
     low, high = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
     if not (np.all(low == -1.0) and np.all(high == 1.0)):
         raise ValueError(f"an action lies within [-1, 1], got {space}")
@@ -102,8 +99,7 @@ _POLICIES = (
     "sb3_contrib.tqc.policies.TQCPolicy",
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy",
     f"{__package__}.gradient.GruPolicy",
-)
-"""Classes of policies; a subclass may compute anything and is none of them."""
+)  # classes of policies; a subclass may compute anything and is none of them
 
 
 def _check_known(kind: type) -> None:
@@ -137,11 +133,11 @@ def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
         return []
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
         raise ValueError(f"recurrent layers with further arguments are not known: {module}")
-    kind, names = module.mode.lower(), ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    return [
-        RecurrentCell(kind, *(_to_array(getattr(module, f"{name}_l{i}")) for name in names))
-        for i in range(module.num_layers)
-    ]
+    cells, names = list[RecurrentCell](), ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+    for i in range(module.num_layers):
+        arrays = (_to_array(getattr(module, f"{name}_l{i}")) for name in names)
+        cells.append(RecurrentCell(module.mode.lower(), *arrays))
+    return cells
 
 
 def _to_array(parameter: "Tensor") -> Array:
@@ -168,28 +164,21 @@ def _convert_dense(layers: list["nn.Module"]) -> tuple[list[Array], list[Array],
                 raise ValueError("two linear layers without an activation between")
             weights.append(_to_array(layer.weight))
             biases.append(_to_array(layer.bias))
-        elif (
-            type(layer) in names
-            and getattr(layer, "alpha", 1.0) == 1.0
-            and getattr(layer, "negative_slope", 0.01) == 0.01
-        ):
-            layer_activations.append(names[type(layer)])
         else:
-            known = ", ".join(names.values())
-            raise ValueError(f"layer {layer} is not known; known: linear, {known}")
+            slopes = getattr(layer, "alpha", 1.0), getattr(layer, "negative_slope", 0.01)
+            if type(layer) not in names or slopes != (1.0, 0.01):
+                known = ", ".join(names.values())
+                raise ValueError(f"layer {layer} is not known; known: linear, {known}")
+            layer_activations.append(names[type(layer)])
     if len(layer_activations) == len(weights):  # the last one is the output's
         return weights, biases, layer_activations[:-1], layer_activations[-1]
     return weights, biases, layer_activations, "linear"
 
 
 def policy_from_zip(
-    path: str | Path,
-    env: AnyEnv,
-    *,
-    trust: bool = False,
-    normalise: str | Path | None = None,
+    path: str | Path, env: AnyEnv, *, trust: bool = False, normalise: str | Path | None = None,
     **about: Any,
-) -> Policy:
+) -> Policy:  # fmt: skip
     """Read the deterministic actor of a stable-baselines3 zip, for the env of its training.
 
     A policy trained on a VecFrameStack around the env has that many frames of history.
@@ -208,7 +197,6 @@ def policy_from_zip(
         FileNotFoundError: There is no such file.
         PermissionError: `trust` is False.
         ValueError: The file is no such zip, or its policy has another observation.
-        ModuleNotFoundError: stable-baselines3 is not installed.
     """
     file = Path(path)
     check_trusted(file, trust)
@@ -218,21 +206,15 @@ def policy_from_zip(
     network = convert_sb3_policy(policy, load_normaliser(file, trust, normalise), frames)
     scales = np.resize(scales, network.mean.shape)  # of all frames, or of one
     network = replace(network, mean=network.mean * scales, scale=network.scale / scales)
-    algorithm = f"stable-baselines3's {type(policy).__name__}"
-    described = {"algorithm": algorithm, "steps": int(content.get("num_timesteps", 0))}
-    return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
+    described = {"env_id": "", "steps": int(content.get("num_timesteps", 0))}
+    described["algorithm"] = f"stable-baselines3's {type(policy).__name__}"
+    return Policy(file.stem, network, Card.from_env(env, **described | about))
 
 
 def export_zip(
-    path: str | Path,
-    target: str | Path,
-    env_id: str,
-    env_options: Mapping[str, Any] | None = None,
-    *,
-    trust: bool = False,
-    normalise: str | Path | None = None,
-    **about: Any,
-) -> Policy:
+    path: str | Path, target: str | Path, env_id: str, env_options: Mapping[str, Any] | None = None,
+    *, trust: bool = False, normalise: str | Path | None = None, **about: Any,
+) -> Policy:  # fmt: skip
     """Export a zip's actor to a policy's file, which runs no code where it is read.
 
     Args:
@@ -246,9 +228,6 @@ def export_zip(
 
     Returns:
         Policy as it is in the file.
-
-    Raises:
-        ValueError: The target has another ending.
     """
     check_trusted(Path(path), trust)
     if Path(target).suffix != SUFFIX:
@@ -300,14 +279,10 @@ def check_trusted(file: Path, trust: bool) -> None:
 
 
 def check_zip(file: Path) -> None:
-    """Check a zip by its list of members, before anything in it is read.
+    """Check a zip of stable-baselines3 by its members' names; ValueError for another file.
 
     Args:
         file: Path of the zip.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is no zip of stable-baselines3.
     """
     if not file.is_file():
         raise FileNotFoundError(f"{file}: {'a folder' if file.is_dir() else 'no such file'}")
@@ -317,10 +292,8 @@ def check_zip(file: Path) -> None:
     except BadZipFile as error:
         raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
     if missing:
-        raise ValueError(
-            f"{file} is no zip of stable-baselines3, or is cut short: it holds no "
-            f"{' and '.join(sorted(missing))}"
-        )
+        text = f"{file} is no zip of stable-baselines3, or is cut short: it holds no"
+        raise ValueError(f"{text} {' and '.join(sorted(missing))}")
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
@@ -350,8 +323,7 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "Base
     """Build the policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
-    kind = content["policy_class"]
-    options = {**content["policy_kwargs"]}
+    kind, options = content["policy_class"], {**content["policy_kwargs"]}
     options.pop("device", None)
     if not isinstance(kind, type):
         raise ValueError(f"{file}: its policy is of no class, but {kind!r}")
@@ -363,9 +335,8 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "Base
         policy: BasePolicy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
-        raise ValueError(
-            f"{file}: its weights are not those of its {kind.__name__}: {error}"
-        ) from error
+        text = f"{file}: its weights are not those of its {kind.__name__}"
+        raise ValueError(f"{text}: {error}") from error
     return policy
 
 
@@ -412,10 +383,11 @@ def _match_frames(
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
-    if frames > 0 and rest == 0 and space == make_space(layout, frames):
-        return frames, np.ones(1)
-    if frames > 0 and rest == 0 and space == make_space(scale_layout(layout), frames):
-        return frames, get_scales(layout).astype(np.float64)
+    if frames > 0 and rest == 0:
+        if space == make_space(layout, frames):
+            return frames, np.ones(1)
+        if space == make_space(scale_layout(layout), frames):
+            return frames, get_scales(layout).astype(np.float64)
     raise ValueError(
         f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
         f"observation here has {len(layout)}: {', '.join(entry.name for entry in layout)}. An "
@@ -426,10 +398,8 @@ def _match_frames(
 def _describe_matching_env(space: gym.Space[Any]) -> str:
     """Describe the registered env that has this observation, if there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
-        try:
+        with suppress(ModuleNotFoundError):  # of an extra
             layout = get_env_facts(gym.make(env_id)).layout
-        except ModuleNotFoundError:  # of an extra
-            continue
-        if space == make_space(layout):
-            return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
+            if space == make_space(layout):
+                return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
     return " that no environment here has by itself (with an estimator, say which)"

@@ -44,14 +44,9 @@ class GruPolicy(BasePolicy):
     """
 
     def __init__(
-        self,
-        observation_space: gym.spaces.Box,
-        action_space: gym.spaces.Box,
-        lr_schedule: Schedule,
-        cells: int = 64,
-        net_arch: Sequence[int] = (64, 64),
-        **options: Any,
-    ) -> None:
+        self, observation_space: gym.spaces.Box, action_space: gym.spaces.Box,
+        lr_schedule: Schedule, cells: int = 64, net_arch: Sequence[int] = (64, 64), **options: Any,
+    ) -> None:  # fmt: skip
         options = {"features_extractor_class": Standardised} | options
         super().__init__(observation_space, action_space, **options)
         self.features_extractor = self.make_features_extractor()
@@ -61,8 +56,7 @@ class GruPolicy(BasePolicy):
             layers += [nn.Linear(inputs, outputs), nn.SiLU()]
         self.layers = nn.Sequential(*layers[:-1])
         with torch.no_grad():
-            last_weight = list(self.layers.parameters())[-2]
-            last_weight.mul_(0.1)  # small first actions: random ones teach little
+            list(self.layers.parameters())[-2].mul_(0.1)  # small first actions: others teach little
         # betas as in Xu et al.: a shorter memory than Adam's defaults
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
@@ -78,8 +72,7 @@ class GruPolicy(BasePolicy):
         Returns:
             Actions and next state.
         """
-        z = self.features_extractor(observations)
-        _, after = self.cell(z[None], state[None])
+        _, after = self.cell(self.features_extractor(observations)[None], state[None])
         return self.layers(after[0]), after[0]
 
     def _begin(self, count: int) -> torch.Tensor:
@@ -87,12 +80,9 @@ class GruPolicy(BasePolicy):
         return torch.zeros(count, self.cell.hidden_size, device=self.device)
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         """Compute deterministic actions within [-1, 1] and the next state.
 
         Args:
@@ -139,30 +129,20 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         policy_kwargs: Arguments of the policy.
         _init_setup_model: As in stable-baselines3.
         **options: Arguments of `BaseAlgorithm`, such as the seed of the weights.
-
-    Raises:
-        ValueError: `n_steps` is below 1.
     """
 
     policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3
 
     def __init__(
-        self,
-        policy: str | type[GruPolicy],
-        env: Any,
-        learning_rate: float | Schedule = 5e-3,
-        n_steps: int = 16,
-        compile: bool = True,
+        self, policy: str | type[GruPolicy], env: Any, learning_rate: float | Schedule = 5e-3,
+        n_steps: int = 16, compile: bool = True,
         source: Callable[..., TrainingSource] | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
-        **options: Any,
-    ) -> None:
+        policy_kwargs: dict[str, Any] | None = None, _init_setup_model: bool = True, **options: Any,
+    ) -> None:  # fmt: skip
         if n_steps < 1:
             raise ValueError(f"n_steps is at least 1, got {n_steps}")
-        super().__init__(
-            policy, env, learning_rate, policy_kwargs, support_multi_env=True, **options
-        )
+        options["support_multi_env"] = True
+        super().__init__(policy, env, learning_rate, policy_kwargs, **options)
         self.n_steps, self.compile, self.source = n_steps, compile, source
         if _init_setup_model:
             self._setup_model()
@@ -175,14 +155,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         self.policy = built.to(self.device)
 
     def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "gradient",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> "AnalyticPolicyGradient":
+        self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int = 1,
+        tb_log_name: str = "gradient", reset_num_timesteps: bool = True, progress_bar: bool = False,
+    ) -> "AnalyticPolicyGradient":  # fmt: skip
         """Train until a number of steps, window by window.
 
         Args:
@@ -195,16 +170,11 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
         Returns:
             The model itself.
-
-        Raises:
-            ValueError: There is no source.
-            FloatingPointError: The gradient is not finite; the message has the step.
         """
         if self.source is None:
             raise ValueError("AnalyticPolicyGradient drives cars on tensors: it needs their source")
-        total, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        log = reset_num_timesteps, tb_log_name, progress_bar
+        total, callback = self._setup_learn(total_timesteps, callback, *log)
         policy: Any = self.policy
         cars, seeds, reward_scale = self.source(device=self.device, compile=self.compile)
         reward_scale.begin()
@@ -249,17 +219,10 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
 
 def _unroll_window(
-    policy: GruPolicy,
-    cars: Any,
-    obs: torch.Tensor,
-    state: torch.Tensor,
-    reward_scale: RewardScale,
-    steps: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Drive cars for a window: mean weighted cost with its graph, last observations and state.
-
-    The state (N, cells) is zero where an episode begins.
-    """
+    policy: GruPolicy, cars: Any, obs: torch.Tensor, state: torch.Tensor,
+    reward_scale: RewardScale, steps: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Drive cars for a window: mean weighted cost with its graph, last observations and state."""
     mean_cost = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):
         actions, state = policy(obs, state)

@@ -1,8 +1,7 @@
 """Standardised observations as the input of a network, instead of SI units, and scaled rewards.
 
-Scales and mixing are measured once, before the training, and are part of the network, which reads
-plain observations. Some differences, such as course less heading, vary little while their parts
-vary much, and matter to a policy. Mixing scales them up, as gradient methods need.
+Scales and mixing are measured once, before the training, and are part of the network. Mixing scales
+up small differences of entries that vary much, such as course less heading, for gradient methods.
 """
 
 import math
@@ -53,13 +52,9 @@ class Standardised(FlattenExtractor):
     mixing: torch.Tensor
 
     def __init__(
-        self,
-        observation_space: gym.Space[Observations],
-        mean: list[float],
-        scale: list[float],
-        clip: float | None = CLIP,
-        mixing: list[list[float]] | None = None,
-    ) -> None:
+        self, observation_space: gym.Space[Observations], mean: list[float], scale: list[float],
+        clip: float | None = CLIP, mixing: list[list[float]] | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(observation_space)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
@@ -98,9 +93,6 @@ def read_normalisation(
 
     Returns:
         Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
-
-    Raises:
-        ValueError: The normaliser is of observations of another size.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None
@@ -126,8 +118,8 @@ class RewardScale:
 
     def begin(self) -> None:
         """Start every car's first drive."""
-        self._drive[:] = 0
-        self._update_scale(range(len(self._drive)))
+        self._drive[:] = -1
+        self.start_next_drives(np.ones(len(self._drive), np.bool_))
 
     def start_next_drives(self, rows: npt.NDArray[np.bool_]) -> None:
         """Start the next drive of some cars.
@@ -135,12 +127,8 @@ class RewardScale:
         Args:
             rows: Whether a car starts its next drive, shape (N,).
         """
-        chosen = np.flatnonzero(rows).tolist()
-        self._drive[chosen] += 1
-        self._update_scale(chosen)
-
-    def _update_scale(self, cars: Sequence[int]) -> None:
-        for i in cars:
+        for i in np.flatnonzero(rows).tolist():
+            self._drive[i] += 1
             scales = self._drive_scales[i]
             self.now[i] = scales[min(self._drive[i], len(scales) - 1)]
 

@@ -25,16 +25,14 @@ with require_extra("train", "distillation needs torch"):
 Single = npt.NDArray[np.float32]
 
 _CLIP = 8.0  # limit of a normalised input (standard deviations)
-_UNREAD = ("gps_X", "gps_Y", "gps_satellites")
-"""Entries without information for control, as they only locate the car."""
+_UNREAD = ("gps_X", "gps_Y", "gps_satellites")  # without information for control
+# Beginnings of entries that a filter has read: behind it they would only shake the action.
 _FILTERED = ("gyro", "accel_", "roll_rate", "camera_", "gps_")
-"""Beginnings of entries that a filter has read: behind it they would only shake the action."""
 _MIN_SPREAD = 1e-9  # standard deviation below which an input counts as constant
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
 _MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
-_TIMES = (3, 10, 30, 100, 300)
-"""Times of the means in steps; of 10 ms each: from the motors' lag to half a drive."""
+_TIMES = (3, 10, 30, 100, 300)  # steps, of 10 ms each: from the motors' lag to half a drive
 SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
 _BLOCK = 50  # steps whose means are one product of matrices
 _MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
@@ -53,13 +51,11 @@ def compute_scale(spread: Array) -> Array:
 
 
 def compute_whitening(z: npt.NDArray[np.floating], minimum: float) -> Array:
-    """Compute the symmetric matrix that makes the samples' covariance the identity.
-
-    This is ZCA whitening (Bell and Sejnowski 1997), of eigenvalues that are not below a minimum.
+    """Compute the symmetric whitening of samples, ZCA (Bell and Sejnowski 1997).
 
     Args:
         z: Samples, shape (n, k).
-        minimum: Minimum of the covariance's eigenvalues.
+        minimum: Value that the covariance's lower eigenvalues count as.
 
     Returns:
         Matrix, shape (k, k).
@@ -85,15 +81,11 @@ class Demonstrations(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """The scaling of a student's inputs: clip((x - mean) scale) mixing.
-
-    `Standardised` is that of reinforcement learning.
-    """
+    """The scaling of a student's inputs: clip((x - mean) scale) mixing."""
 
     mean: Array  # shape (k,)
     scale: Array  # factors, shape (k,), zero for an entry that is not read
-    mixing: Array | None = None
-    """Symmetric whitening, shape (k, k), which scales up small differences; None for none."""
+    mixing: Array | None = None  # whitening, shape (k, k), which scales up small differences
 
     def mix_inputs(self, obs: Single) -> Single:
         """Compute the inputs of a network.
@@ -110,9 +102,7 @@ class Scaling(NamedTuple):
 
 
 def _compute_scaling(
-    drives: Sequence[Demonstrations],
-    layout: Sequence[ObservationEntry],
-    needs: Sequence[str],
+    drives: Sequence[Demonstrations], layout: Sequence[ObservationEntry], needs: Sequence[str]
 ) -> Scaling:
     """Compute the scaling of a student's inputs from drives."""
     # A student that has all of `needs` reads nothing else, which would only be noise to it. One
@@ -139,9 +129,6 @@ class DistillConfig:
 
     The auxiliary loss is that of the teacher's inputs that a student with memory does not see:
     squared errors in standard deviations, where the loss of zero actions counts 1.
-
-    Raises:
-        ValueError: A number is out of range, there are cells and traces, or `told` without memory.
     """
 
     rounds: int = 7  # of driving and learning; in the first one the teacher drives
@@ -177,8 +164,8 @@ class DistillConfig:
 class _TraceLayer(nn.Module):
     """The inputs and SiLU units, with the moving averages of all over some times (steps).
 
-    The inputs and their averages are whitened: `mean` is subtracted, and `mixing` multiplies. A
-    small difference of two of them often has most information: it says how a sensor changes.
+    The inputs and their averages are whitened, by `mean` and `mixing`: small differences of two of
+    them say how a sensor changes.
     """
 
     mean: torch.Tensor
@@ -280,10 +267,8 @@ class Student(nn.Module):
         memory_size = self.traces.size if self.traces else config.cells
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
-        head_inputs = config.cells or sizes[-2]
-        self.auxiliary_head = (
-            nn.Linear(head_inputs, n_privileged) if config.auxiliary_weight else None
-        )
+        head_inputs = config.cells or sizes[-2] if config.auxiliary_weight else 0
+        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if head_inputs else None
         self.recurrent = bool(memory_size)
 
     def forward(
@@ -304,17 +289,15 @@ class Student(nn.Module):
         memory_output = z
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
-        auxiliary = []
+        outputs = [self.dense[-1](z)]
         if self.auxiliary_head is not None:
-            auxiliary.append(self.auxiliary_head(memory_output if self.cell else z))
-        return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
+            outputs.append(self.auxiliary_head(memory_output if self.cell else z))
+        return torch.cat(outputs, dim=-1), state
 
     def fit_scaling(
-        self,
-        drives: Sequence[Demonstrations],
-        layout: Sequence[ObservationEntry],
+        self, drives: Sequence[Demonstrations], layout: Sequence[ObservationEntry],
         needs: Sequence[str],
-    ) -> Scaling:
+    ) -> Scaling:  # fmt: skip
         """Fit the scaling of the inputs, and the whitening of the moving averages, on drives.
 
         Args:

@@ -1,8 +1,8 @@
 """Training of a policy in a folder: rollouts on the batch engine, evaluations, a checkpoint.
 
-The folder holds `checkpoint.safetensors` (for `resume`), `policy.safetensors` (the network of the
-best evaluation, with its card), `best_model.zip` (the same model in stable-baselines3's format),
-`curve.jsonl` (the evaluations), and `begun_with.safetensors` where it started from a policy.
+The folder holds `checkpoint.safetensors`, `policy.safetensors` (the best evaluation's network with
+its card), `best_model.zip` (the same model in stable-baselines3's format), `curve.jsonl` (the
+evaluations), and `begun_with.safetensors` where it started from a policy.
 """
 
 import math
@@ -106,10 +106,8 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
     state = read_state(path)
     saved, version = state["task"], state["sideslip"]
     if version != __version__:
-        raise ValueError(
-            f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
-            "may be others: train anew, in another folder"
-        )
+        text = f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs"
+        raise ValueError(f"{text} may be others: train anew, in another folder")
     names = [item.name for item in fields(TrainingTask)]  # a default for none of them
     missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
     if missing:
@@ -121,10 +119,8 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         raise ValueError(f"{path}: {error}") from None
     for name, value in arguments.items():
         if value != getattr(task, name):
-            raise ValueError(
-                f"{path} is of {name} {getattr(task, name)!r}, not {value!r}: train that in "
-                "another folder"
-            )
+            text = f"{path} is of {name} {getattr(task, name)!r}, not {value!r}"
+            raise ValueError(f"{text}: train that in another folder")
     record = from_json(RunRecord, state["aim"], f"{path}: the aim")
     return SavedTraining(Path(folder), task, record, state)
 
@@ -136,10 +132,6 @@ class Trainer:
     A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
     and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
     actions before weights change.
-
-    Raises:
-        ValueError: The folder holds another training, or arguments contradict each other.
-        ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
     """
 
     task: TrainingTask
@@ -147,9 +139,9 @@ class Trainer:
     folder: str | Path
     resume: bool = False  # whether to resume from the folder's checkpoint
     run_options: RunOptions = field(default_factory=RunOptions)
+    # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy` or
+    # its name, whose costs weigh the drives
     trained_agent: str | Path | Policy | None = None
-    """Zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy` or
-    its name, whose costs weigh the drives."""
     trust: bool = False  # whether a pickle of VecNormalize beside the zip may be read
 
     def __post_init__(self) -> None:
@@ -177,23 +169,19 @@ class Trainer:
             saved = read_training(self._folder, **asdict(self.task))
             self._state, self.trained_agent = saved.state, saved.load_initial_policy()
         elif (self._folder / CHECKPOINT).exists():
-            raise ValueError(
-                f"{self._folder} holds a training already: go on with it (resume), or take another "
-                "folder"
-            )
+            text = f"{self._folder} holds a training already: go on with it (resume), or"
+            raise ValueError(f"{text} take another folder")
         else:
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def train(self) -> TrainResult:
         """Train up to the number of steps; the model and its evaluations."""
-        callback, is_new = self.build(), self._state is None
-        if is_new:
-            (self._folder / WARM_START_FILE).unlink(missing_ok=True)  # of one without a checkpoint
-        if is_new and callback.policy is not None:
-            save_policy(
-                self._folder / WARM_START_FILE, callback.policy.network, callback.policy.card
-            )
-        model, run = callback.model, None
+        callback, file = self.build(), self._folder / WARM_START_FILE
+        policy, model, run = callback.policy, callback.model, None
+        if self._state is None:
+            file.unlink(missing_ok=True)  # of one without a checkpoint
+            if policy is not None:
+                save_policy(file, policy.network, policy.card)
         done = model.num_timesteps
         if done < self.steps:
             log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=self.task.algo)
@@ -222,10 +210,9 @@ class Trainer:
             callback.scaling = StandardisedArguments(*state["scaling"])
         else:
             callback.scaling = start.scaling if start and not state else _measure_scaling(task)
-        options = dict[str, Any](estimator=task.estimator_kwargs)
-        options["env_kwargs"] = task.options(task.num_envs)
-        options["wrapper_class"] = start.wrap_env if start else None
-        env = make_vec_env(task.env_id, task.num_envs, scaled=False, **options)
+        options = dict[str, Any](wrapper_class=start.wrap_env if start else None, scaled=False)
+        options |= {"estimator": task.estimator_kwargs, "env_kwargs": task.options(task.num_envs)}
+        env = make_vec_env(task.env_id, task.num_envs, **options)
         first, period = task.first_seed + steps, callback.period
         if start and start.driver:
             n_steps = -(-(self.steps - steps) // env.num_envs)
@@ -233,10 +220,8 @@ class Trainer:
         else:
             scales = (np.resize(callback.weights, env.num_envs) / period)[:, None].tolist()
         scaled_env = RewardScaleWrapper(env, RewardScale(scales))
-        log, device = self.run_options.tensorboard_log, self.run_options.device
-        further = dict[str, Any](
-            device=device, tensorboard_log=log, seed=(task.seed + steps) % 2**32
-        )
+        run, seed = self.run_options, (task.seed + steps) % 2**32
+        further = dict[str, Any](device=run.device, tensorboard_log=run.tensorboard_log, seed=seed)
         if task.algorithm.on_tensors:
             further["source"] = partial(_make_source, task, first, scaled_env.reward_scale)
         model = task.make_model(scaled_env, period, callback.scaling, **further)
@@ -253,11 +238,7 @@ class Trainer:
 
 
 def _make_source(
-    task: TrainingTask,
-    first: int,
-    reward_scale: RewardScale,
-    device: str | torch.device,
-    compile: bool,
+    task: TrainingTask, first: int, reward_scale: RewardScale, device: Any, compile: bool
 ) -> "TrainingSource":
     """Make a task's environments on tensors, whose rows have seeds from the first one on."""
     from ...envs.device import make_device_env
@@ -301,8 +282,7 @@ def _collect_observations(
     base: Any = env.unwrapped
     period = base.control_period * base.dt
     decay = math.exp(-period / correlation_time) if correlation_time else 0.0
-    rng, observations = np.random.default_rng(seed), []
-    noise = np.zeros(env.action_space.shape or ())
+    rng, observations, noise = np.random.default_rng(seed), [], np.zeros(base.action_space.shape)
     env.reset(seed=seed)
     for step in range(round(_DURATION / period)):
         noise = decay * noise + (1.0 - decay**2) ** 0.5 * rng.standard_normal(noise.shape)
@@ -327,8 +307,7 @@ def _measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) ->
         for i in np.flatnonzero(start).tolist():
             scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
             costs[i] = lengths[i] = 0.0
-    open_scales = lengths / (costs + COST_FLOOR)
-    for car_scales, open_scale in zip(scales, open_scales, strict=True):
+    for car_scales, open_scale in zip(scales, lengths / (costs + COST_FLOOR), strict=True):
         car_scales.append(float(np.median(car_scales or [open_scale])))
     return scales
 

@@ -26,14 +26,7 @@ from ..learned.network import Network
 from ..learned.policy import Policy
 from ..rollout import iterate_steps
 from ..vec_env import Observations, get_scales, scale_layout
-from .config import (
-    WARM_START_ENTRY,
-    WARM_START_TRACES_ENTRY,
-    Settings,
-    TrainingTask,
-    get_algorithm,
-    read_settings,
-)
+from .config import Settings, TrainingTask, get_algorithm, read_settings
 from .export import check_zip, load_normaliser
 from .normalise import StandardisedArguments, read_normalisation
 from .student import SAMPLE_STRIDE, compute_whitening
@@ -45,6 +38,8 @@ with require_extra("train", "training needs {}"):
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+WARM_START_ENTRY = "begun"  # the entry of training a policy further
+WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _MIN_VARIANCE = 1e-4  # least variance of a mixture of memory features, for `compute_whitening`
 
@@ -110,10 +105,9 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     known = [["gru"]] if on_tensors else [[], [MovingAverages.kind]]
     if architecture not in [("linear", 1, option) for option in known]:
         needed = "a GRU" if on_tensors else "nothing or traces"
-        raise ValueError(
-            f"{algo} goes on from dense layers without tanh at their end, {needed} before them and "
-            f"no older frames; (output, history, cells) of {policy.name} are {architecture}"
-        )
+        text = f"dense layers without tanh at their end, {needed} before them and no older frames"
+        form = f"(output, history, cells) of {policy.name} are {architecture}"
+        raise ValueError(f"{algo} goes on from {text}; {form}")
     if on_tensors and network.activation != "silu":
         raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
     if on_tensors:
@@ -138,22 +132,14 @@ class WarmStart:
         agent: Path of the zip, or policy.
         task: Task of the training.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
-
-    Attributes:
-        policy: The policy, None for a zip.
-        driver: Agent that drives as the policy does, None for a zip.
-        env: Vector env of the task's evaluations, with the model's observation.
-        scaling: Scaling of the model's observations.
-
-    Raises:
-        PermissionError: There is such a pickle and no trust.
-        ValueError: The zip cannot be read, or the task trains no such policy.
     """
+
+    scaling: StandardisedArguments  # of the model's observations
 
     def __init__(self, agent: str | Path | Policy, task: TrainingTask, trust: bool = False) -> None:
         self.policy = agent if isinstance(agent, Policy) else None
-        self.driver: _NetworkAgent | None = None
-        self.env = task.vector_env(task.n_eval_envs)
+        self.driver: _NetworkAgent | None = None  # that drives as the policy does
+        self.env = task.vector_env(task.n_eval_envs)  # with the model's observation
         self._whitening: tuple[Array, Array] | None = None
         self._variables: dict[str, Any] = {}  # a zip's tensors of no module
         if isinstance(agent, Policy):
@@ -171,15 +157,11 @@ class WarmStart:
         except Exception as error:  # torch raises many for one that is cut short
             raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
         inner = [name for name in policy if "features_extractor." in name]
-        buffers = {name.rpartition(".")[2]: policy[name] for name in inner}
+        buffers = {name.rpartition(".")[2]: policy[name].tolist() for name in inner}
         if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
-            bound, mixing = float(buffers["clip"]), buffers.get("mixing")
-            self.scaling = StandardisedArguments(
-                buffers["mean"].tolist(),
-                buffers["scale"].tolist(),
-                bound if bound < math.inf else None,
-                None if mixing is None else mixing.tolist(),
-            )
+            clip = buffers["clip"] if buffers["clip"] < math.inf else None
+            numbers = buffers["mean"], buffers["scale"], clip, buffers.get("mixing")
+            self.scaling = StandardisedArguments(*numbers)
             return
         width = (self.env.single_observation_space.shape or (0,))[0]
         mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
@@ -193,13 +175,13 @@ class WarmStart:
         network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
         names = [entry.name for entry in get_layout(self.env)]
         if policy_entries != names:
-            known, available = ", ".join(policy_entries), ", ".join(names)
-            raise ValueError(f"{policy.name} reads {known}; here there is {available}")
+            known, here = ", ".join(policy_entries), ", ".join(names)
+            raise ValueError(f"{policy.name} reads {known}; here there is {here}")
         form, on_tensors = _get_policy_form(policy, task.algo), task.algorithm.on_tensors
         policy_kwargs = task.settings.get("policy_kwargs", {})
         if policy_kwargs != policy_kwargs | form:
-            contrast = f"{form}, and the settings say {policy_kwargs}"
-            raise ValueError(f"{policy.name} is a network of {contrast}")
+            text = f"{policy.name} is a network of {form}"
+            raise ValueError(f"{text}, and the settings say {policy_kwargs}")
         if network.cells and not on_tensors:
             self._whitening = _measure_whitening(self.env, network, task.scaling_seed)
             self.env = self.wrap_env(self.env)
@@ -219,8 +201,8 @@ class WarmStart:
         tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
         self._name, self._parameters = policy.name, {"policy": tensors}
         self.driver = _NetworkAgent(network)
-        scaling = network.mean.tolist(), network.scale.tolist(), network.clip
-        self.scaling = StandardisedArguments(*scaling)
+        numbers = network.mean.tolist(), network.scale.tolist(), network.clip
+        self.scaling = StandardisedArguments(*numbers)
 
     def wrap_env(self, env: CarVectorEnv) -> CarVectorEnv:
         """Wrap a vector env so that it has the model's observation.
@@ -253,13 +235,10 @@ class WarmStart:
         return replace(self.policy.network, **{name: getattr(plain, name) for name in names})
 
     def load(self, model: "BaseAlgorithm") -> None:
-        """Load the tensors into a model; of a policy those of the actor alone.
+        """Load the tensors, of a policy the actor's; ValueError where the model has other ones.
 
         Args:
             model: Model of stable-baselines3.
-
-        Raises:
-            ValueError: The tensors are of another network.
         """
         policy = dict(model.get_parameters()["policy"])
         if self.policy is None:  # a zip from elsewhere has its features extractor outside
@@ -271,10 +250,9 @@ class WarmStart:
             for name, tensor in self._variables.items():
                 getattr(model, name).data.copy_(tensor)
         except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-            raise ValueError(
-                f"{self._name} holds other networks than this training's {type(model).__name__} "
-                f"(its settings say which): {' '.join(str(error).split())[:300]}"
-            ) from error
+            text = f"{self._name} holds other networks than this training's {type(model).__name__}"
+            reason = " ".join(str(error).split())[:300]
+            raise ValueError(f"{text} (its settings say which): {reason}") from error
 
 
 def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
@@ -290,16 +268,12 @@ class _NetworkAgent:
         self.network = network
 
     def predict(
-        self,
-        observation: Observations,
-        state: Array | None = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
+        self, observation: Observations, state: Array | None = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Observations, Array]:
+    ) -> tuple[Observations, Array]:  # fmt: skip
         """Compute actions within [-1, 1] and the next memory, as stable-baselines3 does."""
-        memory = (
-            np.zeros((len(observation), self.network.memory)) if state is None else state.copy()
-        )
+        shape = len(observation), self.network.memory
+        memory = np.zeros(shape) if state is None else state.copy()
         if episode_start is not None:
             memory[np.asarray(episode_start, np.bool_)] = 0.0
         actions = self.network(np.asarray(observation, np.float64), memory)
@@ -311,8 +285,7 @@ class _MemoryObservation(
 ):
     """A vector env whose observations (N, k) are the inputs of a network's dense layers.
 
-    The inner env, with the network's observation, resets a row in the step that ends it. Of
-    `whitening` the first, shape (k,), is subtracted; the second multiplies, shape (k, k).
+    Of `whitening` the first, shape (k,), is subtracted; the second multiplies, shape (k, k).
     """
 
     transparent = True  # its layout says how it changes the observation

@@ -17,8 +17,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 
 from ...agents import make_agent
-from ...agents.controllers.two_dof import CAMERA_PERIOD
-from ...agents.design.pi import PLACEMENTS, POLE, design_pi
+from ...agents.controllers.two_dof import CAMERA_PERIOD, PLACEMENTS, POLE, design_pi
 from ...agents.rollout import rollout
 from ...envs.record import Array
 from ...envs.scenarios.draws import KMH

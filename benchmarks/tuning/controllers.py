@@ -17,8 +17,8 @@ import numpy as np
 
 from ... import __version__
 from ...agents.baselines import GRIP, STEER_WEIGHT, Options
+from ...agents.controllers.two_dof import POLE
 from ...agents.controllers.yaw_stability import BANDWIDTH
-from ...agents.design.pi import POLE
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import check_choice

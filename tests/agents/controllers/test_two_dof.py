@@ -10,8 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.two_dof import _compute_static_gain
-from sideslip.agents.design.pi import POLE, design_pi, sample_pi
+from sideslip.agents.controllers.two_dof import POLE, _compute_static_gain, _sample_pi, design_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import Bicycle, make_bicycle_model
 from sideslip.estimators import EstimateObservation
@@ -90,7 +89,7 @@ def test_sampled_poles_are_where_they_were_placed(
     """The loop with the moment held, its poles taken back to s = ln z / T."""
     model = make_bicycle_model(COMS, kmh * KMH)
     slow, fast = np.sort(-np.linalg.eigvals(model.A).real)
-    pi = sample_pi(COMS, kmh * KMH, period, POLE, placement)
+    pi = _sample_pi(COMS, kmh * KMH, period, POLE, placement)
     G, H = model.discretise(period)
     # states beta, gamma and the integral, which the moment takes before it grows
     closed = np.zeros((3, 3))
@@ -109,7 +108,7 @@ def test_sampled_poles_are_where_they_were_placed(
 
 def test_sampling_fast_gives_the_continuous_design() -> None:
     for placement in ("radius", "real"):
-        one = sample_pi(COMS, 25.0 * KMH, 1e-5, POLE, placement)
+        one = _sample_pi(COMS, 25.0 * KMH, 1e-5, POLE, placement)
         other = design_pi(COMS, 25.0 * KMH, POLE, placement)
         assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
 

@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.yaw_stability import (
+    BANDWIDTH,
     BicyclePlant,
     SlidingMode,
     _compute_surface_slope,
@@ -30,7 +31,7 @@ def env() -> Any:
 def test_escs_sampled_loop_is_stable_over_the_speeds(car: Any) -> None:
     """Moment held over a period and late by the motors; below the critical speed."""
     for speed in np.arange(2.0, min(40.0, 0.95 * critical_speed(car)), 1.0):
-        k_p, k_i = _compute_yaw_gains(car, float(speed))
+        k_p, k_i = _compute_yaw_gains(car, float(speed), BANDWIDTH)
         model = make_bicycle_model(car, float(speed))
         G, H = model.discretise(T)
         lag = np.exp(-T / car.motor_lag)

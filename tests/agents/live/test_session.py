@@ -123,7 +123,7 @@ def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
     recorder = Recorder(path, SETUP)
     for i in range(3 * controller.MAX_BATCHES + 7):
         recorder.take([bytes([i % 256])])
-    batches = [batch for block in Session(path).blocks for batch in block.batches]
+    batches = [batch for block in Session(path).blocks for batch in block[0]]
     assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]
     recorder.close()
-    assert sum(len(block.batches) for block in Session(path).blocks) == 307
+    assert sum(len(block[0]) for block in Session(path).blocks) == 307

@@ -25,13 +25,12 @@ from sideslip.agents.training.callbacks import (
 from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
-    WARM_START_ENTRY,
-    WARM_START_TRACES_ENTRY,
     TrainingTask,
     _check_settings,
     get_algorithm,
     read_settings,
 )
+from sideslip.agents.training.warm_start import WARM_START_ENTRY, WARM_START_TRACES_ENTRY
 
 SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
 ROLLOUT, VISION = 128, "sideslip/YawVision-v0"

@@ -7,7 +7,7 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.agents.design.pi import PLACEMENTS, POLE, design_pi
+from sideslip.agents.controllers.two_dof import PLACEMENTS, POLE, design_pi
 from sideslip.benchmarks.papers.tie_vision_control import (
     INTEGRALS,
     PRINTED,
