@@ -157,6 +157,10 @@ def make_oracle(
 
     Returns:
         The env and the agent.
+
+    Raises:
+        ValueError: The name is unknown.
+        TypeError: The options have another key.
     """
     check_choice("oracle", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})

@@ -133,6 +133,9 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
 
     Returns:
         Env with its wrappers.
+
+    Raises:
+        TypeError: An argument is missing or unknown.
     """
     try:
         return gym.make(env_id, **options)

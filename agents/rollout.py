@@ -57,6 +57,9 @@ def iterate_steps(
 
     Yields:
         The reset, then every step.
+
+    Raises:
+        TypeError: The agent has no `predict`.
     """
     if not (agent is None or hasattr(agent, "predict")):
         text = f"an agent has stable-baselines3's predict, got {type(agent).__name__}"
@@ -245,6 +248,9 @@ def rollout(
 
     Returns:
         Columns by name, their units, and the log.
+
+    Raises:
+        TypeError: A vector env, or an env of another package.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as new_env:

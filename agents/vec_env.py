@@ -333,6 +333,9 @@ def make_native_env(
 
     Returns:
         Vector env, wrapped if there is an estimator.
+
+    Raises:
+        ValueError: The id has no native vector env.
     """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry

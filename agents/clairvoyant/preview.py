@@ -105,6 +105,9 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
     Returns:
         Forecast from the manoeuvre's start to the episode's end.
+
+    Raises:
+        ValueError: The env is elsewhere in its episode.
     """
     n = base.control_period
     snapshot = base.get_state()

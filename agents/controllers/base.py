@@ -128,6 +128,9 @@ class Controller(ABC):
 
         Returns:
             Action in [-1, 1], shape (width,) or (N, width), and the next state.
+
+        Raises:
+            ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
         if obs.shape[-1] != self._n_entries or obs.ndim > 2:

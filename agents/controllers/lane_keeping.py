@@ -126,6 +126,9 @@ class LaneKeeping(Controller):
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
         haste: Weight of the steering command less the applied angle, as for `HASTE`.
+
+    Raises:
+        ValueError: The action does not steer, an entry is missing, or an option is out of range.
     """
 
     needs = Inputs._fields

@@ -107,6 +107,9 @@ class Lqr(Controller):
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
         knows_car: Whether the observation has each row's `TRUE_PARAMETERS`: gains are designed for
             that car, and commands corrected for its motors.
+
+    Raises:
+        ValueError: An entry is missing, or an option is out of range.
     """
 
     min_period = 1  # ticks, of the period that the gains are designed for

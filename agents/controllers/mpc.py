@@ -81,6 +81,10 @@ class Mpc(Lqr):
         status: Status of each row in the last call: "solved", "solved inaccurate" (ten times the
             tolerance of 1e-4 of full scale), or why there is no solution and the action is NaN.
         solve_time: Time of the solver for each row (s).
+
+    Raises:
+        ModuleNotFoundError: The extras `mpc` and `design` are not installed.
+        ValueError: An entry is missing, or an option is out of range.
     """
 
     def __init__(

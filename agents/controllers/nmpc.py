@@ -192,6 +192,9 @@ class Nmpc(Lqr):
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
         knows_car: Whether each row's car is in the observation, as for `Lqr`.
+
+    Raises:
+        ValueError: An entry is missing, an option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP

@@ -59,6 +59,9 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
 
     Returns:
         Gains k_p (N m/rad) and k_i (N m/(rad s)).
+
+    Raises:
+        ValueError: The placement is unknown, or the pole is not positive.
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
@@ -223,6 +226,9 @@ class TwoDof(Controller):
         sampled: Whether to place the poles of the sampled loop.
         grip: Grip limit, as for `Controller`.
         feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
+
+    Raises:
+        ValueError: A rate, placement or feedforward is unknown, or beta_hat is missing.
     """
 
     needs = Inputs._fields

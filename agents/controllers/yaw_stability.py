@@ -128,6 +128,9 @@ class Esc(Controller):
         slip: Bound of the sideslip angle (rad).
         stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
         grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     memory = 1
@@ -313,6 +316,9 @@ class ModelFollowing(Controller):
         bandwidth: K_beta and K_gamma (rad/s).
         rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
         grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
     """
 
     memory = len(ModelMemory._fields)

@@ -38,7 +38,11 @@ JsonMap = dict[str, Any]
 
 @dataclass(frozen=True)
 class Card:
-    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only."""
+    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
+
+    Raises:
+        ValueError: A value has another type, or one that JSON does not have.
+    """
 
     env_id: str  # id of the env
     observation: tuple[tuple[str, str], ...]  # (name, unit) of each entry that the network takes
@@ -204,6 +208,9 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         path: Path that ends in `.safetensors`.
         network: Network to write.
         card: Card of its training.
+
+    Raises:
+        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:

@@ -59,6 +59,9 @@ class OnboardController:
         env: `EstimateObservation` with sensors' clocks, nominal car, references; it is not driven.
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
+
+    Raises:
+        TypeError: The env is not an `EstimateObservation`.
     """
 
     def __init__(

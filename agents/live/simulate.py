@@ -136,6 +136,9 @@ def simulate(
 
     Returns:
         The episode, and the agent with its counts.
+
+    Raises:
+        ValueError: The control period is too long for lock-step.
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")

@@ -191,6 +191,10 @@ class Viewer(AbstractContextManager["Viewer"]):
         title: Title above the estimates.
         page: Host and port of the page, port 0 for any; None: no page.
         screen: Whether the terminal has a table.
+
+    Raises:
+        OSError: The port is in use.
+        ModuleNotFoundError: aiohttp is not installed.
     """
 
     def __init__(self, title: str, page: Address | None, screen: bool) -> None:

@@ -76,7 +76,11 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of a run, which may change when a training resumes."""
+    """The options of a run, which may change when a training resumes.
+
+    Raises:
+        ValueError: `eval_freq` is below 1, or the device is none of torch's.
+    """
 
     eval_freq: int = 250_000  # steps between two evaluations
     device: str = "cpu"  # torch's name of the device

@@ -87,6 +87,9 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
 
     Returns:
         Values by name.
+
+    Raises:
+        ValueError: The file is no such YAML, or has neither entry.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -149,7 +152,11 @@ def _make_schedule(name: str, value: object) -> LinearSchedule | float:
 
 @dataclass(frozen=True)
 class TrainingTask:
-    """The task of a training, which stays the same when the training resumes."""
+    """The task of a training, which stays the same when the training resumes.
+
+    Raises:
+        ValueError: A name is unknown, a number out of range, or fields contradict each other.
+    """
 
     env_id: str = "sideslip/YawVision-v1"  # of a native vector env
     algo: str = "ppo"  # name in `ALGORITHMS`

@@ -158,6 +158,9 @@ def distill(
 
     Returns:
         Policy of the last round: equal bits for equal arguments.
+
+    Raises:
+        ValueError: There is no task, or `auxiliary_weight` where the student sees everything.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")

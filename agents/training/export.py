@@ -228,6 +228,9 @@ def export_zip(
 
     Returns:
         Policy as it is in the file.
+
+    Raises:
+        ValueError: The target has another ending.
     """
     check_trusted(Path(path), trust)
     if Path(target).suffix != SUFFIX:

@@ -129,6 +129,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         policy_kwargs: Arguments of the policy.
         _init_setup_model: As in stable-baselines3.
         **options: Arguments of `BaseAlgorithm`, such as the seed of the weights.
+
+    Raises:
+        ValueError: `n_steps` is below 1.
     """
 
     policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3
@@ -170,6 +173,10 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
         Returns:
             The model itself.
+
+        Raises:
+            ValueError: There is no source.
+            FloatingPointError: The gradient is not finite; the message has the step.
         """
         if self.source is None:
             raise ValueError("AnalyticPolicyGradient drives cars on tensors: it needs their source")

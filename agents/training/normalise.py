@@ -93,6 +93,9 @@ def read_normalisation(
 
     Returns:
         Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
+
+    Raises:
+        ValueError: The normaliser is of observations of another size.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None

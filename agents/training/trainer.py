@@ -132,6 +132,10 @@ class Trainer:
     A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
     and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
     actions before weights change.
+
+    Raises:
+        ValueError: The folder holds another training, or arguments contradict each other.
+        ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
     """
 
     task: TrainingTask

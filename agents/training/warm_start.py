@@ -132,6 +132,10 @@ class WarmStart:
         agent: Path of the zip, or policy.
         task: Task of the training.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+    Raises:
+        PermissionError: There is such a pickle and no trust.
+        ValueError: The zip cannot be read, or the task trains no such policy.
     """
 
     scaling: StandardisedArguments  # of the model's observations

@@ -123,7 +123,11 @@ def _solve(case: _CalibrationCase) -> ClairvoyantEpisode:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The calibration of tasks; a stopped run goes on from the folder of finished cases."""
+    """The calibration of tasks; a stopped run goes on from the folder of finished cases.
+
+    Raises:
+        ValueError: There are fewer than two seeds, so that there is no interval.
+    """
 
     tasks: Sequence[ControlTask]
     folder: Path  # of finished cases
@@ -151,6 +155,9 @@ class Calibration:
 
         Returns:
             Record of each task.
+
+        Raises:
+            ModuleNotFoundError: CasADi or OSQP is not installed.
         """
         with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
             import casadi  # noqa: F401

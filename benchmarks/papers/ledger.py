@@ -155,6 +155,9 @@ class Claim:
         text: What is claimed.
         *parts: Numbers that show it.
         note: What was found, for the report.
+
+    Raises:
+        ValueError: There is no part.
     """
 
     def __init__(

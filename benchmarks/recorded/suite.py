@@ -42,7 +42,11 @@ _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(Emulation):
-    """How a drive is replayed; estimators assume the course noise of its `Emulation`."""
+    """How a drive is replayed; estimators assume the course noise of its `Emulation`.
+
+    Raises:
+        ValueError: A value out of range, or an unknown estimator.
+    """
 
     estimators: Sequence[str] | None = None  # in `ESTIMATORS`, None: all; gyro-only always runs
     q_beta: float = 1e-3  # process noise of sideslip (rad2/s)

@@ -39,6 +39,11 @@ def check_film(path: Path | None) -> None:
 
     Args:
         path: File, None for none.
+
+    Raises:
+        ValueError: The file has another ending.
+        OSError: The file cannot be written.
+        ModuleNotFoundError: The extra `render` is not installed.
     """
     if path is None:
         return

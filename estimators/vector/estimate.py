@@ -116,6 +116,10 @@ class EstimateObservation(VectorObservation):
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
+
+    Raises:
+        TypeError: It is not innermost, records are out of reach, or the estimator is one object.
+        ValueError: An output is unknown, names would stand twice, or there is no autoreset.
     """
 
     def __init__(

@@ -122,6 +122,9 @@ class VectorObservation(
 
         Returns:
             Observations and infos.
+
+        Raises:
+            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
         """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
@@ -148,6 +151,9 @@ class VectorObservation(
 
         Returns:
             Observations, rewards, terminations, truncations and infos.
+
+        Raises:
+            ResetNeeded: It is called before `reset`, or after a step that failed.
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:
