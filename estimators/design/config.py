@@ -52,6 +52,10 @@ class _Reader:
     def __init__(self, name: str, options: Mapping[str, object]) -> None:
         self.name, self._unread, self._known = name, dict(options), list[str]()
 
+    def is_unread(self, key: str) -> bool:
+        """Return whether an option was passed that is not read yet."""
+        return key in self._unread
+
     def add_defaults(self, defaults: Mapping[str, object]) -> None:
         """Add options that the caller left out."""
         self._unread = dict(defaults) | self._unread
@@ -294,7 +298,7 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         if name in WANDER:
             key = f"{name}_time"
             times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
-            if times[name] > 0.0 and f"q_{name}" in reader:
+            if times[name] > 0.0 and reader.is_unread(f"q_{name}"):
                 text = f"q_{name} is not used beside {key}, {times[name]:g} s, and {name}_sd"
                 raise ValueError(f"{reader.name}: {text}")
     return {"fast": fast, "bias_sds": biases, "bias_times": times}

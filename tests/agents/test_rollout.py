@@ -109,10 +109,12 @@ def test_a_wrapper_that_changes_numbers_takes_their_names_and_leaves_the_cost() 
         return gym.make("sideslip/YawFusion-v0", scenario="coms-slalom")
 
     plain = sideslip.rollout(make(), None, seed=1)
-    scaled = sideslip.rollout(gym.wrappers.RescaleObservation(make(), -1, 1), None, seed=1)
+    scaled = sideslip.rollout(
+        gym.wrappers.RescaleObservation(make(), np.float32(-1), np.float32(1)), None, seed=1
+    )
     assert "obs_0" in scaled.units and "obs_beta_ref_mean" not in scaled.columns
     for wrap in (
-        lambda env: gym.wrappers.TransformReward(env, lambda reward: max(reward, -0.001)),
+        lambda env: gym.wrappers.TransformReward(env, lambda reward: max(float(reward), -0.001)),
         gym.wrappers.RecordEpisodeStatistics,
     ):
         assert sideslip.rollout(wrap(make()), None, seed=1).cost == plain.cost
