@@ -90,7 +90,9 @@ class _EachRow(Generic[T]):
     def __init__(self, read: Callable[[Episode], T]) -> None:
         self._read = read
 
-    def __get__(self, env: "StabilityVectorEnv", kind: type | None = None) -> Sequence[T]:
+    def __get__(self, env: "StabilityVectorEnv | None", kind: type | None = None) -> Sequence[T]:
+        if env is None:  # asked of the class
+            return self  # type: ignore[return-value]
         return _LazyRows(env.num_envs, lambda i: self._read(env._get_episode(i)))
 
 

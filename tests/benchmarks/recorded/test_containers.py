@@ -391,18 +391,6 @@ def test_a_trace_of_two_buses_or_clocks_is_refused(
         read_parts(path, {**COLUMNS, "dbc": str(tmp_path / "car.dbc")})
 
 
-def test_a_value_that_is_not_available_is_no_measurement(tmp_path: Path) -> None:
-    def lose(i: int, frame: Any) -> None:
-        if frame.arbitration_id == 256 and 400 <= i < 410:
-            frame.data[2:4] = b"\xff\x7f"
-
-    path = write_frames(tmp_path / "drive.log", lose)
-    dbc = write_dbc(tmp_path, DBC + 'VAL_ 256 YawRate 32767 "SNA" ;\n')
-    (log,), remarks = read_parts(path, {**COLUMNS, "dbc": str(dbc)})
-    assert np.abs(log.record.fast[:, FAST.gyro]).max() < 3.9
-    assert any("not available are left out" in text for text in remarks)
-
-
 def test_a_message_names_one_of_two_signals(tmp_path: Path) -> None:
     """That it is ours by name, as its namesake is, is no matter then."""
     path = write_trace(tmp_path, "drive.blf")

@@ -116,7 +116,7 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # the true car
     (truth(["colour"]), ValueError, "no parameter 'colour'; it has: mass"),
     (truth([], ["mood"]), ValueError, "no true state 'mood'; there is: beta"),
-    (truth(["mass"], make=truth(["mass"])), ValueError, "true_mass would stand twice"),
+    (truth(["mass"], make=truth(["mass"])), ValueError, "two are stacked"),
     (truth([], ["beta"], make=wrap("exact-kf")), ValueError, "beta_hat would stand twice"),
     (truths(lambda: SyncVectorEnv([FUSED])), TypeError, "has no layout"),
     (truths(SAME_STEP, [], ["beta"]), ValueError, "true states need autoreset_mode"),

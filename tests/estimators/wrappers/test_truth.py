@@ -175,9 +175,3 @@ def test_beside_states_the_friction_is_the_present_one(num_envs: int | None) -> 
         idle = np.zeros(wrapped.action_space.shape or (1,), np.float32)
         seen = np.array([np.atleast_2d(wrapped.step(idle)[0])[:, column] for _ in range(40)])
         assert (seen[:18] == first).all() and seen[-1] == pytest.approx(factor * first)
-
-
-def test_two_are_not_stacked_for_they_would_calibrate_twice() -> None:
-    env = TruthObservation(gym.make("sideslip/YawFusion-v1"), ["mass"])
-    with pytest.raises(ValueError, match="two are stacked"):
-        TruthObservation(env, ["yaw_inertia"])
