@@ -124,7 +124,8 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         slow: By sensor ("camera", "gps"), fields of `SlowSensor` that replace the id's.
     """
 
-    dt = TICK  # s, the base tick
+    dt = TICK
+    """The base tick (s)."""
     _spec: EnvSpec | None = None
 
     def __init__(

@@ -95,6 +95,9 @@ class _EachRow(Generic[T]):
             return self  # type: ignore[return-value]
         return _LazyRows(env.num_envs, lambda i: self._read(env._get_episode(i)))
 
+    def __set__(self, env: "StabilityVectorEnv", value: object) -> None:
+        raise AttributeError("an attribute of the rows is read, not set")
+
 
 class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
@@ -137,7 +140,8 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
         ValueError: For an argument out of place; TypeError for one of another type.
     """
 
-    dt = TICK  # s, the base tick
+    dt = TICK
+    """The base tick (s)."""
     _spec: EnvSpec | None = None
 
     def __init__(
@@ -253,9 +257,16 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
 
     # what `StabilityEnv` has by these names, of each row's episode
     record = _EachRow(lambda episode: episode.record)
+    """Record of each row's last step."""
     scenario = _EachRow(lambda episode: episode.config.scenario)
+    """Scenario of each row's episode."""
     vehicle = _EachRow(lambda episode: episode.vehicle)
+    """True vehicle of each row's episode, with what its seed drew."""
     car_truth = _EachRow(lambda episode: episode.car_truth)
+    """What an oracle is told of each row's episode."""
     nominal = _EachRow(lambda episode: episode.config.nominal)
+    """Vehicle that estimators and controllers of each row are designed from."""
     held_speed = _EachRow(lambda episode: episode.config.held_speed)
+    """Speed (m/s) of each row that is held exactly (small-angle plant), or None."""
     slow_sensors = _EachRow(lambda episode: episode.slow_sensors)
+    """Slow sensors of each row, with the clock phases that its episode drew."""

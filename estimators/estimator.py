@@ -190,7 +190,7 @@ class Estimator:
         """Reset what a subclass has beside `filters`."""
 
     def step(self, fast: Array, packets: Array) -> None:
-        """Process fast rows and packets, which follow the last ones taken; else ValueError.
+        """Process fast rows and packets, which follow the last ones taken.
 
         Args:
             fast: Fast rows, shape (k, FAST_WIDTH).

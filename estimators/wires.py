@@ -78,9 +78,6 @@ def read_wires(source: VehicleSource | None) -> SignalCalibration:
 
     Returns:
         The calibration; the error of a value out of place has the file's name.
-
-    Raises:
-        type: The error of a value out of place, with the file's name.
     """
     if source is None or source == "identify" or not is_document(source):
         return SignalCalibration()

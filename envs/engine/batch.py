@@ -29,9 +29,9 @@ from .window import make_window, overwrite_steering, precompute_lane_window
 
 IntArray = npt.NDArray[np.int64]
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
+_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 # How many parameters ticks read, and how many numbers of the state they change besides the driver's
 # angle: in an ideal world, and in one with errors.
-_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 _TICK_PARAMS = (P.errors[0], P.slow[0].period)
 _TICK_STATE = (Z.errors[0], Z.slow[0].frames)
 

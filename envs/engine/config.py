@@ -189,9 +189,8 @@ def _apply_scenario_clocks(
 
 
 def _replace_parameters(car: Vehicle, changes: Mapping[str, float], tier: str) -> Vehicle:
-    """Replace parameters by a scenario's; a scored one's yield to what a car states itself."""
-    fields = (x for x in dataclasses.fields(car) if tier and x.default is not dataclasses.MISSING)
-    stated = {x.name for x in fields if x.default != getattr(car, x.name)}
+    """Replace parameters by a scenario's; what a tier assumes yields to what a car states."""
+    stated = {x for x in ("motor_power", "transfer_height") if tier and getattr(car, x) > 0.0}
     return car.replace(**{name: value for name, value in changes.items() if name not in stated})
 
 
@@ -245,7 +244,11 @@ class EnvConfig:
     lead_in: float = 0.0  # s
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "slow_changes", copy.deepcopy(self.slow_changes))
+        copied = {
+            name: copy.deepcopy(dict(x)) if isinstance(x, Mapping) else x
+            for name, x in self.slow_changes.items()
+        }
+        object.__setattr__(self, "slow_changes", copied)
         check_choice("sensors", self.sensors, SENSOR_SETS)
         if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
             names = [entry.name for entry in dataclasses.fields(self)]

@@ -38,7 +38,9 @@ _LONGEST_STEP_BACK = 0.25  # s, by which frames of a bus may come out of order
 _LONGEST_LATENCY = 5.0  # s; beyond it a bag's log has another clock than its headers
 DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
 _NO_VALUE = re.compile(
-    r"\b(sna|n/?a|err(or)?|fault|init)\b|(un|not ?)avail|invalid|not.?valid", re.I
+    r"(?<!no[ _-])(?<![a-z])(sna|n/?a|err(or)?|fault|init)(?![a-z])|(un|not[ _-]?)avail|"
+    r"invalid|not.?valid",
+    re.I,
 )
 _ARITHMETIC = re.compile(
     r"(?:[\d\s.+\-*/^(),]|\bX1?\b|(?<=\d)e|\b(?:sin|cos|tan|exp|log|sqrt|abs)\b)*", re.I

@@ -197,10 +197,10 @@ def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: boo
     is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
     if not (is_merged or (is_shuffled and not is_strict)):
         return []
-    for name in set(needed) - {"time"} if is_merged else ():
+    for name in [x for x in needed if x != "time"] if is_merged else ():
         rows = np.flatnonzero(np.isfinite(values[name]))
         steps = np.diff(time[rows])
-        if 0 < np.count_nonzero(steps < -_WRAP) <= 0.001 * len(steps):
+        if 0 < np.count_nonzero(steps < -_WRAP) <= max(1.0, 0.001 * len(steps)):
             row = int(rows[np.argmin(steps) + 1])
             raise ValueError(
                 f"time steps back by {-steps.min():.6g} s at row {row + 1}, within {name}: the "

@@ -39,9 +39,6 @@ def compute_error_bound(
 
     Returns:
         Standard deviation (rad), shape (K,).
-
-    Raises:
-        ValueError: There are latencies, and the model varies with time.
     """
     prior = dict.fromkeys(select_states(tuple(sensors)), 0.0)
     options = {"slow": list(sensors), "prior": prior} | options

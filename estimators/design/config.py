@@ -50,11 +50,8 @@ class _Reader:
     """Keyword arguments of a filter by name; `check_unread` refuses those that were not read."""
 
     def __init__(self, name: str, options: Mapping[str, object]) -> None:
-        self.name, self._unread, self._known = name, dict(options), list[str]()
-
-    def is_unread(self, key: str) -> bool:
-        """Return whether an option was passed that is not read yet."""
-        return key in self._unread
+        self.name, self.passed, self._known = name, frozenset(options), list[str]()
+        self._unread = dict(options)
 
     def add_defaults(self, defaults: Mapping[str, object]) -> None:
         """Add options that the caller left out."""
@@ -298,7 +295,7 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         if name in WANDER:
             key = f"{name}_time"
             times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
-            if times[name] > 0.0 and reader.is_unread(f"q_{name}"):
+            if times[name] > 0.0 and f"q_{name}" in reader.passed:
                 text = f"q_{name} is not used beside {key}, {times[name]:g} s, and {name}_sd"
                 raise ValueError(f"{reader.name}: {text}")
     return {"fast": fast, "bias_sds": biases, "bias_times": times}

@@ -20,8 +20,8 @@ from ..wrappers.truth import (
     STIFFNESSES,
     TruthEntries,
     calibrate,
-    check_single,
     choose_vehicle,
+    refuse_stacked,
     set_stiffness,
 )
 from ..wrappers.truth import TruthObservation as SingleTruth
@@ -304,7 +304,7 @@ class TruthObservation(VectorObservation):
     ) -> None:
         recorded = {"parameters": list(parameters), "states": list(states)}
         super().__init__(env, SingleTruth, recorded)
-        check_single(env, type(self))
+        refuse_stacked(env, type(self))
         if not hasattr(env, "layout"):
             text = f"{type(env).__name__} has no layout; wrap it in"
             raise TypeError(f"{text} sideslip.estimators.vector.EstimateObservation first")

@@ -114,7 +114,7 @@ class VectorObservation(
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows, or those of options["reset_mask"], else ResetNeeded: all come first.
+        """Reset the rows, or those of options["reset_mask"].
 
         Args:
             seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.

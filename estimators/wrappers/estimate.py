@@ -346,10 +346,17 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
 
         Args:
             snapshot: Result of `get_state`.
+
+        Raises:
+            ValueError: The snapshot is of an env with other step limits.
         """
+        limits, steps = self._find_step_limits(), snapshot.get("steps", [])
+        if len(limits) != len(steps):
+            has = f"the snapshot has {len(steps)} step limits"
+            raise ValueError(f"{has}, this env {len(limits)}")
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
-        for limit, steps in zip(self._find_step_limits(), snapshot["steps"], strict=True):
-            limit._elapsed_steps = steps
+        for limit, elapsed in zip(limits, steps, strict=True):
+            limit._elapsed_steps = elapsed
         self._update_estimator().set_state(snapshot["estimator"])
 
     def _find_step_limits(self) -> list[gym.wrappers.TimeLimit[Any, Any]]:

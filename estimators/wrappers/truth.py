@@ -164,7 +164,7 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
-def check_single(env: Any, kind: type) -> None:
+def refuse_stacked(env: Any, kind: type) -> None:
     """Raise ValueError where a wrapper of a kind is inside: readings would be calibrated twice.
 
     Args:
@@ -205,7 +205,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     ) -> None:
         RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         gym.Wrapper.__init__(self, env)
-        check_single(env, type(self))
+        refuse_stacked(env, type(self))
         self._entries = TruthEntries(parameters, states, env.get_wrapper_attr("layout"))
         self.layout = self._entries.layout
         self.observation_space = make_space(self.layout)

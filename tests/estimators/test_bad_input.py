@@ -35,6 +35,7 @@ SHORT = type(FIG7)(duration=0.3)
         ("multirate-kf", {"slow": "radar"}, ValueError, "multirate-kf can use camera or gps"),
         ("dakf", {"slow": "camera"}, ValueError, "dakf can use gps"),
         ("bicycle-kf", {"slow": "gps"}, ValueError, "bicycle-kf uses no slow sensor"),
+        ("joint", {"q_bias": 1.0, "bias_time": 30.0}, ValueError, "q_bias is not used beside"),
         ("joint", {"q_bank": 1.0}, ValueError, "q_bank is not used beside bank_time, 14 s"),
         ("bicycle-kf", {"q_psi": 1.0}, TypeError, "bicycle-kf: unknown option 'q_psi'"),
         (

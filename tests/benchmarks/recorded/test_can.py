@@ -17,7 +17,7 @@ def test_a_value_that_is_not_available_is_no_measurement(tmp_path: Path) -> None
             frame.data[2:4] = b"\xff\x7f"
 
     path = bus.write_frames(tmp_path / "drive.log", lose)
-    dbc = bus.write_dbc(tmp_path, bus.DBC + 'VAL_ 256 YawRate 32767 "SNA" ;\n')
+    dbc = bus.write_dbc(tmp_path, bus.DBC + 'VAL_ 256 YawRate 32767 "Signal_Not_Available" ;\n')
     (log,), remarks = read_parts(path, {**bus.COLUMNS, "dbc": str(dbc)})
     assert np.abs(log.record.fast[:, FAST.gyro]).max() < 3.9
     assert any("not available are left out" in text for text in remarks)
