@@ -236,18 +236,6 @@ def _iterate_wrappers(env: Any) -> Iterator[Any]:
         yield from _iterate_wrappers(child)
 
 
-def has_foreign_wrapper(env: Any) -> bool:
-    """Check whether a wrapper may change observations or actions.
-
-    Args:
-        env: Env with its wrappers.
-
-    Returns:
-        True if one is not known, or declared, to be transparent.
-    """
-    return not all(map(_is_transparent, _iterate_wrappers(env)))
-
-
 def _is_transparent(wrapper: Any) -> bool:
     """Return whether a wrapper is known, or declared, to keep observations and actions."""
     if "transparent" in vars(wrapper):

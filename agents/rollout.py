@@ -17,9 +17,11 @@ from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
 from ..envs.numerics.primitives import Scalar
 from ..envs.record import Array, Log, concatenate
+from ..envs.task import make_space
 from ..envs.validation import short_repr
 from ..envs.vehicle.parameters import Vehicle
-from .env_info import CarEnv, CarVectorEnv, has_foreign_wrapper
+from .controllers.base import NoControl
+from .env_info import CarEnv, CarVectorEnv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,14 +82,15 @@ def iterate_steps(
 
 def _check_full_scale(env: CarEnv | CarVectorEnv, agent: Any) -> None:
     """Raise ValueError for an agent whose actions have another full scale than the car."""
-    designed, car = getattr(agent, "full_scale", None), getattr(env.unwrapped, "vehicle", None)
-    if not (isinstance(designed, float) and isinstance(car, Vehicle)):
+    designed, cars = getattr(agent, "full_scale", None), getattr(env.unwrapped, "vehicle", ())
+    if not isinstance(designed, float) or isinstance(agent, NoControl):
         return
-    if not math.isclose(designed, car.yaw_moment_limit, rel_tol=1e-9):
-        raise ValueError(
-            f"the agent's full scale is {designed:g} N m, the car's {car.yaw_moment_limit:g}: "
-            "make the agent for an env that has this vehicle from the start"
-        )
+    for car in [cars] if isinstance(cars, Vehicle) else cars:
+        if not math.isclose(designed, car.yaw_moment_limit, rel_tol=1e-9):
+            raise ValueError(
+                f"the agent's full scale is {designed:g} N m, the car's {car.yaw_moment_limit:g}: "
+                "make the agent for an env that has this vehicle from the start"
+            )
 
 
 def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tuple[Array, Array]:
@@ -128,6 +131,7 @@ _INFO_UNITS = {
 }
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")  # states in a log, as estimators' are
 _DEGREES = 180.0 / np.pi
+_NUMBER = Real | np.number | np.bool_
 _ESTIMATE_COLOUR = "#56B4E9"
 _STYLES: dict[str, dict[str, Any]] = {  # by the curve's label; others are of what is true
     "estimate, 1 std": {"color": _ESTIMATE_COLOUR, "lw": 1.0},
@@ -265,13 +269,16 @@ def rollout(
         info = step.info | {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
         info["y_l"] = motion.y + base.vehicle.preview * (motion.psi - motion.theta)
         info |= {"X": motion.X, "Y": motion.Y}  # y_l: tie-vision (4)
-        info = {x: value for x, value in info.items() if isinstance(value, Real | np.number)}
+        info = {
+            x: value for x, value in info.items() if isinstance(value, Real | np.number | np.bool_)
+        }
         info.pop("is_success", None)
-        rows.append([*map(float, (*info.values(), step.reward, *step.action, *step.obs))])
+        rows.append([*map(float, (*info.values(), step.reward, *step.action, *np.ravel(step.obs)))])
         records.append(base.record)
     names, width = [*info, "reward"], len(step.action)
     names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
-    has_layout = not has_foreign_wrapper(env)  # else entries have no name and no unit
+    # a wrapper may change the observation: its entries have no name and no unit
+    has_layout = env.observation_space == make_space(layout)
     entries = {f"obs_{entry.name}": entry.unit for entry in layout} if has_layout else {}
     names += list(entries) or [f"obs_{i}" for i in range(step.obs.size)]
     # wrappers may put a prefix before beta's estimates in `info`

@@ -140,7 +140,7 @@ def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     chosen = {name: options[name] for name in ("scenario", "vehicle", "control_period")}
     env_options = {name: value for name, value in chosen.items() if value is not None}
     more = parse_options(options["option"])
-    if twice := sorted(env_options.keys() & more.keys()):
+    if twice := sorted((env_options.keys() - {"control_period"}) & more.keys()):
         raise ValueError(f"{twice[0]} is there twice, as a flag and as --option")
     return {
         **{name: options[name] for name in ("estimator", "agent", "env")},

@@ -237,7 +237,6 @@ def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
         metrics["share_won"] = stats.compute_win_rate(*np.concatenate(costs, axis=1))
     all_costs = np.concatenate([pair.costs[0] for pair in pairs])
     return metrics | {"worst_cost": stats.compute_tail_mean(all_costs)}
-    return metrics
 
 
 def rank_entries(results: Results, tier: str | None) -> list[Standing]:
