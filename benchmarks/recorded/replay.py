@@ -14,6 +14,7 @@ import numpy as np
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
+from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.wires import SignalCalibration, apply_wires
@@ -130,6 +131,8 @@ def replay_file(
     Raises:
         ValueError: A drive has `until` without "identify", or the readers or `replay` refuse it.
     """
+    if is_nmea(log):
+        raise ValueError(f"{log}: a receiver's log (NMEA); replay_nmea reads it")
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
     wires, tables, unknown = wires or SignalCalibration(), [], ""
@@ -153,11 +156,13 @@ def replay_file(
     settings = {"noise": wires.noise} | settings
     settings["emulated"] = not any(part.slow for part in logs)
     present = {name for part in logs for name in part.slow}
-    for name in ("course_rate", "delay", "bias_deg") if present else ():
+    is_emulated = not present and any("beta" in part.truth for part in logs)
+    for name in () if is_emulated else ("course_rate", "delay", "bias_deg"):
         if settings.get(name, getattr(Settings, name)) != getattr(Settings, name):
-            raise ValueError(f"{name} is of an emulated course; the log has slow sensors itself")
-    if absent := sorted({"camera", "gps"} & wires.latency.keys() - present):
-        remarks.append(f"The latency of {absent[0]} is not used: the log has no such sensor.")
+            has = "the log has slow sensors itself" if present else "no true angle makes one"
+            raise ValueError(f"{name} is of an emulated course, got {settings[name]}; {has}")
+    for name in sorted({"camera", "gps"} & wires.latency.keys() - present):
+        remarks.append(f"The latency of {name} is not used: the log has no such sensor.")
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suites = [replay(part, design, **settings) for part in parts]
     times = [part.time[-1] - part.time[0] for part in parts]

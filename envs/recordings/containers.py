@@ -226,6 +226,7 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
     short = [name.partition(".")[2] for name in names]
     messages: dict[tuple[int, bool], tuple[Any, dict[str, str]]] = {}
     channels, units = dict[str, _Channel](), dict[str, str]()
+    absent: dict[str, set[Any]] = {}  # values that say there is none, by label
     named = {name.partition(".")[2] for name in names if is_wanted(name)}  # MESSAGE.SIGNAL decides
     for message in database.messages:
         wanted = {}
@@ -239,6 +240,10 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
                     both = [x for x in names if x.endswith(f".{label}")]
                     raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
             wanted[signal.name], channels[label] = label, _Channel()
+            choices: Mapping[int, object] = signal.choices or {}
+            raws = [raw for raw, text in choices.items() if _NO_VALUE.search(str(text))]
+            scale = signal.conversion.raw_to_scaled
+            absent[label] = {scale(raw, decode_choices=False) for raw in raws}
             units[label] = find_unit(signal.unit or "")
         if wanted:
             messages[message.frame_id, message.is_extended_frame] = message, wanted
@@ -256,7 +261,6 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
             message, wanted = messages[key]
             buses.setdefault(key, set()).add(frame.channel)
             try:
-                raw = message.decode(bytes(frame.data), decode_choices=False, scaling=False)
                 decoded = message.decode(bytes(frame.data), decode_choices=False)
             except DecodeError:
                 decoded = {}
@@ -264,8 +268,7 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
                 n_short += 1
                 continue
             for name, label in wanted.items():
-                choices = message.get_signal_by_name(name).choices or {}
-                if name in decoded and _NO_VALUE.search(str(choices.get(raw[name], ""))):
+                if name in decoded and decoded[name] in absent[label]:
                     n_absent += 1
                 elif name in decoded:  # a multiplexed one is not in every frame
                     channels[label].stamps.append(frame.timestamp)
