@@ -128,7 +128,8 @@ def predict_covariance(f: FilterRecord) -> None:
             b = load8(Q, i + 1, j) + load8(FP, i + 1, j) * factor
             c = load8(Q, i + 2, j) + load8(FP, i + 2, j) * factor
             d = load8(Q, i + 3, j) + load8(FP, i + 3, j) * factor
-            a, b, c, d = _multiply_rows(FP, i, GT, n, j, a, b, c, d)
+            if j < dense:  # the columns behind have decays alone
+                a, b, c, d = _multiply_rows(FP, i, GT, n, j, a, b, c, d)
             store8(P, a, i, j)
             if i + 1 < dense:
                 store8(P, b, i + 1, j)

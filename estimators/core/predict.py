@@ -218,7 +218,7 @@ def _apply_transition(f: FilterRecord, v: Vector) -> None:
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
         total = load8(f.own_decay, j) * load8(v, j)
-        for k in range(n):
+        for k in range(n if j < f.dense else 0):  # the states behind decay by themselves
             total = total + load_element(v, k) * load8(f.GT, k, j)
         store8(new, total, 0, j)
     for j in range(0, n, step):
