@@ -162,8 +162,10 @@ def _fetch(f: FilterRecord, template: FilterRecord) -> None:
     for j in range(0, template.n, 8):
         for i in range(template.n):
             prefetch(f.Q, i, j)
-            prefetch(f.G, i, j)
-            prefetch(f.GT, i, j)
+            if i < template.dense:
+                prefetch(f.G, i, j)
+            if j < template.dense:
+                prefetch(f.GT, i, j)
 
 
 @jit
