@@ -236,10 +236,10 @@ def _iterate_wrappers(env: Any) -> Iterator[Any]:
         yield from _iterate_wrappers(child)
 
 
-def _is_transparent(wrapper: Any) -> bool:
+def _is_transparent(wrapper: object) -> bool:
     """Return whether a wrapper is known, or declared, to keep observations and actions."""
     if "transparent" in vars(wrapper):
-        return wrapper.transparent is True
+        return vars(wrapper)["transparent"] is True
     for base_class in type(wrapper).__mro__:
         if "transparent" in vars(base_class):
             return vars(base_class)["transparent"] is True

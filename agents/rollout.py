@@ -17,7 +17,7 @@ from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
 from ..envs.numerics.primitives import Scalar
 from ..envs.record import Array, Log, concatenate
-from ..envs.task import make_space
+from ..envs.task import Infos, make_space
 from ..envs.validation import short_repr
 from ..envs.vehicle.parameters import Vehicle
 from .env_info import CarEnv, CarVectorEnv
@@ -36,7 +36,7 @@ class EpisodeStep(NamedTuple):
     """
 
     obs: Any  # (k,) or (N, k)
-    info: dict[str, Any]
+    info: Infos
     action: Any  # before this outcome, (width,) or (N, width)
     reward: Scalar  # of the row or (N,)
     terminated: bool | npt.NDArray[np.bool_]  # whether the episode ended by itself

@@ -16,6 +16,9 @@ from .ticks import TICK
 from .vehicle.actuators import apply_lag
 from .vehicle.parameters import GRAVITY, Vehicle
 
+Infos = dict[str, Any]
+"""An env's `info`, or a vector env's `infos`."""
+
 REFERENCES = ("zero-slip", "model", "limited", "lagged")
 ZERO_SLIP, MODEL, LIMITED, LAGGED = range(len(REFERENCES))
 
@@ -205,11 +208,11 @@ REPORT = StepReport()
 
 _NUMBERS = REPORT._fields[: REPORT.failure]  # first keys of `info`, all floats
 _KEYS = (*_NUMBERS, "failure", "is_success")
-_RUNNING: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "is_success": False}
+_RUNNING: Infos = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "is_success": False}
 _MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
-def make_info(report: list[float]) -> dict[str, Any]:
+def make_info(report: list[float]) -> Infos:
     """Make `info` of a step or a reset.
 
     Args:
@@ -230,7 +233,7 @@ def make_info(report: list[float]) -> dict[str, Any]:
     return info
 
 
-def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
+def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> Infos:
     """Make the infos of some rows of a batch as Gymnasium's vector environments have them.
 
     Args:

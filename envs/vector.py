@@ -9,14 +9,14 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
 from .engine.batch import IntArray, NumbaEngine
-from .engine.batch_env import BatchEnv, Infos
+from .engine.batch_env import BatchEnv
 from .engine.config import EnvConfig
 from .engine.layout import Z
 from .engine.views import Episode, compute_true_states
 from .record import Array
 from .rendering.renderer import VectorRenderMixin
 from .stability import StabilityEnv
-from .task import REFUSED, WILD, make_infos
+from .task import REFUSED, WILD, Infos, make_infos
 from .ticks import TICK
 from .validation import Mask, check_int, parse_actions, warn_once
 

@@ -12,11 +12,17 @@ from typing import Any
 import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from .core.filter import advance, process_packet_all
+from .core.filter import (
+    NO_OUTPUTS,
+    FilterOutputs,
+    StepRecord,
+    advance,
+    process_packet_all,
+)
 from .core.record import FILTER, FilterRecords
 from .design.options import FAST_CHANNELS, FIND
 from .design.periodic import count_ticks
-from .estimator import EMPTY, NO_NIS, Estimator, TickOutputs, TickRecord, compile_filter_call
+from .estimator import Estimator, compile_filter_call
 from .protocol import compute_std
 
 _MAX_SEARCHED_LATENCY = 0.12  # s
@@ -126,8 +132,8 @@ class _LatencySearch:
         is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
         packets = np.ascontiguousarray(packets[is_past])
         nis = np.full(len(packets), np.nan)
-        record = fast, count, packets, len(packets), 0, EMPTY, EMPTY, nis
-        compile_filter_call(advance)(filters, gains, *record)
+        record = StepRecord(fast, count, packets, len(packets))
+        compile_filter_call(advance)(filters, gains, record, 0, NO_OUTPUTS._replace(nis=nis))
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
@@ -164,10 +170,15 @@ class LateEstimator(Estimator):
         return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
 
     def _receive(self, packet: Array) -> None:
-        self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
+        self.take(StepRecord(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1))
 
-    def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
-        """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS."""
+    def take(self, record: StepRecord, outputs: FilterOutputs = NO_OUTPUTS) -> None:
+        """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS.
+
+        Args:
+            record: Rows and packets.
+            outputs: Arrays to fill.
+        """
         (fast, rows, packets, count), (X, S, nis) = record, outputs
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
         self._waiting[:, _INDEX_COLUMN] = -1.0
@@ -210,8 +221,9 @@ class LateEstimator(Estimator):
         packets = np.ascontiguousarray(pending[:, :_INDEX_COLUMN])
         pending_nis = np.full(len(pending), np.nan)
         if len(fast):
-            record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
-            compile_filter_call(advance)(self.delayed_filters, self.gains, *record)
+            record = StepRecord(fast, len(fast), packets, len(packets))
+            outputs = NO_OUTPUTS._replace(nis=pending_nis)
+            compile_filter_call(advance)(self.delayed_filters, self.gains, record, 0, outputs)
         else:
             for packet in packets:
                 compile_filter_call(process_packet_all)(self.delayed_filters, self.gains, packet)
@@ -229,8 +241,8 @@ class LateEstimator(Estimator):
         if len(self._rows):
             rows = _align_rows(self._rows, self._lags)
             packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
-            record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
-            compile_filter_call(advance)(self.filters, self.gains, *record)
+            record = StepRecord(rows, len(rows), packets, len(packets))
+            compile_filter_call(advance)(self.filters, self.gains, record, 0, NO_OUTPUTS)
 
     @property
     def latency(self) -> dict[str, float]:

@@ -15,7 +15,15 @@ from numba.extending import is_jitted
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.filter import advance, process_packet_all, reset_filters, write_estimate
+from .core.filter import (
+    NO_OUTPUTS,
+    FilterOutputs,
+    StepRecord,
+    advance,
+    process_packet_all,
+    reset_filters,
+    write_estimate,
+)
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
@@ -27,10 +35,6 @@ from .protocol import Estimates, UnobservableWarning
 
 _T = TypeVar("_T")
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-TickRecord = tuple[Array, int, Array, int]  # fast rows and their number, packets and theirs
-TickOutputs = tuple[Array, Array, Array]  # states, standard deviations and NIS, or empty ones
-EMPTY = np.zeros((0, 0))
-NO_NIS = np.zeros(0)
 
 
 def compile_call(function: Callable[..., _T], *example_args: object) -> Callable[..., _T]:
@@ -52,9 +56,10 @@ def compile_call(function: Callable[..., _T], *example_args: object) -> Callable
 
 
 _MATRIX, _VECTOR = np.zeros((1, 1)), np.zeros(1)
+_RECORD, _OUTPUTS = StepRecord(_MATRIX, 0, _MATRIX, 0), FilterOutputs(_MATRIX, _MATRIX, _VECTOR)
 _Call = Callable[..., Any]
 _EXAMPLES: dict[_Call, tuple[object, ...]] = {
-    advance: (_MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX, _VECTOR),
+    advance: (_RECORD, 0, _OUTPUTS),
     process_packet_all: (np.zeros(PACKET_WIDTH),),
     write_estimate: (_VECTOR, _MATRIX),
 }
@@ -201,38 +206,20 @@ class Estimator:
         for label, array, width in tables:
             if array.shape[1:] != (width,):
                 raise ValueError(f"{label} have shape (k, {width}), got {array.shape}")
-        self.take(fast, len(fast), packets, len(packets))
+        self.take(StepRecord(fast, len(fast), packets, len(packets)))
 
-    def take(
-        self,
-        fast: Array,
-        rows: int,
-        packets: Array,
-        count: int,
-        X: Array = EMPTY,
-        S: Array = EMPTY,
-        nis: Array = NO_NIS,
-    ) -> None:
+    def take(self, record: StepRecord, outputs: FilterOutputs = NO_OUTPUTS) -> None:
         """Process rows and packets as `step` does, without any checks.
 
         Args:
-            fast: Fast rows, C-contiguous float64, shape (k, FAST_WIDTH).
-            rows: Number of fast rows to take.
-            packets: Packets, C-contiguous float64, shape (capacity, PACKET_WIDTH).
-            count: Number of packets to take.
-            X: Output for the states, shape (rows, n), or empty.
-            S: Output for the standard deviations, shape (rows, n), or empty.
-            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+            record: Rows and packets, C-contiguous float64.
+            outputs: Arrays to fill.
         """
-        self._take((fast, rows, packets, count), (X, S, nis))
-
-    def _take(self, record: TickRecord, outputs: TickOutputs) -> None:
-        """Process rows and packets: record, outputs are arguments of `advance` around `start`."""
         call = compile_filter_call(advance)
-        done = call(self.filters, self.gains, *record, 0, *outputs)
-        while done < record[1]:
+        done = call(self.filters, self.gains, record, 0, outputs)
+        while done < record.rows:
             self.design_missing()
-            done = call(self.filters, self.gains, *record, done, *outputs)
+            done = call(self.filters, self.gains, record, done, outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Process one fast row: from the last tick to this one, with the gyro.
@@ -269,7 +256,7 @@ class Estimator:
         fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
         X, S = np.empty((2, len(fast), len(self.names)))
         nis = np.full(len(packets), np.nan)
-        self.take(fast, len(fast), packets, len(packets), X, S, nis)
+        self.take(StepRecord(fast, len(fast), packets, len(packets)), FilterOutputs(X, S, nis))
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
     def prepare_record(self, source: Log | Record) -> Record:

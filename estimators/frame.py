@@ -9,6 +9,7 @@ from ..envs.numerics import require_extra
 from ..envs.record import PACKET
 from ..envs.recordings.log_file import read_parts
 from ..envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
+from .core.filter import NO_OUTPUTS, StepRecord
 from .make import make_estimator
 from .wires import apply_wires, read_wires
 
@@ -74,7 +75,8 @@ def _run_joint(log: "Log", car: Vehicle) -> "pd.DataFrame":
         ends = record.first + np.array([start, start + len(rows)])
         first, last = np.searchsorted(packets[:, PACKET.arrived], ends)
         now = slice(start, start + len(rows))
-        filter_.take(rows, len(rows), packets[first:last], last - first, X[now], S[now])
+        part = StepRecord(rows, len(rows), packets[first:last], last - first)
+        filter_.take(part, NO_OUTPUTS._replace(X=X[now], S=S[now]))
         healthy[now] = filter_.is_healthy
     beta, gamma = (filter_.names.index(name) for name in ("beta", "gamma"))
     return pd.DataFrame(

@@ -16,6 +16,7 @@ from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_pa
 from ..envs.recordings.tables import parse_column_name
 from ..envs.sensors.link import SlowSensor
 from ..envs.vehicle.parameters import VehicleSource, make_vehicle
+from .core.filter import NO_OUTPUTS, StepRecord
 from .core.record import FilterRecords
 from .design.options import FAST_CHANNELS
 from .make import make_estimator
@@ -227,6 +228,7 @@ class Stream:
             now, fast = fast[: stop - start], fast[stop - start :]
             count = int(np.searchsorted(packets[:, PACKET.arrived], stop))
             X, S = np.empty((2, len(now), len(self._filter.names)))
-            self._filter.take(now, len(now), packets[:count], count, X, S)
+            record = StepRecord(now, len(now), packets[:count], count)
+            self._filter.take(record, NO_OUTPUTS._replace(X=X, S=S))
             packets, start, self._x, self._sd = packets[count:], stop, X[-1], S[-1]
         self._done = end

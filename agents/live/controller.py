@@ -26,10 +26,11 @@ from ...envs.numerics.packed import read
 from ...envs.record import FAST, FAST_WIDTH, Array
 from ...envs.task import REPORT, compute_reference, filter_reference
 from ...envs.ticks import NEVER
+from ...estimators.core.filter import NO_OUTPUTS, StepRecord
 from ...estimators.estimator import Estimator
 from ...estimators.protocol import compute_std
 from ...estimators.wrappers.estimate import EstimateObservation
-from ...estimators.wrappers.outputs import Observed, StepRecord, compile_observe, write_outputs
+from ...estimators.wrappers.outputs import Observed, compile_observe, write_outputs
 from ..env_info import get_env_facts
 from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
 
@@ -80,9 +81,10 @@ class OnboardController:
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
         self._bounds = self.base.config.bounds
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
-        self._estimates: tuple[Array, ...] = tuple(np.zeros((2, 1, len(self.names))))
+        X, S = np.zeros((2, 1, len(self.names)))
+        self._outputs = NO_OUTPUTS._replace(X=X, S=S)
         # estimated states and their standard deviations, shape (n,), written anew by every tick
-        self.x, self.std = (values[0] for values in self._estimates)
+        self.x, self.std = X[0], S[0]
         self._begin(0)
         row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
@@ -121,8 +123,8 @@ class OnboardController:
             self._begin(tick.number)
         n, row = self.facts.control_period, tick.row
         if self._is_native:
-            packets = tick.packets, len(tick.packets)
-            self.estimator.take(row.reshape(1, -1), 1, *packets, *self._estimates)
+            record = StepRecord(row.reshape(1, -1), 1, tick.packets, len(tick.packets))
+            self.estimator.take(record, self._outputs)
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
             self.x[:], self.std[:] = self.estimator.x, compute_std(self.estimator.P)

@@ -31,9 +31,9 @@ from ...agents.learned.policy import ZIP
 from ...envs.numerics.kernel_cache import LAYERS, find_kernel_folder
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
+from ...estimators.core.filter import StepRecord
 from ...estimators.registry import is_user_file
 from ...estimators.vector.batch import ForeignBatch
-from ...estimators.wrappers.outputs import StepRecord
 from ..control.run import NUMBERS, Chunk, DriveResult, run_chunk
 from .child import DONE, ChildSettings
 

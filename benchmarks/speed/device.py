@@ -23,7 +23,7 @@ from ..harness.stats import Estimate
 from .timing import Taken
 
 _COUNTS = (1024, 16384, 65536, 262144, 1048576)
-_ROUNDS = 5
+_ROUNDS, _STEPS = 5, 20  # rounds that count, each of so many steps
 _COPIED = 1 << 28  # bytes, beyond every cache
 
 
@@ -61,17 +61,17 @@ def _count_bytes(env: Any) -> float:
     return float((read + written) / env.num_envs)
 
 
-def _measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
-    """Measure a batch in rounds of `steps`, after a first one; copied: a copy's bytes a second."""
+def _measure(env: Any, copied: float) -> _DeviceTiming:
+    """Measure a batch in rounds, after a first one; copied: a copy's bytes a second."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
 
     def run_steps() -> None:
-        for _ in range(steps):
+        for _ in range(_STEPS):
             env.step(actions)
 
-    taken = [_measure_seconds(run_steps, env.device) for _ in range(rounds + 1)][1:]
-    rates, dtype = Taken(env.num_envs * steps / x for x in taken), str(env.dtype)
+    taken = [_measure_seconds(run_steps, env.device) for _ in range(_ROUNDS + 1)][1:]
+    rates, dtype = Taken(env.num_envs * _STEPS / x for x in taken), str(env.dtype)
     kind = dtype.removeprefix("torch.")
     return _DeviceTiming(env.num_envs, kind, rates.range, _count_bytes(env), copied)
 
@@ -99,8 +99,6 @@ def _main(
     count: Annotated[list[int] | None, typer.Option(help="Rows of a batch; repeatable.")] = None,
     engine: Annotated[str, typer.Option(help="cuda, or torch: on a GPU, else torch.")] = "",
     compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 20,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = _ROUNDS,
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
 ) -> None:
     """Measure env-steps per second, resets included, against the size of the batch."""
@@ -112,7 +110,7 @@ def _main(
     for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
         batch = make_device_env(env, size, device=device, dtype=kind, **options)
         copied = copied or _measure_bandwidth(batch.device)
-        timings.append(_measure(batch, copied, rounds, steps))
+        timings.append(_measure(batch, copied))
         console.print(f"{size}, {kind}: {timings[-1].rate.value:.3g} env-steps/s", highlight=False)
         del batch
     hardware = f"CPU, {torch.get_num_threads()} threads of torch"
@@ -121,8 +119,8 @@ def _main(
     text = (
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
         f"{hardware}, torch {torch.__version__}; {env}, engine {engine}, "
-        f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
-        f"{steps} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
+        f"{'compiled' if compiled else 'not compiled'}. Median and range of {_ROUNDS} rounds of "
+        f"{_STEPS} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
         f"{_format_table(timings)}\n"
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -18,6 +18,7 @@ from ...agents.baselines import CONSTANT_ERRORS, compute_range_rms
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.scenarios.world import IDEAL
 from ...envs.sensors.slow import SLOW_NAMES
+from ...estimators.core.filter import NO_OUTPUTS, StepRecord
 from ...estimators.design.models import COURSE_SPEED
 from ...estimators.design.options import NOISE
 from ...estimators.estimator import Estimator
@@ -202,7 +203,8 @@ def _run_with_health(estimator: Estimator, log: Log) -> tuple[Array, Array, npt.
         ends = record.first + part.start, record.first + part.stop
         first, last = np.searchsorted(record.packets[:, PACKET.arrived], ends)
         fast, packets = record.fast[part], record.packets[first:last]
-        estimator.take(fast, len(fast), packets, len(packets), X[part], S[part])
+        step = StepRecord(fast, len(fast), packets, len(packets))
+        estimator.take(step, NO_OUTPUTS._replace(X=X[part], S=S[part]))
         healthy.append(estimator.is_healthy)
     place = estimator.names.index("beta")
     return X[:, place], S[:, place], np.array(healthy)

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
 
-from ..engine.batch_env import BatchEnv, Infos
+from ..engine.batch_env import BatchEnv
 from ..numerics.torch_backend import DTYPES, torch
-from ..task import REPORT, RUNNING, StepReport
+from ..task import REPORT, RUNNING, Infos, StepReport
 from ..validation import Mask, parse_actions, short_repr
 from ..vector import make_rows
 

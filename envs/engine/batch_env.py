@@ -13,11 +13,11 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ..task import Infos
 from ..validation import Mask, format_rows, short_repr
 from .batch import IntArray, NumbaEngine
 from .config import EnvConfig, EpisodeConfig
 
-Infos = dict[str, Any]
 ArrayT = TypeVar("ArrayT")
 
 

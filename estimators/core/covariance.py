@@ -56,29 +56,30 @@ def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
 
 @inline
 def _accumulate_rows(
-    M: Vector, i: int, k: int, v: Scalar, a: Scalar, b: Scalar, c: Scalar, d: Scalar
+    M: Vector, i: int, k: int, v: Scalar, sums: tuple[Scalar, ...]
 ) -> tuple[Scalar, ...]:
+    a, b, c, d = sums
     a, b = a + load_element(M, i, k) * v, b + load_element(M, i + 1, k) * v
     return a, b, c + load_element(M, i + 2, k) * v, d + load_element(M, i + 3, k) * v
 
 
 @inline
 def _multiply_rows(
-    M: Vector, i: int, V: Vector, n: int, j: int, a: Scalar, b: Scalar, c: Scalar, d: Scalar
+    M: Vector, i: int, V: Vector, n: int, j: int, sums: tuple[Scalar, ...]
 ) -> tuple[Scalar, ...]:
-    """Add rows i to i + 3 of M (., n) times V to a, b, c and d, eight columns from j on."""
+    """Add rows i to i + 3 of M (., n) times V to four sums, eight columns from j on."""
     for k in range(n):
-        a, b, c, d = _accumulate_rows(M, i, k, load8(V, k, j), a, b, c, d)
-    return a, b, c, d
+        sums = _accumulate_rows(M, i, k, load8(V, k, j), sums)
+    return sums
 
 
 @inline
 def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> tuple[Scalar, ...]:
     """Multiply rows i to i + 3 of M by a symmetric matrix P, see `_multiply_rows`."""
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    sums = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
-        a, b, c, d = _accumulate_rows(M, i, k, load8_symmetric(P, k, j), a, b, c, d)
-    return a, b, c, d
+        sums = _accumulate_rows(M, i, k, load8_symmetric(P, k, j), sums)
+    return sums
 
 
 @jit
@@ -94,7 +95,7 @@ def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
     """
     for j in range(0, m, 8):
         for i in range(0, n, 4):
-            first, second, third, fourth = _multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            first, second, third, fourth = _multiply_rows(a, i, b, n, j, (0.0, 0.0, 0.0, 0.0))
             store8(c, first, i, j)
             store8(c, second, i + 1, j)
             store8(c, third, i + 2, j)
@@ -129,7 +130,7 @@ def predict_covariance(f: FilterRecord) -> None:
             c = load8(Q, i + 2, j) + load8(FP, i + 2, j) * factor
             d = load8(Q, i + 3, j) + load8(FP, i + 3, j) * factor
             if j < dense:  # the columns behind have decays alone
-                a, b, c, d = _multiply_rows(FP, i, GT, n, j, a, b, c, d)
+                a, b, c, d = _multiply_rows(FP, i, GT, n, j, (a, b, c, d))
             store8(P, a, i, j)
             if i + 1 < dense:
                 store8(P, b, i + 1, j)

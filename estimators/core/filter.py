@@ -6,6 +6,8 @@ A filter at the slow sensor's rate listens every `pace` ticks; in between it hol
 (`stride`) or predicts them.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...envs.numerics.functions import sincos
@@ -18,6 +20,26 @@ from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, linearise, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 from .update import FIRST_VARIANCE, compute_excess, correct_fast
+
+
+class StepRecord(NamedTuple):
+    """What a filter gets in a call, as an env's newest step; of N cars, (N, ...) each."""
+
+    fast: Matrix  # fast rows, shape (k, FAST_WIDTH)
+    rows: Scalar  # number of fast rows that are there (an env's `rows` are the rows themselves)
+    packets: Matrix  # shape (capacity, PACKET_WIDTH)
+    count: Scalar  # how many of them there are
+
+
+class FilterOutputs(NamedTuple):
+    """What a filter writes in a call; what is empty is not written."""
+
+    X: Matrix  # states, shape (rows, n)
+    S: Matrix  # their standard deviations, shape (rows, n)
+    nis: Vector  # normalised innovation squared of each packet, shape (count,)
+
+
+NO_OUTPUTS = FilterOutputs(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
 @jit
@@ -229,32 +251,24 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
 def advance(
     layers: FilterRecords,
     gains: GainTables,
-    fast: Matrix,
-    rows: int,
-    packets: Matrix,
-    count: int,
+    record: StepRecord,
     start: int,
-    X: Matrix,
-    S: Matrix,
-    nis: Vector,
+    outputs: FilterOutputs,
 ) -> int:
-    """Process the fast rows from `start` to `rows` and the first `count` packets.
+    """Process the fast rows of a record from `start` on, and its packets.
 
     Args:
         layers: Memory, shape (1,); or (2,), of which the second measures what the first estimates.
         gains: Tables of gains of the first layer, shape (cells, rows, columns).
-        fast: Fast rows, shape (rows or more, FAST_WIDTH).
-        rows: Number of fast rows.
-        packets: Packets, shape (count or more, PACKET_WIDTH).
-        count: Number of packets.
+        record: Rows and packets.
         start: Number of rows that are done already.
-        X: Output for the states, shape (rows, n), or empty.
-        S: Output for the standard deviations, shape (rows, n), or empty.
-        nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+        outputs: Arrays to fill.
 
     Returns:
         Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
+    fast, rows, packets, count = record
+    X, S, nis = outputs
     f = layers[0]
     position, end_tick = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
@@ -278,7 +292,7 @@ def advance(
         if len(X) > 0:
             _write_row(layers, gains, j, X, S)
     f.counts[COUNTERS.future] += count - position  # packets of a call without rows
-    return rows
+    return int(rows)
 
 
 @jit

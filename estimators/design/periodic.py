@@ -16,7 +16,7 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.covariance import correct_scalar, project_row
-from ..core.filter import advance, reset_filters, run_tick
+from ..core.filter import NO_OUTPUTS, StepRecord, advance, reset_filters, run_tick
 from ..core.innovation import (
     CLONE,
     CONSTANT,
@@ -325,10 +325,10 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
     packets = packets[np.argsort(packets[:, PACKET.arrived], kind="stable")]
 
     def run(first: int, ticks: int) -> None:
-        arrived, empty = packets[:, PACKET.arrived], np.zeros((0, 0))
+        arrived = packets[:, PACKET.arrived]
         due = packets[(arrived >= first) & (arrived < first + ticks)]
-        record = np.zeros((ticks, FAST_WIDTH)), ticks, due, len(due), 0
-        advance(filters, table[None], *record, empty, empty, np.zeros(0))
+        record = StepRecord(np.zeros((ticks, FAST_WIDTH)), ticks, due, len(due))
+        advance(filters, table[None], record, 0, NO_OUTPUTS)
 
     def list_errors(tick: int) -> list[Array]:
         """List what holds an error before a tick's step, as views of the filter's memory."""

@@ -9,10 +9,11 @@ import numpy.typing as npt
 
 from ...envs.numerics.simd8 import allocate_aligned
 from ...envs.record import Array
+from ..core.filter import StepRecord
 from ..core.record import FILTER
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
-from ..wrappers.outputs import Observed, StepRecord, write_outputs
+from ..wrappers.outputs import Observed, write_outputs
 from .lane_ticks import FilterBank
 from .lanes import compile_observe_batch, make_blocks
 

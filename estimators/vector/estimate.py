@@ -8,14 +8,15 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
-from ...envs.task import ObservationEntry
+from ...envs.task import Infos, ObservationEntry
 from ...envs.vehicle.parameters import VehicleSource
+from ..core.filter import StepRecord
 from ..filters import FILTERS
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, STD, Observed, StepRecord
+from ..wrappers.outputs import BETA, NEES, STD, Observed
 from ..wrappers.truth import (
     STIFFNESSES,
     TruthEntries,
@@ -26,7 +27,7 @@ from ..wrappers.truth import (
 )
 from ..wrappers.truth import TruthObservation as SingleTruth
 from .batch import BatchEstimator, ForeignBatch
-from .records import BatchedEnv, Mask, Observations, VectorObservation
+from .records import AnyVectorEnv, BatchedEnv, Mask, Observations, Snapshot, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
 
@@ -124,7 +125,7 @@ class EstimateObservation(VectorObservation):
 
     def __init__(
         self,
-        env: VectorEnv[Any, Any, Any],
+        env: AnyVectorEnv,
         estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
@@ -159,10 +160,10 @@ class EstimateObservation(VectorObservation):
         if isinstance(self._records, _BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
-    def _get_memory(self) -> dict[str, Any]:
+    def _get_memory(self) -> Snapshot:
         return {"estimator": self.estimator.get_state(), "out": self._out.copy()}
 
-    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
+    def _set_memory(self, snapshot: Snapshot) -> None:
         self._update_cars(range(self.num_envs))
         self.estimator.set_state(snapshot["estimator"])
         self._out[:] = snapshot["out"]
@@ -196,11 +197,11 @@ class EstimateObservation(VectorObservation):
             self._update_cars(rows)
             self.estimator.reset(mask)
 
-    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+    def _append(self, obs: Observations, infos: Infos, mask: Mask) -> Observations:
         self._observe(self._records.read("", range(self.num_envs)), obs, infos, mask, self._out)
         return self._out.copy()
 
-    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+    def _finish(self, infos: Infos, ended: Mask) -> None:
         inner, out = self._outputs.table.inner, np.zeros_like(self._out)
         obs = np.zeros((self.num_envs, inner), np.float32)
         if inner > 0:
@@ -212,7 +213,7 @@ class EstimateObservation(VectorObservation):
             infos["final_obs"][i] = out[i].copy()
 
     def _observe(
-        self, records: StepRecord, obs: Observations, infos: dict[str, Any], mask: Mask,
+        self, records: StepRecord, obs: Observations, infos: Infos, mask: Mask,
         out: Observations,
     ) -> None:  # fmt: skip
         """Process the records of some rows; write their observations and their part of `infos`."""
@@ -238,11 +239,9 @@ class EstimateObservation(VectorObservation):
 
 
 def _build_batch(
-    source: str | EstimatorFactory,
-    specs: Sequence[EstimatorSpec],
-    dt: float,
+    source: str | EstimatorFactory, specs: Sequence[EstimatorSpec], dt: float,
     options: Mapping[str, Any],
-) -> BatchEstimator:
+) -> BatchEstimator:  # fmt: skip
     """Build an estimator for each spec, compiled together where all are ours and none is late."""
     build_one = functools.partial(make_estimator, source, dt=dt, **options)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
@@ -255,7 +254,7 @@ def _build_batch(
     return BatchEstimator(get_label(source), specs, dt, build_one)
 
 
-def _find_records(env: VectorEnv[Any, Any, Any]) -> _SyncRecords | _BatchedRecords:
+def _find_records(env: AnyVectorEnv) -> _SyncRecords | _BatchedRecords:
     """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
         text = f"{type(env).__name__} is no vector environment; the wrapper of a single one"
@@ -298,7 +297,7 @@ class TruthObservation(VectorObservation):
 
     def __init__(
         self,
-        env: VectorEnv[Any, Any, Any],
+        env: AnyVectorEnv,
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
@@ -322,12 +321,12 @@ class TruthObservation(VectorObservation):
         for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
             self._values[i], self._calibration[i] = self._entries.read(truth)
 
-    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+    def _finish(self, infos: Infos, ended: Mask) -> None:
         for i in np.flatnonzero(ended):
             car = self._values[i], self._calibration[i]
             infos["final_obs"][i] = self._entries.append(infos["final_obs"][i], *car, None)
 
-    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+    def _append(self, obs: Observations, infos: Infos, mask: Mask) -> Observations:
         true_states: Any = None
         if self._entries.states:
             base: Any = self.unwrapped
@@ -339,9 +338,9 @@ class TruthObservation(VectorObservation):
                 raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
         return self._entries.append(obs, self._values, self._calibration, true_states)
 
-    def _get_memory(self) -> dict[str, Any]:
+    def _get_memory(self) -> Snapshot:
         return {"values": self._values.copy(), "calibration": self._calibration.copy()}
 
-    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
+    def _set_memory(self, snapshot: Snapshot) -> None:
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()

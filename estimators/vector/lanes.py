@@ -17,6 +17,7 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
 from ...envs.record import FAST, FAST_WIDTH
+from ..core.filter import StepRecord
 from ..core.innovation import BUFFER, LARSEN
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import (
@@ -31,7 +32,7 @@ from ..core.record import (
 )
 from ..core.update import NONE
 from ..estimator import compile_call
-from ..wrappers.outputs import Observed, OutputTable, StepRecord, observe
+from ..wrappers.outputs import Observed, OutputTable, observe
 from .lane_ticks import FilterBank, LaneBlock, advance_block, get_gains
 
 _MIN_LANES = 4  # filters that are computed alone in less time than in lanes

@@ -16,12 +16,14 @@ from gymnasium.vector.utils import batch_space
 from ...envs.engine.views import CarTruth
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
-from ...envs.task import ObservationEntry, make_space
+from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.vehicle.parameters import Vehicle
 
 IntArray = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
+Snapshot = dict[str, Any]
+AnyVectorEnv = VectorEnv[Any, Any, Any]
 
 
 class BatchedEnv(Protocol):
@@ -61,7 +63,7 @@ class VectorObservation(
     layout: tuple[ObservationEntry, ...]
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], single: type[gym.Wrapper], recorded: Mapping[str, Any]
+        self, env: AnyVectorEnv, single: type[gym.Wrapper], recorded: Mapping[str, Any]
     ) -> None:
         RecordConstructorArgs.__init__(self, **recorded)
         VectorWrapper.__init__(self, env)
@@ -78,11 +80,11 @@ class VectorObservation(
         """Begin the new episodes of some rows."""
         raise NotImplementedError
 
-    def _append(self, obs: Observations, infos: dict[str, Any], mask: Mask) -> Observations:
+    def _append(self, obs: Observations, infos: Infos, mask: Mask) -> Observations:
         """Make the observations of all rows, of which some got a new one, and their `infos`."""
         raise NotImplementedError
 
-    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+    def _finish(self, infos: Infos, ended: Mask) -> None:
         """Make `final_obs` and `final_info` of rows that ended within the step."""
         raise NotImplementedError
 
@@ -113,11 +115,11 @@ class VectorObservation(
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows, or those of options["reset_mask"].
+    ) -> tuple[Observations, Infos]:
+        """Reset the rows, or those of options["reset_mask"], as `gymnasium.vector.VectorEnv` does.
 
         Args:
-            seed: Seed of row 0, or a list (N,); see `gymnasium.vector.VectorEnv.reset`.
+            seed: Seed of row 0, or a list (N,).
             options: Options of the env.
 
         Returns:
@@ -130,21 +132,19 @@ class VectorObservation(
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         ended_before, self._ended = self._ended, None
         if ended_before is None and not rows.all():
-            raise ResetNeeded(
-                "reset all rows first: no step succeeded since then, or none was made"
-            )
+            text = "reset all rows first: no step succeeded since then, or none was made"
+            raise ResetNeeded(text)
         try:
             obs, infos = self.env.reset(seed=seed, options=options)
         except Exception as error:
             self._restore_ended(ended_before, error)
             raise
-        none = np.zeros(self.num_envs, np.bool_)
-        self._ended = none if ended_before is None else ended_before & ~rows
+        self._ended = np.zeros_like(rows) if ended_before is None else ended_before & ~rows
         self._begin(rows)
         return self._append(obs, infos, rows), infos
 
-    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows; ResetNeeded before `reset`, and after a step that failed.
+    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, Infos]:
+        """Step all rows as `gymnasium.vector.VectorEnv` does.
 
         Args:
             actions: Actions of all rows.
@@ -157,9 +157,8 @@ class VectorObservation(
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:
-            raise ResetNeeded(
-                "call reset() first: before the first step, and after one that failed"
-            )
+            text = "call reset() first: before the first step, and after one that failed"
+            raise ResetNeeded(text)
         try:
             obs, rewards, terminated, truncated, infos = self.env.step(actions)
         except Exception as error:
@@ -175,18 +174,16 @@ class VectorObservation(
         self._ended = ended
         return obs, rewards, terminated, truncated, infos
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> Snapshot:
         """Return a snapshot for `set_state`; TypeError where the env makes none."""
         env: Any = self.env
         if not hasattr(env, "get_state"):
-            raise TypeError(
-                f"{type(env).__name__} makes no snapshots; the vector env that gym.make_vec builds "
-                "without a vectorization_mode does"
-            )
+            text = "makes no snapshots; the vector env that gym.make_vec builds by itself does"
+            raise TypeError(f"{type(env).__name__} {text}")
         ended = None if self._ended is None else self._ended.copy()
         return {"env": env.get_state(), "ended": ended} | self._get_memory()
 
-    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+    def set_state(self, snapshot: Snapshot) -> None:
         """Restore a snapshot of this env or of one built with the same arguments.
 
         Args:
@@ -197,11 +194,11 @@ class VectorObservation(
         self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
         self._set_memory(snapshot)
 
-    def _get_memory(self) -> dict[str, Any]:
+    def _get_memory(self) -> Snapshot:
         """Return a snapshot of what the wrapper has beside the env."""
         raise NotImplementedError
 
-    def _set_memory(self, snapshot: Mapping[str, Any]) -> None:
+    def _set_memory(self, snapshot: Snapshot) -> None:
         """Restore what `_get_memory` returned."""
         raise NotImplementedError
 

@@ -12,9 +12,10 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from ...envs.sensors.link import SlowSensor
-from ...envs.task import ObservationEntry, make_space
+from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
+from ..core.filter import StepRecord
 from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS
@@ -29,7 +30,6 @@ from .outputs import (
     Observed,
     Outputs,
     OutputTable,
-    StepRecord,
     compile_observe,
     write_outputs,
 )
@@ -309,7 +309,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[_Floats, dict[str, Any]]:
+    ) -> tuple[_Floats, Infos]:
         """Reset the env, then the estimator with this episode's clocks, and take tick 0.
 
         Args:
@@ -323,7 +323,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
-    def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, Infos]:
         """Step the env; the estimator takes its record before the observation is made.
 
         Args:
@@ -367,7 +367,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
             layer = layer.env
         return limits
 
-    def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
+    def _append_estimates(self, obs: _Floats, info: Infos) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""
         base, estimator, out = self._base, self.estimator, np.empty(len(self.layout), np.float32)
         rows = base.rows

@@ -13,7 +13,13 @@ from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import as_python, jit, noinline
 from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum, minimum
 from ...envs.task import ObservationEntry
-from ..core.filter import advance, compute_deviation, read_covariance
+from ..core.filter import (
+    FilterOutputs,
+    StepRecord,
+    advance,
+    compute_deviation,
+    read_covariance,
+)
 from ..core.record import FILTER, FilterRecord, GainTables
 from ..core.update import compute_excess, is_healthy
 from ..estimator import compile_call
@@ -21,15 +27,6 @@ from ..protocol import EstimatorLike, compute_std
 
 BETA, STD, NEES, HEALTHY = range(4)  # places in the summary of a step
 _wrap = as_python(wrap, ARRAYS)
-
-
-class StepRecord(NamedTuple):
-    """The record of an env's newest step; of N cars, each field has them as its first axis."""
-
-    fast: Matrix  # fast rows, shape (k, FAST_WIDTH)
-    rows: Scalar  # number of fast rows that are there (an env's `rows` are the rows themselves)
-    packets: Matrix  # shape (capacity, PACKET_WIDTH)
-    count: Scalar  # how many of them there are
 
 
 class OutputTable(NamedTuple):
@@ -136,11 +133,10 @@ def observe(
     Returns:
         Number of fast rows done, as `advance` returns it.
     """
-    fast, rows, packets, count = record
     obs, (inner, plan, limits), beta, gamma, out, summary = observed
-    no_states, no_nis = fast[:0], summary[:0]  # empty: `advance` writes no records
-    done = advance(filters, gains, fast, rows, packets, count, start, no_states, no_states, no_nis)
-    if done < rows:
+    nothing = FilterOutputs(record.fast[:0], record.fast[:0], summary[:0])
+    done = advance(filters, gains, record, start, nothing)
+    if done < record.rows:
         return done
     for i in range(inner):
         out[i] = obs[i]

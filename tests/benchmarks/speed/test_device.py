@@ -16,9 +16,10 @@ ENV_ID = "sideslip/YawVision-v0"
 def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_speed, "_COPIED", 1 << 20)
+    for name, value in {"_COPIED": 1 << 20, "_STEPS": 1, "_ROUNDS": 2}.items():
+        monkeypatch.setattr(device_speed, name, value)
     out = tmp_path / "table.md"
-    device_speed._main("cpu", ["float64"], ENV_ID, [4, 8], steps=1, rounds=2, out=out)
+    device_speed._main("cpu", ["float64"], ENV_ID, [4, 8], out=out)
     command, _, text, _, *lines = out.read_text().splitlines()
     assert "sideslip.benchmarks.speed.device" in command
     assert f"{ENV_ID}, engine torch, not compiled. Median and range of 2 rounds of 1 steps" in text
@@ -30,12 +31,14 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
         assert 0.0 < low <= float(rate) <= high, count
 
 
-def test_every_round_takes_its_steps() -> None:
+def test_every_round_takes_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """One round more than is counted, the first of them."""
     env: Any = make_device_env(ENV_ID, 2)
     steps: list[Any] = []
     env.step = steps.append
-    found = device_speed._measure(env, 1e9, rounds=2, steps=3)
+    monkeypatch.setattr(device_speed, "_STEPS", 3)
+    monkeypatch.setattr(device_speed, "_ROUNDS", 2)
+    found = device_speed._measure(env, 1e9)
     assert len(steps) == (2 + 1) * 3 and found.size == 2
 
 
@@ -45,7 +48,7 @@ def test_every_round_takes_its_steps() -> None:
 )
 def test_a_wrong_word_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        device_speed._main(**wrong, count=[2], rounds=1, steps=1, out=None)
+        device_speed._main(**wrong, count=[2], out=None)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

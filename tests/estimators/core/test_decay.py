@@ -15,6 +15,7 @@ from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
+from sideslip.estimators.core.filter import NO_OUTPUTS, StepRecord
 from sideslip.estimators.design.dual_rate import RULES
 from sideslip.estimators.design.kalman import INVERSES
 from sideslip.estimators.design.periodic import MARGINAL
@@ -127,7 +128,8 @@ def decay(filter_: Estimator, error: float = 1.0) -> float:
     filter_.set_state(state)
     x, std = np.empty((2 * half, n)), np.empty((2 * half, n))
     rest = packets[~early]
-    filter_.take(np.zeros((2 * half, FAST_WIDTH)), 2 * half, rest, len(rest), x, std)
+    record = StepRecord(np.zeros((2 * half, FAST_WIDTH)), 2 * half, rest, len(rest))
+    filter_.take(record, NO_OUTPUTS._replace(X=x, S=std))
     late = np.log(np.abs(x[half::cycle]).max(1))
     return math.exp(np.polyfit(np.arange(len(late)), late, 1)[0])
 

@@ -16,6 +16,7 @@ from sideslip.envs import Log
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.estimators import Estimator, make_estimator
+from sideslip.estimators.core.filter import NO_OUTPUTS, StepRecord
 from sideslip.estimators.core.model import build_model
 from sideslip.estimators.core.predict import linearise
 from sideslip.estimators.core.record import N_INPUTS
@@ -120,7 +121,8 @@ def test_a_filter_says_when_it_is_lost() -> None:
                 packets[:, PACKET.arrived] < start + 500
             )
             chosen = np.ascontiguousarray(packets[arrives])
-            filter_.take(record.fast[start : start + 500].copy(), 500, chosen, len(chosen))
+            rows = record.fast[start : start + 500].copy()
+            filter_.take(StepRecord(rows, 500, chosen, len(chosen)))
             told.append(filter_.is_healthy)
         return told
 
@@ -140,7 +142,7 @@ def test_a_steering_angle_that_jumps_behind_a_gap_waits_for_the_next_row() -> No
     used = []
     rows[:, FAST.steer] = (0.0, 0.0, np.nan, 0.9, 0.0, 0.001)
     for row in rows:
-        filter_.take(row[None], 1, log.record.packets[:0], 0)
+        filter_.take(StepRecord(row[None], 1, log.record.packets[:0], 0))
         used.append(float(filter_.filters[0].u[0]))
     assert used == [0.0, 0.0, 0.0, 0.0, 0.0, 0.001]
 
@@ -163,7 +165,9 @@ def test_a_steering_angle_in_degrees_and_a_car_that_reverses_are_said(fault: str
         filter_.reset(log.slow, 0)
         rows = np.ascontiguousarray(record.fast[: until + 1000])
         X, S = np.empty((2, len(rows), len(filter_.names)))
-        filter_.take(rows, len(rows), record.packets[:0], 0, X, S, np.empty(0))
+        filter_.take(
+            StepRecord(rows, len(rows), record.packets[:0], 0), NO_OUTPUTS._replace(X=X, S=S)
+        )
         deviations.append(S[-1, 0])
         assert filter_.is_healthy == (record is log.record)
     assert fault != "degrees" or deviations[0] > 2.0 * deviations[1]

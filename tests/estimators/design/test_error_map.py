@@ -12,6 +12,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
+from sideslip.estimators.core.filter import StepRecord
 from sideslip.estimators.design.periodic import design_and_map, spectral_radius
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
@@ -44,7 +45,7 @@ def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(
     )
     assert filter_.spectral_radius < 1.0
     n = len(filter_.names)
-    filter_.take(log.record.fast, 1, np.zeros((0, PACKET_WIDTH)), 0)
+    filter_.take(StepRecord(log.record.fast, 1, np.zeros((0, PACKET_WIDTH)), 0))
     wrong = filter_.get_state()
     wrong["x"][0, :n] += np.where(np.array(filter_.units) == "N", 10.0, 0.05)
     filter_.set_state(wrong)
