@@ -23,6 +23,7 @@ from .control.score import CONSTANTS, Standing, rank_entries
 from .control.tasks import (
     LIMIT,
     NOMINAL,
+    PARAMETERS,
     STATE,
     STEERING,
     TITLES,
@@ -53,6 +54,7 @@ ENTRIES: dict[str, Sequence[tuple[str, str]]] = {
 """The lines of README's table, and who stands for each: of a policy the one of the task's car."""
 PAGE_ENTRIES = ENTRIES | {
     "policy on late samples alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
+    "a controller given the true car, not its state": [(PARAMETERS, "")],
 }
 """The lines of the page's tables."""
 _BEST, _TUNED = "`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`"
