@@ -21,7 +21,6 @@ from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FIL
 from .control.run import Results, measure
 from .control.score import CONSTANTS, Standing, rank_entries
 from .control.tasks import (
-    LIMIT,
     NOMINAL,
     PARAMETERS,
     STATE,
@@ -58,16 +57,14 @@ PAGE_ENTRIES = ENTRIES | {
 }
 """The lines of the page's tables."""
 _BEST, _TUNED = "`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`"
-_FAST = "road", LIMIT  # tiers of the passenger car
+_FAST = "road", "limit"  # tiers of the passenger car
 _PROCEDURES = {"distill-car-steering": "policy on joint"}
 _TRANSFER = {
     "FMVSS 126": ("fmvss-126 passenger-car", "amplitude", 1.0, ".1f"),
     "another plant": ("outside multi-body", "ratio", 100.0, ".0f"),
 }
 """Columns of transfer: scenario, metric, factor and format."""
-_RIVAL = (REFERENCE_CONTROLLER, "ratio")  # against whom costs are paired there
-EPISODES, _DOUBLED_EPISODES = 64, 32  # a task
-_DOUBLED = ", ranges doubled"
+EPISODES, _DOUBLED_EPISODES, _DOUBLED = 64, 32, ", ranges doubled"  # drives of a task
 
 
 def _measure_entries(
@@ -173,7 +170,8 @@ def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str
         line = [name, *(cells.format(f"tier {tier}", pairs, False) for tier in TITLES)]
         for scenario, metric, factor, form in _TRANSFER.values():
             row = far.get((scenario, agent, metric))
-            value = row.value if row else 1.0 if (agent, metric) == _RIVAL else None
+            is_rival = (agent, metric) == (REFERENCE_CONTROLLER, "ratio")  # of whom the others are
+            value = row.value if row else 1.0 if is_rival else None
             line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)
     tiers = (f"{tier}, {SPEEDS[tier]}" for tier in TITLES)
