@@ -173,7 +173,9 @@ def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
 
 
 def test_a_scenario_beside_a_mixture_is_not_dropped_in_silence() -> None:
-    with pytest.raises(ValueError, match=r"are \['gust'\], and env_options have the scenario 'moose'"):
+    with pytest.raises(
+        ValueError, match=r"are \['gust'\], and env_options have the scenario 'moose'"
+    ):
         TrainingTask(scenarios=["gust"], env_options={"scenario": "moose"})
 
 

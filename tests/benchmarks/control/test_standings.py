@@ -86,6 +86,13 @@ def test_the_best_come_first_with_their_numbers() -> None:
     assert standing[1].n == 80
 
 
+def test_the_better_of_two_default_entries_of_a_name_speaks_for_it() -> None:
+    found = results() | {(task, Entry("lqr")): episodes(90.0) for task in (ONE, TWO)}
+    (best,) = (x for x in table(found) if x.entry == Entry("lqr", REFERENCE_FILTER))
+    gains = _group_agents(table(found)).gains["lqr"]
+    assert all((gains[task] == best.scores[task]).all() for task in (ONE, TWO))
+
+
 def test_won_are_episodes_that_both_finish() -> None:
     """Who finishes a drive that nominal loses has two points for it, whatever it costs."""
     found = results(nominal=8)
