@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,6 +127,19 @@ def write_output(
                 versions[name] = version(name)
         write_report(html, list(suites), get_command_line(), versions)
         print_written(console, html)
+
+
+def check_used(command: Any, names: str, what: str) -> None:
+    """Check that a command has no option that it would ignore; ValueError otherwise.
+
+    Args:
+        command: Command.
+        names: Names of the options that are used.
+        what: What uses no others.
+    """
+    changed = {x.name for x in fields(command) if getattr(command, x.name) != x.default}
+    if ignored := sorted(changed - {*names.split()}):
+        raise ValueError(f"{', '.join(ignored)}: of no use to {what}")
 
 
 def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
@@ -43,13 +43,9 @@ class _Export:
 
         target = self.out or self.zipped.with_suffix(".safetensors")
         check_writable(target)
-        policy = export_zip(
-            *(self.zipped, target, self.env, parse_options(self.option)),
-            trust=self.trust,
-            normalise=self.normalise,
-            estimator=self.estimator,
-            command=get_command_line(),
-        )
+        what = self.zipped, target, self.env, parse_options(self.option)
+        about: dict[str, Any] = {"estimator": self.estimator, "command": get_command_line()}
+        policy = export_zip(*what, trust=self.trust, normalise=self.normalise, **about)
         default = "the scales of its training" if (policy.network.scale != 1.0).any() else "nothing"
         scaled = find_normaliser(self.zipped, self.normalise) or default
         text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
