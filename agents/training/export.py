@@ -282,7 +282,7 @@ def check_trusted(file: Path, trust: bool) -> None:
 
 
 def check_zip(file: Path) -> None:
-    """Check a zip of stable-baselines3 by its members' names; ValueError for another file.
+    """Check a zip of stable-baselines3 by its members; FileNotFoundError or ValueError otherwise.
 
     Args:
         file: Path of the zip.

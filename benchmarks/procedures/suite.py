@@ -156,8 +156,8 @@ def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
         weakest = results[int(np.argmin(highest))]
         failed = [run for run in weakest.runs if not run.passed]
         beyond = math.ceil(bdtrik(0.025, len(results), 0.5))  # cars; no jackknife holds here
-        ends = np.sort(highest)[[beyond - 1, -beyond]] if beyond else ()
-        numbers = {"amplitude": Estimate(float(np.median(highest)), *ends), "n": len(results)}
+        bounds = np.sort(highest)[[beyond - 1, -beyond]] if beyond else ()
+        numbers = {"amplitude": Estimate(float(np.median(highest)), *bounds), "n": len(results)}
         numbers |= {"A": np.degrees(np.median([result.A for result in results]))}
         last = np.array([max(run.multiple for run in result.runs) for result in results])
         ends = float(np.median(highest)), float(np.median(last)), int(np.sum(highest < last))

@@ -198,7 +198,7 @@ def test_an_export_has_the_estimators_options_of_its_card(tmp_path: Path) -> Non
     options = {"outputs": ["beta", "psi"]}
     env = make_vec_env(ID, estimator={"estimator": "exact-kf", **options})
     made(sb3.PPO, "MlpPolicy", env).save(zipped := tmp_path / "model.zip")
-    about = {"estimator": "exact-kf", "estimator_options": options}
+    about: dict[str, Any] = {"estimator": "exact-kf", "estimator_options": options}
     policy = export_zip(zipped, tmp_path / "model.safetensors", ID, trust=True, **about)
     assert ("psi_hat", "rad") in policy.card.observation
 
