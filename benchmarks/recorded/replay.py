@@ -129,7 +129,7 @@ def replay_file(
         Suite of all parts and corners.
 
     Raises:
-        ValueError: `until` or `nominal` stand without "identify", or the readers or `replay` refuse.
+        ValueError: `until` or `nominal` without "identify", or the readers or `replay` refuse it.
     """
     if is_nmea(log):
         raise ValueError(f"{log}: a receiver's log (NMEA); replay_nmea reads it")
