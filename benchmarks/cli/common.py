@@ -154,7 +154,7 @@ def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     chosen = {name: options[name] for name in ("scenario", "vehicle", "control_period")}
     env_options = {name: value for name, value in chosen.items() if value is not None}
     more = parse_options(options["option"])
-    if twice := sorted((env_options.keys() - {"control_period"}) & more.keys()):
+    if twice := sorted({x for x in env_options if env_options[x] != 10} & more.keys()):  # no flag
         raise ValueError(f"{twice[0]} is there twice, as a flag and as --option")
     return {
         **{name: options[name] for name in ("estimator", "agent", "env")},

@@ -36,6 +36,10 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
         ("run", "--option", "seed=1", "--option", "seed=[2]"),
         "option seed is there twice, as 1 and '[2]'",
     ),
+    (
+        ("run", "--control-period", "20", "--option", "control_period=5"),
+        "is there twice, as a flag",
+    ),
     (("run", "--option", "reference"), "an option is NAME=VALUE, got 'reference'"),
     ((*LQR, "--agent-option", "grib=1"), "lqr: unknown option 'grib'; did you mean 'grip'"),
     ((*LQR, "--estimator-option", "q_bta=1"), "unknown option 'q_bta'; did you mean 'q_beta'"),
