@@ -61,6 +61,7 @@ def iterate_steps(
 
     Raises:
         TypeError: The agent has no `predict`.
+        ValueError: The agent is made for a car of another full scale.
     """
     if not (agent is None or hasattr(agent, "predict")):
         text = f"an agent has stable-baselines3's predict, got {type(agent).__name__}"
@@ -253,7 +254,8 @@ def rollout(
         Columns by name, their units, and the log.
 
     Raises:
-        TypeError: A vector env, or an env of another package.
+        TypeError: A vector env, an env of another package, or an agent without `predict`.
+        ValueError: The agent is made for a car of another full scale.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as new_env:

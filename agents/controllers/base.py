@@ -29,14 +29,17 @@ class Controller(ABC):
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
     (N, memory). A controller serves a single env or all rows of a vector env, with one design.
 
-    A missing entry is a ValueError. Where an entry is not finite the action is NaN and the memory
-    stays as it was, which makes a failed estimator visible: an env with `on_bad_action="fail"` ends
-    the episode, others raise.
+    Where an entry is not finite the action is NaN and the memory stays as it was, which makes a
+    failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
         grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
             force. None: no such limit. Friction is `true_friction`, else the nominal car's.
+
+    Raises:
+        TypeError: The grip is no number.
+        ValueError: An entry of `needs` is missing, or the grip is not positive.
     """
 
     needs: tuple[str, ...] = ()  # entries of the observation that the controller reads

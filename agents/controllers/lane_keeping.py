@@ -124,7 +124,7 @@ class LaneKeeping(Controller):
     Args:
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
-        curvature_time: Time constant of the curvature's filter (s).
+        curvature_time: Time constant of the curvature's filter (s), of a control period at least.
         haste: Weight of the steering command less the applied angle, as for `HASTE`.
 
     Raises:
@@ -148,7 +148,7 @@ class LaneKeeping(Controller):
         table = np.ascontiguousarray(np.array(gains)[:, None, None])
         axes, time = (np.array(speeds), np.zeros(1), np.zeros(1)), self.control_period * TICK
         share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
-        filter_time = check_positive("curvature_time", curvature_time)
+        filter_time = max(check_positive("curvature_time", curvature_time), time)
         self._design = table, axes, share, car.preview, filter_time, time, self.authority
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:

@@ -109,7 +109,7 @@ def _esc_law(
         N_z = min(max(unlimited, -limit), limit)
         state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
         if absolute(error) == 0.0:
-            state[n, 0] -= state[n, 0] * dt / _RELEASE
+            state[n, 0] -= state[n, 0] * min(dt, _RELEASE) / _RELEASE
         action[n, 0] = N_z / full_scale
 
 

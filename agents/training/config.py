@@ -130,6 +130,8 @@ def _check_settings(algo: str, settings: object) -> None:
             hint = "; YAML reads 2e6 as text, 2.0e+6 as a number" if "e" in value else ""
             raise ValueError(f"{name} is a number, got {value!r}{hint}")
     kwargs = settings.get("policy_kwargs", {})
+    if replaced := [name for name in kwargs if name.startswith("features_extractor_")]:
+        raise ValueError(f"{replaced[0]} is the training's own, of scaled observations")
     if "activation_fn" in kwargs and get_algorithm(algo).on_tensors:
         raise ValueError(f"the layers of {algo} are of silu: it has no activation_fn")
     check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(list_activations()))
@@ -188,6 +190,9 @@ class TrainingTask:
                 text = f"{len(self.scenarios)} scenarios take as many environments"
                 rule = "an environment has one scenario for all its episodes"
                 raise ValueError(f"{rule}: {text}, got {name} {count}")
+        if self.scenarios and "scenario" in self.env_options:
+            text = f"and env_options have the scenario {self.env_options['scenario']!r}"
+            raise ValueError(f"the scenarios of a mixture are {self.scenarios}, {text}")
         for i, scenario in enumerate(self.scenarios):
             try:
                 make_scenario(scenario)

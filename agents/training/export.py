@@ -238,7 +238,7 @@ def export_zip(
     about |= {"env_id": env_id, "env_options": dict(env_options or {})}
     env: CarEnv = gym.make(env_id, **about["env_options"])
     if about.get("estimator"):
-        env = EstimateObservation(env, about["estimator"])
+        env = EstimateObservation(env, about["estimator"], **about.get("estimator_options", {}))
     policy = policy_from_zip(path, env, trust=trust, normalise=normalise, **about)
     env.close()
     save_policy(target, policy.network, policy.card)
@@ -282,7 +282,7 @@ def check_trusted(file: Path, trust: bool) -> None:
 
 
 def check_zip(file: Path) -> None:
-    """Check a zip of stable-baselines3 by its members' names; ValueError for another file.
+    """Check a zip of stable-baselines3 by its members; FileNotFoundError or ValueError otherwise.
 
     Args:
         file: Path of the zip.

@@ -56,9 +56,9 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
         Task with the policy's observation and form.
     """
     card, algo = policy.card, fields.get("algo", "ppo")
-    options = dict(card.env_options) | fields.pop("env_options", {})
-    mixture = [] if options != card.env_options else card.algorithm_options.get("scenarios", [])
-    scenarios = fields.pop("scenarios", mixture)
+    changes = fields.pop("env_options", {})
+    mixture = [] if "scenario" in changes else card.algorithm_options.get("scenarios", [])
+    options, scenarios = card.env_options | changes, fields.pop("scenarios", mixture)
     if scenarios:
         options.pop("scenario", None)
     task_fields = dict[str, Any](env_id=card.env_id, env_options=options, scenarios=scenarios)

@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,6 +129,19 @@ def write_output(
         print_written(console, html)
 
 
+def check_used(command: Any, names: str, what: str) -> None:
+    """Check that a command has no option that it would ignore; ValueError otherwise.
+
+    Args:
+        command: Command.
+        names: Names of the options that are used.
+        what: What uses no others.
+    """
+    changed = {x.name for x in fields(command) if getattr(command, x.name) != x.default}
+    if ignored := sorted(changed - {*names.split()}):
+        raise ValueError(f"{', '.join(ignored)}: of no use to {what}")
+
+
 def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     """Make the record of who drives, in which env.
 
@@ -140,7 +154,7 @@ def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     chosen = {name: options[name] for name in ("scenario", "vehicle", "control_period")}
     env_options = {name: value for name, value in chosen.items() if value is not None}
     more = parse_options(options["option"])
-    if twice := sorted((env_options.keys() - {"control_period"}) & more.keys()):
+    if twice := sorted({x for x in env_options if env_options[x] != 10} & more.keys()):  # no flag
         raise ValueError(f"{twice[0]} is there twice, as a flag and as --option")
     return {
         **{name: options[name] for name in ("estimator", "agent", "env")},

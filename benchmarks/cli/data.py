@@ -6,7 +6,6 @@ cv2 is imported when a command needs it, after the limit on a picture's pixels i
 import math
 import os
 import time
-from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.tables import print_suite
-from .common import print_written, write_output
+from .common import check_used, print_written, write_output
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
@@ -97,11 +96,8 @@ class _Replay:
         if is_nmea(log):
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
-            record: Any = self  # a dataclass, by `register`
-            changed = {x.name for x in fields(record) if getattr(self, x.name) != x.default}
-            used = {"log", "vehicle", "mapping", "html", "json", "parquet", "plot", "kml"}
-            if ignored := sorted(changed - used):
-                raise ValueError(f"{log}: {', '.join(ignored)}: of no use to a receiver's log")
+            used = "log vehicle mapping html json parquet plot kml"
+            check_used(self, used, f"a receiver's log ({log})")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log, self.vehicle, self.mapping)
             write_output(console, [make_receiver_suite(received)], vars(self))
@@ -228,6 +224,7 @@ class _Lane:
         if (source is None) == (self.calibrate is None):
             raise ValueError("expected a picture or a film, or --calibrate FOLDER")
         if source is None:
+            check_used(self, "calibrate json", "--calibrate")
             self._calibrate_camera()
             return
         if not 1.0 < self.lane_width < 10.0:
@@ -248,8 +245,7 @@ class _Lane:
             finder = self._make_finder(film.read_head(_MAX_TRIES), source)
             lanes, seconds = _process_film(film, finder, out)
             if (count := len(lanes)) < film.frame_count:
-                _console.print(f"the film ends after {count} of the {film.frame_count} frames it "
-                               "promises")  # fmt: skip
+                _console.print(f"the film ends after {count} of the {film.frame_count} frames due")
         _report(source, finder.camera, lanes, seconds)
         if self.json is not None:
             frames = [lane._asdict() for lane in lanes]

@@ -19,7 +19,7 @@ from rich.markup import escape
 from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.verdict import format_verdict
-from .common import make_driver, make_setup, print_written, show_episode
+from .common import check_used, make_driver, make_setup, print_written, show_episode
 from .names import check_env
 from .options import File, Text, Texts, register, take, take_argument
 
@@ -66,12 +66,16 @@ class _Live:
         target = _parse_address(self.to) if self.to else (LOOPBACK, self.port)
         setup = make_setup(vars(self))
         if self.relay is not None:
+            check_used(self, "relay to port latency speed duration json", "--relay")
             self._relay(self.relay, target)
         elif self.replay is not None:
             self._replay(self.replay, setup)
         elif self.estimator is not None:
+            check_used(self, " ".join({*vars(self)} - {"to"}), "an ESTIMATOR: see --publish")
             self._run_loop(setup, [_parse_address(text) for text in self.publish or []])
         elif self.simulate:
+            used = "simulate env vehicle scenario option control_period seed to port step speed"
+            check_used(self, used, "--simulate without an ESTIMATOR")
             self._simulate(setup, target)
         else:
             raise ValueError("name an ESTIMATOR, or --simulate, --relay or --replay")
@@ -100,8 +104,7 @@ class _Live:
             other = None
             if self.simulate:
                 arguments = setup["env"], setup["options"], port.address, setup["seed"]
-                car = SimulatedCarProcess(*arguments, self.step, self.speed)
-                other = stack.enter_context(car)
+                other = stack.enter_context(SimulatedCarProcess(*arguments, self.step, self.speed))
             signals = _watch_signals()
             relay = None
             if self.gps is not None:

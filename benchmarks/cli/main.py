@@ -110,8 +110,7 @@ class _Run:
 
         check_film(self.video)
         if self.beside is not None and self.video is None:
-            raise ValueError(f"{self.beside!r} can only drive beside in a film: --video names its "
-                             "file")  # fmt: skip
+            raise ValueError(f"{self.beside!r} can only drive beside in a film: --video FILE")
         setup = common.make_setup(vars(self))
         driver = FilmDriver(self.agent, *common.make_driver(setup, self.trust))
         if self.env is None and driver.env.spec is not None:
@@ -119,13 +118,12 @@ class _Run:
         drive = rollout(driver.env, driver.agent, self.seed)
         common.show_episode(console, drive, self.agent, vars(self))
         if self.video is not None:
-            drivers = [driver]
+            cars = [driver]
             if self.beside is not None:
                 env = copy.deepcopy(driver.env)
                 name = "no control" if self.beside == "none" else self.beside
-                ghost = make_agent(self.beside, env, trust=self.trust)
-                drivers.append(FilmDriver(name, env, ghost))
-            write_film(self.video, drivers, self.seed, console)
+                cars.append(FilmDriver(name, env, make_agent(self.beside, env, trust=self.trust)))
+            write_film(self.video, cars, self.seed, console)
             common.print_written(console, self.video)
 
 

@@ -143,7 +143,7 @@ def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
         if not (name and equals):
             raise ValueError(f"an option is NAME=VALUE, got {text!r}")
         if name in options:
-            raise ValueError(f"option {name} is there twice")
+            raise ValueError(f"option {name} is there twice, as {options[name]!r} and {value!r}")
         options[name] = value
         with suppress(json.JSONDecodeError):
             options[name] = json.loads(value)

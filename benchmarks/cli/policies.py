@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,13 +44,9 @@ class _Export:
 
         target = self.out or self.zipped.with_suffix(".safetensors")
         check_writable(target)
-        policy = export_zip(
-            *(self.zipped, target, self.env, parse_options(self.option)),
-            trust=self.trust,
-            normalise=self.normalise,
-            estimator=self.estimator,
-            command=get_command_line(),
-        )
+        export = partial(export_zip, self.zipped, target, self.env, parse_options(self.option))
+        options = partial(export, trust=self.trust, normalise=self.normalise)
+        policy = options(estimator=self.estimator, command=get_command_line())
         default = "the scales of its training" if (policy.network.scale != 1.0).any() else "nothing"
         scaled = find_normaliser(self.zipped, self.normalise) or default
         text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
@@ -202,10 +199,9 @@ class _Distill:
 
         target, console = self.out or Path(f"{self.name}.safetensors"), Console()
         check_file(target, ".safetensors")
-        names = ("rounds", "epochs", "cells", "noise", "seed", "batch", "traces")
-        sizes, weight = tuple(self.hidden or (64, 64)), self.auxiliary_weight
-        numbers = {name: getattr(self, name) for name in names}
-        config = DistillConfig(hidden=sizes, auxiliary_weight=weight, **numbers)
+        names = "rounds epochs cells noise seed batch traces auxiliary_weight"
+        numbers = {name: getattr(self, name) for name in names.split()}
+        config = DistillConfig(hidden=tuple(self.hidden or (64, 64)), **numbers)
         about: dict[str, object] = {"class": self.kind, "teacher": self.teacher}
         about |= {"cars": self.cars, "varied": self.varied} | config.describe()
         options = {"algorithm": "distill", "algorithm_options": about}

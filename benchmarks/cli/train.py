@@ -190,8 +190,7 @@ def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Pat
         return zoo.find_next_folder(logs, task.algorithm.zoo, task.env_id)
     if out is not None:
         return out
-    env_options = task.env_options.items()
-    options = [value if isinstance(value, str) else name for name, value in env_options]
+    options = [x if isinstance(x, str) else name for name, x in task.env_options.items()]
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))

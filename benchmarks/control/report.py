@@ -126,7 +126,9 @@ def _group_agents(standings: Sequence[Standing]) -> _Ranking:
 
 def _rank(standings: Sequence[Standing], name_entry: Callable[[Entry], str]) -> _Ranking:
     """Collect what each name drove; "" is left out."""
-    driven = {name_entry(x.entry).replace(", ", " with "): x for x in standings if x.pairs}
+    driven = dict[str, Standing]()
+    for standing in (x for x in standings if x.pairs):  # the best first, which stays
+        driven.setdefault(name_entry(standing.entry).replace(", ", " with "), standing)
     driven.pop("", None)
     below = [name for name, x in driven.items() if x.loses_more]
     return _Ranking({name: x.scores for name, x in driven.items()}, below)

@@ -163,10 +163,11 @@ class Standing:
         return any(result.error for result in self.results.values())
 
     @property
-    def rank(self) -> tuple[bool, float]:
+    def rank(self) -> tuple[int, float]:
         """Key of the order: smaller is better; what has no number comes last."""
         value = self.overall.get("score", Estimate(math.nan)).value
-        return self.loses_more or self.is_partial, float(np.nan_to_num(-value, nan=np.inf))
+        below = 2 * self.loses_more + self.is_partial
+        return below, float(np.nan_to_num(-value, nan=np.inf))
 
     @property
     def n(self) -> int:
@@ -240,7 +241,7 @@ def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
 
 
 def rank_entries(results: Results, tier: str | None) -> list[Standing]:
-    """Rank a tier's entries: last who surely loses more cars than nominal, or leaves out tasks.
+    """Rank a tier's entries: last who leaves out tasks, then who surely loses more than nominal.
 
     Args:
         results: Episodes.

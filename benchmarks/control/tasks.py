@@ -233,7 +233,7 @@ def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
     """Make the first test seeds of a salt, below 2^32; more seeds keep the first.
 
     Args:
-        salt: Hexadecimal digits, or ValueError.
+        salt: Hexadecimal digits; ValueError for another text.
         n: Number of seeds.
         more: Text that makes them others.
 

@@ -136,11 +136,9 @@ def _write_baselines(path: Path = FILE) -> None:
     for (task, entry), result in measure(cases, seeds, console=Console()).items():
         if result.error:
             raise ValueError(f"{task.name}, {entry.label}: {result.error}")
-        codes = result["failure"].astype(int).tolist()
-        drives = {"costs": result.costs.tolist(), "failures": codes}
-        record = task.record | {"estimator": entry.estimator, "controller": entry.agent}
-        version = {"salt": salt, "world_version": WORLD_VERSION}
-        lines.append(json.dumps(record | version | drives))
+        more = {"costs": result.costs.tolist(), "failures": result["failure"].astype(int).tolist()}
+        record = {"estimator": entry.estimator, "controller": entry.agent, "salt": salt}
+        lines.append(json.dumps(task.record | record | {"world_version": WORLD_VERSION} | more))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 
 

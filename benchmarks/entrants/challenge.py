@@ -18,7 +18,9 @@ from ...estimators.make import ESTIMATORS
 from ...estimators.registry import find_class, is_user_file
 from ..control.entries import (
     ADAPTIVE,
+    CONTROLLERS,
     JOINT,
+    ORACLE_NAMES,
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
     SETUPS,
@@ -31,7 +33,7 @@ from .worker import LIMIT
 
 EPISODES = 64
 _IDS = [name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name]
-_COMS, _CAR = "small car", "road"  # tiers, of which a scenario without one has car and reference
+_TAKEN = {*ORACLE_NAMES, *CONTROLLERS[YAW], REFERENCE_CONTROLLER, "none", TRUTH, JOINT}
 
 
 def make_user_entry(agent: object, estimator: object, trust: bool = False) -> Entry:
@@ -59,7 +61,9 @@ def _check_entry(entry: Entry) -> None:
     """Raise FileNotFoundError or ValueError for what is unknown, PermissionError for a zip."""
     for part, known in (("agent", AGENTS), ("estimator", ESTIMATORS)):
         source: str = getattr(entry, part)
-        if part in entry.objects:
+        if part in entry.objects:  # whose name decides which results are its
+            if source in _TAKEN:
+                raise ValueError(f"{part} {source!r} is one of the package's: rename yours")
             continue
         if is_user_file(source):
             find_class(source)
@@ -159,8 +163,7 @@ class ComparisonRequest:
     @property
     def is_as_shipped(self) -> bool:
         """Whether all tasks are the package's own, on its seeds."""
-        is_changed = any(task.changes for task in self.tasks)
-        return not (self.fresh or self.salt or self.seeds or is_changed)
+        return not (self.fresh or self.salt or self.seeds or any(x.changes for x in self.tasks))
 
     @cached_property
     def tasks(self) -> list[ControlTask]:
@@ -175,7 +178,7 @@ class ComparisonRequest:
             varied = changes
             if not variants:
                 scenario = make_scenario(source)
-                cars = TIERS[_CAR if car else _COMS]
+                cars = TIERS["road" if car else "small car"]  # of whose tasks it has the rest
                 variants = [ControlTask("", *variant, scenario.name) for variant in cars]
                 varied = changes | {"scenario": scenario.to_dict()}
             for task in self._select_tasks(variants, varied):

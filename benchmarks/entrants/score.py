@@ -179,8 +179,7 @@ def _make_table(comparison: Comparison) -> ResultTable:
     note = (
         "> yours. score: mean r, 0 as nominal, an LQG that knows the nominal car; a loss that "
         "nominal does not have counts -2. Who surely loses more cars than nominal comes last, and "
-        "who does not drive every task. "
-        "cost, won: of the drives that nominal finishes too."
+        "who does not drive every task. cost, won: of the drives that nominal finishes too."
     )
     return ResultTable("Your entries and the package's", _TABLE, lines, note)
 

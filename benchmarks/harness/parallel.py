@@ -37,11 +37,15 @@ def count_cores() -> int:
 
 @contextmanager
 def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
-    """Use an engine for the cases within; ValueError where there is no such engine or cluster.
+    """Use an engine for the cases within.
 
     Args:
         name: Name, `PROCESSES` or "ray".
         address: Existing Ray cluster, "host:port", "" for this machine's; it must run this version.
+
+    Raises:
+        ModuleNotFoundError: Ray is not installed.
+        ValueError: There is no such engine or cluster.
     """
     check_choice("engine", name, _ENGINES)
     if name == PROCESSES:

@@ -106,7 +106,7 @@ def interval(
 
     Args:
         values: Numbers of the seeds, shape (n,).
-        statistic: Function of `values`, and of `paired` unless that is None.
+        statistic: Smooth function, no median, of `values`, and of `paired` unless that is None.
         paired: Numbers of the same seeds, shape (n,), left out together with `values`.
 
     Returns:

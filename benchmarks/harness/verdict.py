@@ -65,7 +65,9 @@ def format_verdict(*lines: str) -> str:
 
 
 def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str:
-    """Describe the first entry and its lead, or those whose interval reaches 1, or nearly: a tie.
+    """Describe the first entry and its lead, or those that it ties with.
+
+    A rival ties where the ratio's interval reaches 1, or nearly.
 
     Args:
         name: Name of the first.

@@ -1,5 +1,6 @@
 """Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
 
+import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from itertools import product
@@ -12,7 +13,7 @@ from ...agents.rollout import compute_cost_ratios
 from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.results import Column, ResultTable, Suite
-from ..harness.stats import geometric_mean, interval
+from ..harness.stats import Estimate, geometric_mean, interval
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
 from . import fmvss126, iso3888, iso4138, iso7401, outside
@@ -147,12 +148,16 @@ def _add_tables(suite: Suite, done: CaseResults) -> None:
 
 def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
     """FMVSS 126: up to which amplitude every run passes, and what the weakest car's failure is."""
+    from scipy.special import bdtrik  # which a command's help need not load
+
     records = []
     for case, results in done.items():
         highest = np.array([result.highest for result in results])
         weakest = results[int(np.argmin(highest))]
         failed = [run for run in weakest.runs if not run.passed]
-        numbers = {"amplitude": interval(highest, np.median), "n": len(results)}
+        beyond = math.ceil(bdtrik(0.025, len(results), 0.5))  # cars; no jackknife holds here
+        bounds = np.sort(highest)[[beyond - 1, -beyond]] if beyond else ()
+        numbers = {"amplitude": Estimate(float(np.median(highest)), *bounds), "n": len(results)}
         numbers |= {"A": np.degrees(np.median([result.A for result in results]))}
         last = np.array([max(run.multiple for run in result.runs) for result in results])
         ends = float(np.median(highest)), float(np.median(last)), int(np.sum(highest < last))

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...envs.record import Array, Log
+from ...envs.record import PACKET, Array, Log
 from ...envs.recordings.dialect import SLOW_QUANTITIES, find_sampling
 from ...envs.recordings.log_file import NEEDED, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import COLUMNS, name_log, parse_mapping, read_columns
+from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.design.models import MEASUREMENTS
 from ...estimators.make import make_estimator
@@ -136,14 +137,15 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
     deviation = estimates.std[:, place]
     moving = LoggedMotion(log).is_moving & (log.time >= log.time[0] + SETTLED)
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
-    has_nis = np.isfinite(estimates.nis).any()
+    used = np.isfinite(estimates.nis)
+    sensors = [SLOW_NAMES[int(i)] for i in log.record.packets[used, PACKET.sensor]]
     learnt = {
         name: (float(estimates.std[0, i]), float(estimates.std[-1, i]))
         for i, name in enumerate(estimates.names)
         if name in _LABELS
     }
-    values = sum(len(MEASUREMENTS[sensor].rows) for sensor in log.slow) / max(len(log.slow), 1)
-    nis = float(np.nanmean(estimates.nis)) / values if has_nis else math.nan
+    values = np.mean([len(MEASUREMENTS[sensor].rows) for sensor in sensors] or math.nan)
+    nis = float(np.mean(estimates.nis[used]) / values) if sensors else math.nan
     beta = estimates.x[:, place]
     wrong = (beta - log.truth.get("beta", np.full(len(beta), np.nan)))[moving]
     known = wrong[np.isfinite(wrong)]

@@ -129,12 +129,12 @@ def replay_file(
         Suite of all parts and corners.
 
     Raises:
-        ValueError: A drive has `until` without "identify", or the readers or `replay` refuse it.
+        ValueError: `until` or `nominal` without "identify", or the readers or `replay` refuse it.
     """
     if is_nmea(log):
         raise ValueError(f"{log}: a receiver's log (NMEA); replay_nmea reads it")
-    if until is not None and vehicle != "identify":
-        raise ValueError("--until is for --vehicle identify")
+    if vehicle != "identify" and (until is not None or nominal != "passenger-car"):
+        raise ValueError("--until and --nominal are for --vehicle identify")
     wires, tables, unknown = wires or SignalCalibration(), [], ""
     factor = settings.get("stiffness_factor", 1.0)  # of corners, whose tyres are nominal
     if vehicle == "identify":

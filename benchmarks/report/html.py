@@ -181,7 +181,7 @@ def write_report(
 
     Args:
         path: File, written whole or not at all.
-        suites: Results, or ValueError.
+        suites: Results of one suite at least; ValueError without one.
         command: Command line that made the suites.
         environment: Versions by name.
     """

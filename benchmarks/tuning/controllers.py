@@ -207,7 +207,7 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
         if error := _run_entry(control_task, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {control_task.name}: {error}")
     study = create_study(task, search.storage, "tpe", search.seed)
-    if not study.trials:
+    if not any("seeds" in trial.user_attrs for trial in study.trials):  # none was finished
         study.enqueue_trial(task.start)
     evaluate = partial(_evaluate_trials, task, search.jobs or count_cores())
     run_search(study, task, search, evaluate, len(task.seeds))

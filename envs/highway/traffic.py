@@ -300,11 +300,10 @@ class Traffic:
         meeting = math.sqrt(2.0 * gap / rate)  # s after the onset, while it still moves
         if meeting > v / rate:  # it already stands
             meeting = gap / v + 0.5 * v / rate
-        begin = v * (draw["onset"] + draw["reaction"])
+        begin, shift = v * (draw["onset"] + draw["reaction"]), self.course.side * WIDTH
         length = v * max(draw["haste"] * (meeting - draw["reaction"]), _SHORTEST)
         stop = position[0] + v * draw["onset"] + 0.5 * v * v / rate + _BrakingVehicle.LENGTH
         back = max(begin + length, stop) + v * draw["stay"]
-        shift = self.course.side * WIDTH
         return TrackPath(shift, begin, length, -shift, back, length)
 
     def _add_vehicles(self, others: int, start: TrafficStart) -> None:
@@ -313,7 +312,7 @@ class Traffic:
         ego, free = int(course.side > 0), int(course.side < 0)
         slots = [(free, 80.0), (ego, -35.0), (ego, 120.0), (free, -45.0)]  # lane, m ahead
         for i in range(others):
-            speed = start.speed * random.uniform(0.95, 1.05)
+            speed, heading = start.speed * random.uniform(0.95, 1.05), 0.0
             if course.ramp is not None and i == 0:
                 lane = course.network.get_lane(course.ramp)
                 position = lane.position(110.0 - lane.start[0] - 60.0 * random.random(), 0.0)
@@ -321,7 +320,12 @@ class Traffic:
                 index, offset = slots[i % len(slots)]
                 far = offset + math.copysign(45.0 * (i // len(slots)), offset)
                 position = np.array([far + random.uniform(-8.0, 8.0), WIDTH * (index - ego)])
-            other = IDMVehicle(self.road, position, speed=speed, target_speed=speed)
+                along, right = position - (ENTRY, 0.0)
+                for bend in (lane for lane in course.route if isinstance(lane, CircularLane)):
+                    if along > 0.0:
+                        position, heading = bend.position(along, right), bend.heading_at(along)
+                    along -= bend.length
+            other = IDMVehicle(self.road, position, heading, speed, target_speed=speed)
             self.road.vehicles.append(other)
         if course.ramp is not None:
             end = course.network.graph["b"]["c"][-1]
@@ -345,8 +349,7 @@ class Traffic:
     @property
     def departed(self) -> bool:
         """Whether the whole of our car's width is beyond the road's edge line."""
-        ego = self.ego
-        return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
+        return not bool(self.ego.lane.on_lane(self.ego.position, margin=0.5 * self.ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
         """Locate our car on the lanes that it follows.

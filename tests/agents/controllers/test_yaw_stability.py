@@ -57,6 +57,12 @@ def test_dead_band_and_side(env: Any) -> None:
     assert left < 0.0 < right
 
 
+def test_the_integral_does_not_change_sign_in_a_long_period_within_the_dead_band() -> None:
+    env = gym.make("sideslip/YawFusion-v0", control_period=800)
+    _, memory = make_agent("esc", env).predict(observe(env), np.array([[100.0]]))
+    assert memory[0, 0] == 0.0
+
+
 def test_slip_is_bounded_with_an_estimate_and_without_one_it_is_not_needed(env: Any) -> None:
     agent = make_agent("esc", env, slip=0.05)
     assert agent.predict(observe(env, beta_hat=0.04))[0] == 0.0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,17 @@ def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
     for other in ("exact-kf", ""):
         behind = make_finetune_task(POLICY, estimator=other)
         assert (behind.estimator, behind.estimator_options) == (other, {})
+
+
+def test_another_option_of_the_env_keeps_the_policys_mixture() -> None:
+    mixture = ["coms-slalom", "coms-step"]
+    card = replace(
+        POLICY.card,
+        env_options=POLICY.card.env_options | {"scenario": mixture[0]},
+        algorithm_options={"scenarios": mixture},
+    )
+    task = make_finetune_task(replace(POLICY, card=card), env_options={"lead_in": 0.5})
+    assert task.scenarios == mixture and task.env_options["lead_in"] == 0.5
 
 
 def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:

@@ -194,6 +194,15 @@ class Fires:
         return Path.write_text, (self.trace, "ran")
 
 
+def test_an_export_has_the_estimators_options_of_its_card(tmp_path: Path) -> None:
+    options = {"outputs": ["beta", "psi"]}
+    env = make_vec_env(ID, estimator={"estimator": "exact-kf", **options})
+    made(sb3.PPO, "MlpPolicy", env).save(zipped := tmp_path / "model.zip")
+    about: dict[str, Any] = {"estimator": "exact-kf", "estimator_options": options}
+    policy = export_zip(zipped, tmp_path / "model.safetensors", ID, trust=True, **about)
+    assert ("psi_hat", "rad") in policy.card.observation
+
+
 def test_nothing_is_read_without_trust(zipped: Path, tmp_path: Path) -> None:
     import base64
 

@@ -11,6 +11,7 @@ from sideslip.benchmarks.control.report import _group_agents, compose_verdict
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
 from sideslip.benchmarks.control.score import Standing, rank_entries
 from sideslip.benchmarks.control.tables import (
+    _LINE,
     Matrix,
     _describe_findings,
     _make_knowledge_table,
@@ -84,6 +85,21 @@ def test_the_best_come_first_with_their_numbers() -> None:
     assert lqr["share_won"].value == 1.0
     assert standing[5].overall["score"] == pytest.approx((0.0, 0.0, 0.0))
     assert standing[1].n == 80
+
+
+def test_the_line_stands_above_those_alone_who_lose_more_cars() -> None:
+    """Who leaves out a task stood below it, and who loses cars, but scores more, above."""
+    found = results(nominal=2, lqr=20)
+    found[TWO, Entry("none")] = undriven("no")
+    labels = [line["label"] for line in _make_main_table("", table(found)).cells]
+    assert labels[-3:] == ["none", _LINE, f"lqr on {REFERENCE_FILTER}"]
+
+
+def test_the_better_of_two_default_entries_of_a_name_speaks_for_it() -> None:
+    found = results() | {(task, Entry("lqr")): episodes(90.0) for task in (ONE, TWO)}
+    (best,) = (x for x in table(found) if x.entry == Entry("lqr", REFERENCE_FILTER))
+    gains = _group_agents(table(found)).gains["lqr"]
+    assert all((gains[task] == best.scores[task]).all() for task in (ONE, TWO))
 
 
 def test_won_are_episodes_that_both_finish() -> None:

@@ -280,6 +280,15 @@ def test_a_users_agent_has_nominals_filter_and_no_tuned_options() -> None:
     assert mine.is_users and not on_default("esc").is_users and not on_default(NOMINAL).is_users
 
 
+@pytest.mark.parametrize("name", ["nominal", "none", "lqr", "truth"])
+@pytest.mark.parametrize("part", ["agent", "estimator"])
+def test_an_object_called_as_the_packages_does_not_get_its_results(name: str, part: str) -> None:
+    """Results are by name: nominal's class scored 0 whatever it did, truth's what oracles do."""
+    parts: dict[str, Any] = {"agent": "lqr", "estimator": ""} | {part: type(name, (), {})}
+    with pytest.raises(ValueError, match=f"{part} '{name}' is one of the package's: rename"):
+        ComparisonRequest((make_user_entry(**parts),))
+
+
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "agent": ({"entries": (on_default("lqrr"),)}, "unknown agent 'lqrr'"),
     "estimator": ({"entries": (Entry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),

@@ -1,5 +1,8 @@
 """The suite of procedures: its cases, and its tables and figures of the uncontrolled cars."""
 
+from typing import Any
+
+import numpy as np
 import pytest
 
 pytest.importorskip("vehiclemodels")
@@ -45,6 +48,21 @@ def test_a_car_that_passes_its_own_series_does_not_fail_beside_one_with_a_longer
     ]
     (record,) = suite._make_sine_records({case: results})
     assert record["passed"] == (7.5, 7.5, 0) and record["text"] == "passes"
+
+
+def test_the_interval_of_the_median_amplitude_holds_it() -> None:
+    """A jackknife's has no width in half of such samples, and holds 66 % of them."""
+    (case, *_), rng = suite._make_cases(quick=True), np.random.default_rng(0)
+    held = []
+    for _ in range(400):
+        multiples = 0.5 * np.round(10.0 * rng.lognormal(0.0, 0.3, 16))
+        runs = [(fmvss126.SineDwellRun(k, k, 0.0, 0.0, 9.0),) for k in multiples.tolist()]
+        records = suite._make_sine_records({case: [fmvss126.SineDwellResult(1.0, x) for x in runs]})
+        amplitude: Any = records[0]["amplitude"]
+        held.append(amplitude.low <= 5.0 <= amplitude.high)
+    assert np.mean(held) > 0.93
+    few: Any = suite._make_sine_records({case: [fmvss126.SineDwellResult(1.0, runs[0])] * 2})
+    assert np.isnan(few[0]["amplitude"].low)
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:

@@ -2,16 +2,22 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 
 import sideslip
+from sideslip.benchmarks.harness.drives import record_drive
 from sideslip.benchmarks.recorded.checks import CHECKS, InspectedDrive
-from sideslip.benchmarks.recorded.inspection import _read_drive, inspect_file
+from sideslip.benchmarks.recorded.inspection import _predict, _read_drive, inspect_file
 from sideslip.benchmarks.recorded.quality import BLOCKER, OK, WARNING, LogFinding
+from sideslip.envs.record import PACKET
+from sideslip.envs.sensors.slow import CAMERA
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
+from sideslip.estimators.make import make_estimator
 from tests.benchmarks.conftest import Run
 
 from .faulty_logs import FAULTS, drive, shift_fixes, spoil
@@ -66,6 +72,17 @@ def _read_clean() -> InspectedDrive:
     checked = _read_drive(drive(CLEAN + 1)[0], {}, PASSENGER_CAR)[1]
     assert checked is not None
     return checked
+
+
+def test_innovations_of_two_sensors_count_by_what_each_packet_measures() -> None:
+    """A camera gives two values 30 times a second, a GPS one 5 times."""
+    options: dict[str, Any] = {"vehicle": "passenger-car", "scenario": "random-steering"}
+    log = record_drive(gym.make("sideslip/YawFusion-v1", **options), 1)
+    nis = make_estimator("joint", vehicle=PASSENGER_CAR, sensors=log.slow).run(log).nis
+    used = np.isfinite(nis)
+    values = np.where(log.record.packets[used, PACKET.sensor] == CAMERA, 2.0, 1.0)
+    predicted = _predict(log, PASSENGER_CAR)
+    assert predicted.nis == pytest.approx(nis[used].sum() / values.sum(), rel=1e-6)
 
 
 def test_two_faults_are_both_named() -> None:

@@ -56,6 +56,14 @@ def test_bad_settings_are_refused(
         replay(log, PASSENGER_CAR, figures=False, **settings)
 
 
+@pytest.mark.parametrize("option", [{"nominal": "coms"}, {"until": 30.0}])
+def test_options_of_the_identified_car_are_not_ignored_for_a_named_one(
+    tmp_path: Path, option: dict[str, Any]
+) -> None:
+    with pytest.raises(ValueError, match="--until and --nominal are for --vehicle identify"):
+        replay_file(saved(tmp_path), "passenger-car", **option)
+
+
 def test_told_the_true_car_the_drive_is_followed_exactly(log: Log) -> None:
     """The input's shift by one row is what makes this exact: unshifted, 1.2e-4 rad are left."""
     suite = replay(log, PASSENGER_CAR, estimators=["multirate-kf"], seeds=2, figures=False)

@@ -57,6 +57,25 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert "score" in controllers.make_suite(planted, log).text
 
 
+def test_a_search_stopped_in_its_first_batch_begins_at_the_start_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Else a trial at random is reported as the start."""
+    stops = iter([True, False])
+
+    def fake(*_: Any) -> float:
+        if next(stops, False):
+            raise KeyboardInterrupt
+        return 1.0
+
+    monkeypatch.setattr(controllers, "_compute_objective", fake)
+    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1)), 0.0))
+    search = task(SearchNumber("gain", 1.0, 0.1, 10.0)), SearchOptions(9, storage(tmp_path), jobs=1)
+    with pytest.raises(KeyboardInterrupt):
+        tune(*search)
+    assert tune(*search)["trials"][0]["numbers"] == {"gain": 1.0}
+
+
 def test_the_objective_is_minus_the_mean_score() -> None:
     gain = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}

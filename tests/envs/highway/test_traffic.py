@@ -64,6 +64,18 @@ def test_the_one_ahead_brakes_as_it_was_drawn_and_never_backs_up() -> None:
     assert speeds[-1] == 0.0 and min(speeds) == 0.0
 
 
+@pytest.mark.parametrize("road", ["straight", "curved"])
+def test_others_begin_on_lanes_where_the_road_bends_too(road: str) -> None:
+    """Those far ahead began straight on, up to 9 m beside their lane."""
+    around = traffic(others=20, road=road)
+    ego = int(around.course.side > 0)
+    expected = [1 - ego, ego, ego, 1 - ego]
+    for i, vehicle in enumerate(around.road.vehicles[1:]):
+        along, right = vehicle.lane.local_coordinates(vehicle.position)
+        assert abs(right) < 1e-9 and vehicle.lane_index[2] == expected[i % 4]
+        assert vehicle.heading == pytest.approx(vehicle.lane.heading_at(along))
+
+
 def test_those_behind_see_our_car_and_brake_or_pass() -> None:
     around = traffic(others=4)
     ours, *others = around.road.vehicles
