@@ -49,7 +49,8 @@ def make_user_entry(agent: object, estimator: object, trust: bool = False) -> En
     """
     parts = {"agent": agent, "estimator": estimator}
     objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
-    return Entry(_label(agent), _label(estimator), objects=objects, trust=trust)
+    label = _label(agent)  # of a zip alone: what else is trusted would lose its tuned options
+    return Entry(label, _label(estimator), objects=objects, trust=trust and label.endswith(ZIP))
 
 
 def _label(source: object) -> str:
@@ -90,11 +91,8 @@ def make_user_entries(
     Returns:
         Entries without repetition.
     """
-    entries = [
-        Entry(agent, estimator, trust=trust and agent.endswith(ZIP))
-        for agent in agents
-        for estimator in estimators or [choose_estimator(agent)]
-    ]
+    pairs = [(agent, one) for agent in agents for one in estimators or [choose_estimator(agent)]]
+    entries = [make_user_entry(*pair, trust) for pair in pairs]
     entries += [Entry(REFERENCE_CONTROLLER, estimator) for estimator in estimators if estimator]
     return list(dict.fromkeys(entries))
 

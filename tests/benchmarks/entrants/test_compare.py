@@ -289,6 +289,12 @@ def test_an_object_called_as_the_packages_does_not_get_its_results(name: str, pa
         ComparisonRequest((make_user_entry(**parts),))
 
 
+def test_trust_of_a_name_does_not_take_its_tuned_options_away() -> None:
+    task, trusted = list_scored_tasks()[0], make_user_entry("lqr", REFERENCE_FILTER, trust=True)
+    assert ControlCase(task, trusted).options == ControlCase(task, on_default("lqr")).options
+    assert make_user_entry("model.zip", "", trust=True).trust
+
+
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "agent": ({"entries": (on_default("lqrr"),)}, "unknown agent 'lqrr'"),
     "estimator": ({"entries": (Entry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
