@@ -69,6 +69,7 @@ class _Live:
             check_used(self, "relay to port latency speed duration json", "--relay")
             self._relay(self.relay, target)
         elif self.replay is not None:
+            check_used(self, "replay estimator agent env json trust", "--replay")
             self._replay(self.replay, setup)
         elif self.estimator is not None:
             check_used(self, " ".join({*vars(self)} - {"to"}), "an ESTIMATOR: see --publish")

@@ -87,8 +87,7 @@ class _Train:
             raise ValueError(f"--varied {varied} is for a new training: an old one keeps its tasks")
         agent, new = prepare_start(self.trained_agent, varied)
         if logs is not None and isinstance(agent, Policy) and agent.network.memory:
-            name = agent.name
-            raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {name}: --out")
+            raise ValueError(f"the zoo's `enjoy` drives nothing with memory as {agent.name}: --out")
         task = trainer.read_training(out).task if resume and out else new(**options)
         start = self.trained_agent.stem if self.trained_agent else ""
         folder = _choose_folder(task, start, out, logs)

@@ -71,6 +71,7 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("live", "--simulate", "--agent", "lqr"), "agent: of no use to --simulate without an EST"),
     (("live", "--simulate", "--json", "a.json", "--record", "a"), "json, record: of no use to"),
     (("lane", "--calibrate", ".", "--out", "camera.json"), "out: of no use to --calibrate"),
+    (("live", "--replay", "a", "--record", "b", "--seed", "1"), "record, seed: of no use to --rep"),
     (("live", "--simulate", "--env", "sideslip/YawVison-v0"), "did you mean"),
     (("live", "--relay", "no-such-file"), "no-such-file"),
     (("live", "exact-kf", "--port", "0", "--gps", "tcp:nowhere"), "expected tcp:HOST:PORT"),
