@@ -13,11 +13,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, list_shipped, load_policy, save_policy
 from sideslip.benchmarks.control import tasks
-from sideslip.benchmarks.control.entries import (
-    LEARNED,
-    ControlCase,
-    Entry,
-)
+from sideslip.benchmarks.control.entries import LEARNED, ControlCase, Entry
 from sideslip.benchmarks.control.run import Chunk, _StoredDrives
 from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
 from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation

@@ -21,12 +21,7 @@ from sideslip.benchmarks.control.entries import (
     make_cases,
 )
 from sideslip.benchmarks.control.run import Chunk, measure
-from sideslip.benchmarks.control.tasks import (
-    YAW,
-    ControlTask,
-    list_scored_tasks,
-    make_salt,
-)
+from sideslip.benchmarks.control.tasks import YAW, ControlTask, list_scored_tasks, make_salt
 from sideslip.benchmarks.report.study import Request
 from sideslip.envs import COMS, FAILURES, SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import make_scenario

@@ -6,12 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.metrics import (
-    EPISODE,
-    METRICS,
-    REDUCTIONS,
-    compute_dissipation,
-)
+from sideslip.benchmarks.harness.metrics import EPISODE, METRICS, REDUCTIONS, compute_dissipation
 
 VALUES = np.array([[0.3, -2.0], [-1.5, 0.5], [0.2, 0.1]])  # of 3 steps and 2 cars
 

@@ -7,12 +7,7 @@ import pytest
 
 pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.procedures import fmvss126
-from sideslip.benchmarks.procedures.drive import (
-    DriveFunction,
-    Fields,
-    Series,
-    TestCar,
-)
+from sideslip.benchmarks.procedures.drive import DriveFunction, Fields, Series, TestCar
 from sideslip.benchmarks.procedures.outside import Law, _simulate_plant
 from sideslip.envs.outside.plants import Drift, make_outside_vehicle
 from sideslip.envs.vehicle.dynamics import Motion

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import fmvss126, iso3888, iso4138, iso7401
-from sideslip.benchmarks.procedures.drive import (
-    CALM,
-    CARS,
-    ENTRIES,
-    DriveFunction,
-)
+from sideslip.benchmarks.procedures.drive import CALM, CARS, ENTRIES, DriveFunction
 from sideslip.benchmarks.procedures.outside import _make_steering_profile
 from sideslip.envs import Scenario
 from sideslip.envs.scenarios.steering import compute_steering

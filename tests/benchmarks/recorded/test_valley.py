@@ -21,12 +21,7 @@ from sideslip.benchmarks.recorded.bicycle_fit import (
     fit,
     make_windows,
 )
-from sideslip.benchmarks.recorded.identify import (
-    POSSIBLE,
-    TYRES,
-    IdentificationResult,
-    identify,
-)
+from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, IdentificationResult, identify
 from sideslip.benchmarks.recorded.quality import find_saturated
 from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
 from sideslip.envs.record import FAST, Array, Log

@@ -13,12 +13,7 @@ from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
-from sideslip.estimators.wires import (
-    SignalCalibration,
-    apply_wires,
-    read_wires,
-    write_vehicle,
-)
+from sideslip.estimators.wires import SignalCalibration, apply_wires, read_wires, write_vehicle
 
 from .simulated import as_table, drive
 from .slalom import columns, saved

@@ -177,8 +177,7 @@ def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "env_id"),
-    [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")],
+    ("name", "env_id"), [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")]
 )
 def test_the_environment_has_the_sensors_the_filter_needs(name: str, env_id: str) -> None:
     assert tune_task.make_estimator_tuning(name, "slalom", seeds=1).env_id == env_id
