@@ -148,30 +148,22 @@ def test_the_bound_that_knows_it_is_a_bound() -> None:
 
 
 @pytest.mark.parametrize(
-    "latency, match",
+    ("name", "options", "error", "message"),
     [
-        ({"gyro": -0.01}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": np.nan}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": 0.6}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": 0.0605}, "a latency of gyro of 0.0605 s is no whole number of ticks"),
-        ({"sonar": 0.1}, "latency is of steer, gyro"),
-        ({"gyro": "find", "steer": "find"}, "is 'find' for one channel"),
+        ("exact-kf", {"gyro": -0.01}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": np.nan}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": 0.6}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": 0.0605}, ValueError, "gyro of 0.0605 s is no whole number of ticks"),
+        ("exact-kf", {"sonar": 0.1}, ValueError, "latency is of steer, gyro"),
+        ("joint", {"gyro": "find", "steer": "find"}, ValueError, "is 'find' for one channel"),
+        ("exact-kf", {"gyro": "find"}, ValueError, "for one channel of a filter with tyres as sta"),
+        ("multirate-residual-kf", LATE, ValueError, "latency, delay='larsen' and delay='buffer' n"),
+        ("exact-kf", 0.06, TypeError, "latency is seconds by channel"),
     ],
 )
-def test_what_a_latency_cannot_be(latency: Any, match: str) -> None:
-    sensors = {"camera": CAMERA}
-    with pytest.raises(ValueError, match=match):
-        make_estimator("exact-kf", **WITH_TYRES, sensors=sensors, speed=7.0, latency=latency)
-
-
-def test_filters_that_cannot_have_one() -> None:
-    common: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": 7.0}
-    with pytest.raises(ValueError, match="'find' for one channel of a filter with tyres as states"):
-        make_estimator("exact-kf", **common, latency={"gyro": "find"})
-    with pytest.raises(ValueError, match="latency, delay='larsen' and delay='buffer' need"):
-        make_estimator("multirate-residual-kf", **common, latency=LATE)
-    with pytest.raises(TypeError, match="latency is seconds by channel"):
-        make_estimator("exact-kf", **common, latency=0.06)
+def test_what_a_latency_cannot_be(name: str, options: Any, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        make_estimator(name, sensors={"camera": CAMERA}, speed=7.0, latency=options)
 
 
 def test_a_lost_filter_says_so_with_a_latency_too() -> None:

@@ -11,7 +11,7 @@ import pytest
 from sideslip.envs.record import PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
+from tests.estimators.dense import Posterior, arrivals, inputs, speeds
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -182,33 +182,6 @@ def test_the_buffer_needs_no_clock(case: Any) -> None:
         assert differences(buffer, mean, cov) < EXACT
     clone.run(log)
     assert clone.counts["unknown"] > 0
-
-
-def test_the_textbooks_formula_says_the_same_as_least_squares() -> None:
-    """mean + P_xy P_yy^-1 (y - C mean), for a record that is short enough to square."""
-    told = dataclasses.replace(CASES["forces, camera"], rows=20)
-    log = told.schedule(3)
-    names = ["beta", "gamma", "psi", "y_l", "F_d", "N_d"]
-    whole = told.posterior(names, log.record)
-    quiet = told.posterior(names, Record(log.record.fast, log.record.packets[:0], dt=told.dt))
-    T, m, n = whole.T.reshape(-1, whole.T.shape[2]), quiet.mean.ravel(), len(names)
-    C: Any = [np.eye(1, len(m), n * k + 1)[0] for k in range(20)]
-    y, r = list(log.record.fast[:, 0]), [GYRO**2] * 20
-    seen: Any = set()
-    for packet in log.record.packets:
-        k = int(packet[PACKET.captured])
-        if k not in seen:
-            C += [np.eye(1, len(m), n * k + 2)[0], np.eye(1, len(m), n * k + 3)[0]]
-            y += [packet[PACKET.value], packet[PACKET.value + 1]]
-            r += [3.5e-3**2, 0.02**2]
-        seen.add(k)
-    C, P = np.array(C), T @ T.T
-    gain = np.linalg.solve(C @ P @ C.T + np.diag(r), C @ P).T
-    mean, cov = m + gain @ (np.array(y) - C @ m), P - gain @ C @ P
-    found, spread = whole.at(19)
-    sd = np.sqrt(np.diag(spread))
-    assert np.abs((mean[-n:] - found) / sd).max() < 1e-8
-    assert np.abs((cov[-n:, -n:] - spread) / np.outer(sd, sd)).max() < 1e-8
 
 
 def test_a_late_sample_used_at_once_is_the_sample_used_in_time() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
 from sideslip.estimators import make_estimator
-from tests.estimators.simulation import CAMERA, FIG6, FIG7, GPS, error, simulate
+from tests.estimators.simulation import CAMERA, FIG7, error, simulate
 
 SEEDS = range(40)
 
@@ -15,11 +15,6 @@ SEEDS = range(40)
 @pytest.fixture(scope="module")
 def fig7() -> Any:
     return [simulate(FIG7, {"camera": CAMERA}, seed) for seed in SEEDS]
-
-
-@pytest.fixture(scope="module")
-def fig6() -> Any:
-    return [simulate(FIG6, {"gps": GPS}, seed) for seed in SEEDS]
 
 
 def rmse(name: Any, logs: Any, drive: Any, **options: Any) -> Any:
@@ -41,9 +36,3 @@ def test_vision_beats_the_bicycle_model(fig7: Any) -> None:
         assert bicycle / other >= 1.05
     assert residual <= 1.10 * multirate  # "proposed best" does not hold
     assert rmse("multirate-kf", fig7, FIG7, delay="ignore") > 1.5 * multirate
-
-
-@pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
-def test_disturbance_accommodation_beats_the_three_state_filter(fig6: Any) -> None:
-    """dakf-stability Fig. 6."""
-    assert rmse("dakf", fig6, FIG6) <= 0.75 * rmse("course-kf", fig6, FIG6)

@@ -11,7 +11,6 @@ import pytest
 
 from sideslip.envs import COMS
 from sideslip.envs.numerics.simd import LANES
-from sideslip.envs.numerics.simd8 import pad_to_cache_line
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
@@ -189,11 +188,3 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     small = list(itertools.takewhile(lambda each: each[0].itemsize <= 64 * 8, behind))
     assert small[-1][1] + small[-1][0].itemsize == 8 * (P + N_TOTAL * N_TOTAL + N_SMALL)
     assert len(small) > 80
-
-
-def test_a_dtype_is_whole_lines_whatever_its_fields_are() -> None:
-    """They are many as a filter's are, or few; what is filled up has no name of theirs."""
-    for count in (1, 7, 8, 9):
-        made = pad_to_cache_line([("rest", np.float64, (count,)), ("x", np.int64)])
-        assert made.itemsize == 64 * -(-(count + 1) // 8) and made.names is not None
-        assert made.names[:2] == ("rest", "x")

@@ -131,18 +131,6 @@ def test_nees_is_told_where_the_truth_is(mode: str) -> None:
             assert "nees" not in other[4]
 
 
-@pytest.mark.parametrize("told", [{}, {"autoreset_mode": "SameStep", "info": "ends"}])
-def test_the_spec_builds_environments_wrapped_one_by_one(told: dict[str, Any]) -> None:
-    env = gym.make_vec(VISION, num_envs=2, **told)
-    together = EstimateObservation(env, "multirate-kf")
-    assert together.spec is not None
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
-    assert again.num_envs == 2
-    assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
-    one, other = again.reset(seed=4)[0], together.reset(seed=4)[0]
-    assert one.tobytes() == other.tobytes()
-
-
 def test_the_spec_tells_of_the_truth_too() -> None:
     told: dict[str, Any] = {"autoreset_mode": "SameStep", "on_bad_action": "fail"}
     env = gym.make_vec(VISION, num_envs=2, **told)

@@ -89,17 +89,9 @@ def test_layout_and_space_describe_the_observation() -> None:
         check_env(alone, skip_render_check=True)
 
 
-def test_nees_is_the_normalised_error_per_output() -> None:
-    env: Any = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
-    env.reset(seed=1)
-    for _ in range(40):
-        *_, info = env.step(still(env))
-        e = env.estimator.x[:2] - [info["beta"], info["gamma"]]
-        P = env.estimator.P[:2, :2]
-        assert info["nees"] == pytest.approx(e @ np.linalg.solve(P, e) / 2.0, rel=1e-9)
-        assert isinstance(info["nees"], float)
+def test_nees_is_the_normalised_error_of_the_outputs_alone() -> None:
     for output, i in (("beta", 0), ("gamma", 1)):
-        env = EstimateObservation(gym.make(VISION, **FIG7), "multirate-kf", outputs=[output])
+        env: Any = EstimateObservation(gym.make(VISION, **FIG7), "multirate-kf", outputs=[output])
         env.reset(seed=1)
         *_, info = env.step(still(env))
         e = env.estimator.x[i] - info[output]
