@@ -38,9 +38,7 @@ def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
             assert each.teacher.width == 1
 
 
-def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contests(
-    tmp_path: Path,
-) -> None:
+def test_what_a_student_sees_besides_stands_in_lessons_card_and_tasks(tmp_path: Path) -> None:
     seen: dict[str, Any] = {"with_map": True, "fast": "all"}
     lessons = Lessons("coms-zero-slip", "", "none", 2, observation_options=seen)
     card, lesson = lessons.make_card(), lessons.make_tasks()[0]

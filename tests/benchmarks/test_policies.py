@@ -90,7 +90,7 @@ def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
     assert table.cells[2]["cost ratio"] in said[1]  # one statistic on a screen
 
 
-def test_without_the_classical_line_the_rest_is_told(
+def test_without_a_classical_line_the_rest_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sideslip.benchmarks.studies.policies.FILTER", "nobody-kf")
@@ -125,7 +125,7 @@ def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) 
     assert agent.needs == ("gyro",)
 
 
-def test_seeds_and_cached_cases_are_of_these_weights(
+def test_seeds_and_cases_are_of_the_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = a_file(tmp_path)

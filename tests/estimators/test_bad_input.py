@@ -64,9 +64,7 @@ SHORT = type(FIG7)(duration=0.3)
         ("dual-rate", {"gains": "placed"}, ValueError, "dual-rate: poles are negative.*, got ..$"),
     ],
 )
-def test_constructor_errors_name_the_thing(
-    name: Any, options: Any, error: Any, message: Any
-) -> None:
+def test_constructor_errors_name_it(name: Any, options: Any, error: Any, message: Any) -> None:
     with pytest.raises(error, match=message):
         make_estimator(name, **({"sensors": BOTH} | options))
 
@@ -99,9 +97,7 @@ def test_every_number_but_one_has_a_limit(key: str) -> None:
         (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "can hold 8"),
     ],
 )
-def test_schedules_that_a_filter_cannot_hold(
-    sensor: Any, name: Any, options: Any, message: Any
-) -> None:
+def test_schedules_that_do_not_fit(sensor: Any, name: Any, options: Any, message: Any) -> None:
     with pytest.raises(ValueError, match=message):
         make_estimator(name, sensors={"camera": sensor}, **options)
 

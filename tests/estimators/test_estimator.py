@@ -30,9 +30,7 @@ def log() -> Log:
         ("joint", {}, [0]),
     ],
 )
-def test_it_is_that_of_the_records(
-    log: Log, name: str, options: dict[str, Any], layers: list[int]
-) -> None:
+def test_it_is_its_records(log: Log, name: str, options: dict[str, Any], layers: list[int]) -> None:
     estimator = make_estimator(name, sensors=log.slow, **options)
     estimator.run(log)
     x, P = np.zeros(0), np.zeros((len(estimator.names),) * 2)

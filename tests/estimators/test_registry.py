@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-import sideslip
 from sideslip.agents import AGENTS, register_agent
 from sideslip.estimators import FILTERS, make_estimator, register_estimator
 from sideslip.estimators.make import ESTIMATORS
-from sideslip.estimators.registry import Registry, _import_entry_point, find_entry_point
+from sideslip.estimators.registry import _import_entry_point, find_entry_point
 from tests.estimators.wrappers.constant import Constant
 
 CONSTANT = "tests.estimators.wrappers.constant:Constant"
@@ -97,10 +96,3 @@ def test_what_can_be_found_again_has_an_entry_point(monkeypatch: pytest.MonkeyPa
     nameless: Any
     for nameless in (lambda: None, Constant(), Constant().reset):
         assert find_entry_point(nameless) is None
-
-
-def test_names_are_those_of_one_registry() -> None:
-    assert sideslip.register_estimator is register_estimator
-    assert sideslip.register_agent is register_agent
-    own = Registry("thing", {})
-    assert list(own) == []

@@ -45,9 +45,7 @@ def files(folder: Path) -> list[str]:
         (("--write",), "package/clairvoyant.json"),
     ],
 )
-def test_it_writes_beside_the_user(
-    arguments: tuple[str, ...], written: str, run: Run, here: Path
-) -> None:
+def test_it_writes_beside(arguments: tuple[str, ...], written: str, run: Run, here: Path) -> None:
     status, out, _ = run("calibrate", *arguments, "--contest", FIRST.name, "--seeds", 2, "-j", 1)
     assert status == 0 and "wrote " in out
     assert files(here) == [written]

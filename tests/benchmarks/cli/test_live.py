@@ -22,9 +22,7 @@ def short(tmp_path: Path) -> Path:
     return path
 
 
-def test_both_ends_in_lock_step_and_the_session_again(
-    run: Run, short: Path, tmp_path: Path
-) -> None:
+def test_both_ends_in_lock_step_and_their_session(run: Run, short: Path, tmp_path: Path) -> None:
     session, numbers = tmp_path / "a.session", tmp_path / "a.json"
     files = "--record", session, "--json", numbers
     status, out, _ = run(*BOTH, "--step", "--scenario", short, *files)

@@ -44,9 +44,7 @@ def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -
     assert options.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
 
 
-def test_write_changes_the_shipped_file(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_changes_ours(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "FILE", tmp_path / "shipped.toml")
     tune_file.update(options.FILE, ENTRY)
     assert run(*FIG8, *FEW, "--write")[0] == 0

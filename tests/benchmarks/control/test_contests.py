@@ -112,9 +112,7 @@ def test_a_rung_that_cannot_be_computed_leaves_the_other_or_the_reason() -> None
         assert "no plant" in lost.verdict and lost.slip_gap == 0.0
 
 
-def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions(
-    tmp_path: Path,
-) -> None:
+def test_the_file_holds_every_number_of_this_version_alone(tmp_path: Path) -> None:
     path = tmp_path / "contests.json"
     entry = found(ONE, BOTH)
     path.write_text(json.dumps([dataclasses.asdict(entry)]))

@@ -60,9 +60,7 @@ def test_one_nan_ends_its_episode_alone(tmp_path: Path) -> None:
     assert driven.mark_failures("bad-action").tolist() == [0.0, 1.0, 0.0]
 
 
-def test_what_it_does_to_its_process_is_its_result(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_ends_a_process_is_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends, or never returns; the numbers of one that drives are those of this process."""
     gone = IsolatedDrive()(chunk(tmp_path, "os._exit(3)"))
     assert gone.error == "its process ended with status 3"

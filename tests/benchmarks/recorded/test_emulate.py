@@ -61,9 +61,7 @@ def test_a_gyro_bias_reaches_the_estimators_but_not_the_heading(log: Log) -> Non
     np.testing.assert_array_equal(two.packets, one.packets)
 
 
-def test_no_course_where_the_truth_is_unknown_and_none_to_use_at_a_standstill(
-    tmp_path: Path,
-) -> None:
+def test_no_course_without_truth_and_none_to_use_at_a_standstill(tmp_path: Path) -> None:
     beta, speed = columns()["sideslip_rad"], np.full(ROWS, SPEED)
     beta[95:105] = np.nan
     speed[:50] = 0.5

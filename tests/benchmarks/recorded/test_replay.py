@@ -110,9 +110,7 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
         assert text
 
 
-def test_a_log_without_truth_or_slow_sensors_runs_and_says_what_it_leaves_out(
-    tmp_path: Path,
-) -> None:
+def test_a_log_without_truth_or_slow_sensors_says_what_is_left_out(tmp_path: Path) -> None:
     log = read_log(saved(tmp_path, sideslip_rad=None))
     suite = replay(log, PASSENGER_CAR)
     assert set(values(suite, "us_per_tick")) == {GYRO_ONLY}
@@ -206,9 +204,7 @@ def test_no_course_is_emulated_in_a_part_that_lacks_the_logs_own(tmp_path: Path)
     assert "Part 2 has no sample of gps." in suite.text and "emulated" not in suite.text
 
 
-def test_without_gps_and_truth_the_inertial_sensors_serve_more_than_one_filter(
-    tmp_path: Path,
-) -> None:
+def test_without_gps_and_truth_inertial_sensors_serve_two_filters(tmp_path: Path) -> None:
     rows = read_csv(saved(tmp_path))
     rows = rows.drop(columns=[name for name in ("course_rad", "sideslip_rad") if name in rows])
     rows.assign(accel_y_mps2=0.0).to_csv(tmp_path / "bare.csv", index=False)

@@ -119,9 +119,7 @@ def test_rows_that_are_alike_count_once() -> None:
         assert _estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
 
 
-def test_a_car_that_cannot_be_is_not_identified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_car_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is written, the exit status is 1, and a replay keeps the stated car."""
     results: list[IdentificationResult] = []
 
@@ -168,9 +166,7 @@ def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
         pytest.param(range(100, 130), (None, TYRES[0]), marks=pytest.mark.long),
     ],
 )
-def test_estimators_do_not_get_worse_on_another_drive(
-    seeds: range, laws: tuple[str | None, ...]
-) -> None:
+def test_estimators_get_no_worse_elsewhere(seeds: range, laws: tuple[str | None, ...]) -> None:
     """By the drawn cars together, for the chosen law and the linear one of a replay: with the
     steering, latency and noise that were found, and with the car alone. The chosen law's intervals
     hold the small-slip stiffness and the inertia per mass."""

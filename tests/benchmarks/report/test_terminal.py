@@ -2,14 +2,25 @@
 
 import io
 import re
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.harness.results import Column, ResultTable, Suite
+from sideslip.benchmarks.harness.stats import Estimate
+from sideslip.benchmarks.report.study import Request, Study
 from sideslip.benchmarks.report.tables import print_run, print_suite
 from sideslip.estimators.make import ESTIMATORS
+
+pytest.importorskip("plotly")
+pytest.importorskip("moviepy")
+from sideslip.benchmarks.report import figures
+from sideslip.benchmarks.report.film import check_film, make_track_kml
+from sideslip.benchmarks.report.html import check_page, write_report
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
 ROWS = [[f"contestant {k} on a filter", *(100 * k + i + 0.5 for i in range(12))] for k in (1, 2)]
@@ -101,3 +112,95 @@ def test_a_run_fits_on_a_screen_and_says_where_the_rest_is(count: int) -> None:
     rest = "tables, with notes and figures, are in a report: --html FILE."
     assert lines[-1] == f"All {3 * count} {rest}"
     assert ("filter-0" in written.getvalue()) == (count <= 2)
+
+
+def run(request: Request, **options: Any) -> Suite:
+    def add_tables(suite: Suite, seeds: int) -> None:
+        suite.add_rows([{"controller": "lqr", "cost": float(seeds)}], scenario="gust")
+
+    study = Study("s", "S?", "Text.", (8, 2), lambda r: r.episodes, add_tables, str, **options)
+    return study.run(request)
+
+
+@pytest.mark.parametrize(
+    ("request_", "seeds"),
+    [(Request(), "8"), (Request(quick=True), "2"), (Request(quick=True, episodes=5), "5")],
+)
+def test_a_study_runs_the_seeds_that_are_asked_for(request_: Request, seeds: str) -> None:
+    suite = run(request_)
+    assert suite.verdict == seeds and suite.rows[0].value == float(seeds)
+
+
+def test_a_study_without_its_module_says_so() -> None:
+    suite = run(Request(), needs=("no_such_module", "Not run."))
+    assert suite.verdict == "Not run." and suite.rows == []
+
+
+def test_pictures_are_drawn_where_plotly_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+    run(Request(), add_figures=lambda *arguments: drawn.append(arguments))
+    assert drawn[0][1] == 8 and drawn[0][2].draw_groups
+    monkeypatch.setattr("sideslip.benchmarks.report.study.import_figures", lambda: None)
+    run(Request(), add_figures=lambda *arguments: drawn.append(arguments))
+    assert len(drawn) == 1
+
+
+def test_metrics_of_a_record_become_rows() -> None:
+    """What is no metric is for tables alone; a number that is not finite has no row."""
+    suite = Suite("s", "S", "")
+    record = {"estimator": "dakf", "rmse": Estimate(1.0, 0.5, 2.0), "note": "none", "rank": None}
+    suite.add_rows([record | {"cost": np.float64(3), "gap": np.nan}], "Id-v0", scenario="a", n=7)
+    rmse, cost = suite.rows
+    assert (rmse.suite, rmse.estimator, rmse.scenario, rmse.n) == ("s", "dakf", "a", 7)
+    assert (rmse.metric, rmse.value, rmse.low, rmse.high) == ("rmse", 1.0, 0.5, 2.0)
+    assert (cost.metric, cost.value, cost.salt) == ("cost", 3.0, "fixed")
+    assert cost.env_version.startswith("Id-v0 ")
+
+
+def test_seeds_are_run_in_chunks_of_each_condition() -> None:
+    def square(case: tuple[int, Any]) -> list[dict[str, tuple[float, float]]]:
+        assert len(case[1]) <= 2
+        return [{"a": (case[0], seed), "b": (0.0, 1.0)} for seed in case[1]]
+
+    one, other = Request(jobs=1).run_seeds(square, (3, 4), 5, 2, "")
+    assert [drive["a"] for drive in one] == [(3, 0), (3, 1), (3, 2), (3, 3), (3, 4)]
+    assert [drive["a"][0] for drive in other] == [4] * 5 and other[0]["b"] == (0.0, 1.0)
+
+
+FEW, MANY, NAN = np.arange(2.0), np.arange(3.0), np.array([0.0, np.nan])
+SHORT_ROW = Suite("s", "S", "", tables=[ResultTable("short row", ("a", "b"), [["1"]])])
+
+
+def write_unmarked_page(folder: Path) -> None:
+    (folder / "page.md").write_text("<!-- tables of one -->\nold\n")
+    check_page(folder / "page.md", ["one"])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda _: figures.draw_time_series(MANY, {"dakf": FEW}, "x"), ValueError,
+         "'dakf' has shape"),
+        (lambda _: figures.draw_track({"truth": (MANY, FEW)}), ValueError, "track 'truth'"),
+        (lambda _: figures.draw_curves(FEW, {"a": MANY}, "x", "y"), ValueError,
+         "has 3 values, x 2"),
+        (lambda at: write_report(at / "a.html", [SHORT_ROW], "", {}), ValueError,
+         r"short row.*1 cells under 2 headers"),
+        (lambda at: write_report(at / "a.html", [], "", {}), ValueError, "at least one suite"),
+        (lambda at: check_film(at / "film.avi"), ValueError,
+         r"a film ends in .mp4 or .gif, got '.*film.avi'"),
+        (lambda at: check_film(at / "a"), ValueError, "a film ends in .mp4 or .gif"),
+        (lambda at: check_film(at / "none/a.mp4"), FileNotFoundError, "no such folder"),
+        (lambda _: make_track_kml("x", {}), ValueError, "track"),
+        (lambda _: make_track_kml("x", {"short": (MANY, FEW)}), ValueError, "track"),
+        (lambda _: make_track_kml("x", {"lost": (NAN, FEW)}), ValueError, "track"),
+        (write_unmarked_page, ValueError,
+         r"page\.md: expected the lines <!-- tables of SUITE -->"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_refused(
+    call: Callable[[Path], Any], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        call(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["page.md"])

@@ -67,9 +67,7 @@ def test_the_objective_is_minus_the_mean_score() -> None:
     assert _compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_an_adaptive_contestant_is_tuned_on_the_filter_it_follows(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_adaptive_contestant_is_tuned_on_its_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which takes no option, and drives after a short lead-in."""
     asked: list[ControlCase] = []
     monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
@@ -101,9 +99,7 @@ def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPa
     assert _compute_objective(bad, SEEDS, {"pole": -1.0}) == math.inf
 
 
-def test_of_a_slow_contestant_the_worse_half_stops_early(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_of_slow_entries_half_stops_early(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The rest goes on with new seeds, and is judged by the mean of all that it has driven."""
     asked: list[tuple[int, ...]] = []
 
@@ -234,9 +230,7 @@ def test_a_mistake_is_one_line_that_names_it(
     assert status == 2 and message in " ".join(err.split())
 
 
-def test_the_command_writes_options_and_log(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_both(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(controllers, "list_scored_tasks", lambda: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)

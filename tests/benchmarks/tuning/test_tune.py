@@ -176,13 +176,6 @@ def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
     assert (task.env_id, task.sensors, task.unit) == ("sideslip/YawVision-v0", "camera", "rad")
 
 
-@pytest.mark.parametrize(
-    ("name", "env_id"), [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")]
-)
-def test_the_environment_has_the_sensors_the_filter_needs(name: str, env_id: str) -> None:
-    assert tune_task.make_estimator_tuning(name, "slalom", seeds=1).env_id == env_id
-
-
 def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Path) -> None:
     held = {"q_gamma": 1e-2}
     task = tune_task.make_estimator_tuning(

@@ -127,7 +127,7 @@ LIES: list[tuple[str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("sensor", "lie"), LIES, ids=str)
-def test_told_a_noise_that_is_1_5_times_too_small_or_no_delay_it_is_not(
+def test_told_1_5_times_too_little_noise_or_no_delay_it_is_not(
     prompt: Runs, sensor: Any, lie: Any
 ) -> None:
     verdict = judge(exact(prompt.drives, prompt.logs[0], (sensor,), **lie), prompt.logs)
@@ -135,9 +135,7 @@ def test_told_a_noise_that_is_1_5_times_too_small_or_no_delay_it_is_not(
 
 
 @pytest.mark.parametrize("sensors", SETS, ids="-".join)
-def test_what_it_says_of_every_state_is_the_recursion_in_textbook_letters(
-    prompt: Runs, sensors: Any
-) -> None:
+def test_what_it_says_of_every_state_is_the_textbooks_recursion(prompt: Runs, sensors: Any) -> None:
     drives, log = prompt.drives, prompt.logs[0]
     filter_ = exact(drives, log, sensors)
     best = variances(drives.vehicle, sensors=told(log, *sensors), speed=drives.speed, seconds=1.0)

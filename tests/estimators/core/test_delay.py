@@ -108,9 +108,7 @@ def held_residuals(log: Any, age: Any) -> Any:
     ],
     ids=["stored", "constant"],
 )
-def test_a_sample_meets_the_prediction_of_its_capture_or_of_an_assumed_one(
-    age: Any, options: Any
-) -> None:
+def test_a_sample_meets_the_prediction_of_its_capture_or_another(age: Any, options: Any) -> None:
     log = simulate(QUICK, {"camera": UNEVEN}, 3)
     filter_ = make_estimator(
         "multirate-kf", sensors=log.slow, speed=V, gains="covariance", **options, **Q

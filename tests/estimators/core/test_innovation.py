@@ -61,9 +61,7 @@ def test_the_gate_refuses_as_many_good_samples_as_it_says(log: Any) -> None:
 
 @pytest.mark.parametrize("delay", ["clone", "buffer"])
 @pytest.mark.parametrize("sensor", [0, 1])
-def test_an_outlier_leaves_the_filter_as_if_it_had_never_come(
-    log: Any, delay: Any, sensor: Any
-) -> None:
+def test_an_outlier_leaves_it_as_if_it_had_never_come(log: Any, delay: Any, sensor: Any) -> None:
     """Bit for bit, also where it comes in the midst of others."""
     filter_ = told_the_truth(delay=delay, gate=0.9999)
     record = Record(log.record.fast[:3000], log.record.packets)

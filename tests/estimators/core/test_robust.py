@@ -240,9 +240,7 @@ def test_on_a_strange_car_its_intervals_mean_something() -> None:
 
 
 @pytest.mark.parametrize(("name", "options"), [("joint", {}), ("exact-kf", WITH_TYRES)])
-def test_ten_minutes_at_a_standstill_change_nothing_that_is_not_seen(
-    name: str, options: dict[str, Any]
-) -> None:
+def test_a_standstill_changes_nothing_that_is_not_seen(name: str, options: dict[str, Any]) -> None:
     """Gyro and accelerometer are off, the wheels' noise is all that moves; then it drives again."""
     scenario = {
         "base": "random-steering",

@@ -57,9 +57,7 @@ def squares(filter_: Estimator, log: Log, since: int = SETTLED) -> tuple[float, 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0])
 @pytest.mark.parametrize("friction", [0.4, 0.9])
-def test_the_law_is_the_plants_and_its_slopes_are_differences(
-    factor: float, friction: float
-) -> None:
+def test_the_law_is_the_plants_and_slopes_differences(factor: float, friction: float) -> None:
     C, F_z = 24000.0, 4000.0
     for alpha in (-0.3, -0.02, -0.001, 0.004, 0.05, 0.2):
         at = (alpha, factor, 1.0 / friction)

@@ -37,9 +37,7 @@ def log() -> Any:
 
 
 @pytest.mark.parametrize("delay", ["clone", "buffer", "larsen", "stored", "ignore"])
-def test_a_gps_in_the_cameras_place_gives_the_same_bits(
-    delay: str, log: Any, monkeypatch: Any
-) -> None:
+def test_a_gps_in_the_cameras_place_has_its_bits(delay: str, log: Any, monkeypatch: Any) -> None:
     """Noise by 1/V at the capture, HDOP, satellites and the heading fix go with it."""
     table = None if delay == "larsen" else [(1.0, 1.0), (8.0, 8.0)]
     options: dict[str, Any] = {"delay": delay, "gains": "covariance", "hdop_table": table}

@@ -12,7 +12,7 @@ from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import FAST
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.actuators import compute_yaw_moment
-from sideslip.envs.vehicle.linear import make_course_model, make_vision_model
+from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
@@ -68,39 +68,6 @@ def test_dakf_is_the_papers_discrete_model() -> None:
     np.testing.assert_array_equal(f.C_fast[0, :5], [0, 1, 0, 0, 0])  # (19)
     np.testing.assert_array_equal(f.C[1, 0, :5], [1, 0, 1, 0, 0])
     assert filter_.names == ("beta", "gamma", "psi", "d1", "d2")
-
-
-def rank(A: Any, C: Any) -> Any:
-    rows = [C]
-    for _ in range(len(A) - 1):
-        rows.append(rows[-1] @ A)
-    return np.linalg.matrix_rank(np.vstack(rows), tol=1e-9)
-
-
-def test_dakf_sees_four_of_five_directions() -> None:
-    """The paper's IV.D claims five."""
-    V = 25.0 / 3.6
-    model = make_course_model(COMS, V)
-    A = np.zeros((5, 5))
-    A[:3, :3] = model.A
-    A[0, 3] = A[1, 4] = 1.0
-    C = np.hstack([model.C, np.zeros((2, 2))])
-    assert rank(A, C) == 4
-    assert rank(model.A, model.C) == 3
-    with pytest.warns(UserWarning, match="cannot see"):
-        (named,) = make_estimator("dakf", sensors={"gps": GPS}, speed=V).unobservable
-    parts = dict(part.split() for part in named.split(", "))
-    direction = np.array([float(parts.get(s, 0.0)) for s in ("beta", "gamma", "psi", "d1", "d2")])
-    assert direction[0] == 1.0 and direction[2] == -1.0
-    assert np.abs(C @ direction).max() < 1e-9
-    assert np.abs(A @ direction).max() < 2e-3 * np.abs(direction).max()  # four digits are printed
-
-
-def test_vision_sees_everything() -> None:
-    model = make_vision_model(COMS, 25.0 / 3.6)
-    assert rank(model.A, model.C) == 4
-    assert rank(model.A, model.C[1:]) == 4  # from vision alone
-    assert make_estimator("multirate-kf", sensors={"camera": CAMERA}, speed=7.0).unobservable == ()
 
 
 def test_the_course_noise_grows_as_one_over_speed() -> None:

@@ -130,7 +130,7 @@ STEERING = {"base": "random-steering", "duration": 6.0}
     ],
     ids=["accelerometer", "accelerometer, slalom", "accelerometer's bias", "road's bank"],
 )
-def test_a_sensor_or_a_state_for_it_halves_the_error_of_beta(
+def test_a_sensor_or_its_state_halves_the_error(
     scenario: Any, less: Any, more: Any, score: Any
 ) -> None:
     errors = []

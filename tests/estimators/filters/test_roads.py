@@ -55,7 +55,7 @@ def nees(found: list[Any], told: bool, sensors: tuple[str, ...], **options: Any)
 
 
 @pytest.mark.parametrize("sensors", SETS, ids="-".join)
-def test_psi_follows_the_heading_against_the_road_within_its_deviation(
+def test_psi_is_the_heading_against_the_road_as_sure_as_it_says(
     prompt: list[Any], sensors: Any
 ) -> None:
     """And does not where the input is missing; the course is one over the ground."""

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.simulation import CAMERA, FIG7, simulate
+from tests.estimators.simulation import CAMERA, FIG7, error, simulate
 
 from .literal import T, car, correct, due, excited, gain, inputs, observer, settled, stationary, zoh
 
@@ -222,3 +223,32 @@ def test_pseudo_residuals_follow_the_papers_four_steps(inverse: Any) -> None:
         "multirate-residual-kf", sensors=log.slow, speed=V, inverse=inverse, **Q
     )
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)
+
+
+SEEDS = range(40)
+
+
+@pytest.fixture(scope="module")
+def fig7() -> Any:
+    return [simulate(FIG7, {"camera": CAMERA}, seed) for seed in SEEDS]
+
+
+def rmse(name: Any, logs: Any, drive: Any, **options: Any) -> Any:
+    tuned = {**PAPER_TUNINGS.get(name, {}), **options}
+    filter_ = make_estimator(
+        name, vehicle=drive.told, sensors=logs[0].slow, speed=drive.speed, **tuned
+    )
+    return np.sqrt(np.mean([error(filter_.run(log), log) for log in logs]))
+
+
+@pytest.mark.smoke
+def test_vision_beats_the_bicycle_model(fig7: Any) -> None:
+    """tie-vision Fig. 7."""
+    bicycle = rmse("bicycle-kf", fig7, FIG7)
+    multirate = rmse("multirate-kf", fig7, FIG7)
+    residual = rmse("multirate-residual-kf", fig7, FIG7)
+    assert bicycle == pytest.approx(5.75e-3, abs=0.1e-3)
+    for other in (multirate, residual, rmse("single-rate-kf", fig7, FIG7)):
+        assert bicycle / other >= 1.05
+    assert residual <= 1.10 * multirate  # "proposed best" does not hold
+    assert rmse("multirate-kf", fig7, FIG7, delay="ignore") > 1.5 * multirate

@@ -151,9 +151,7 @@ def test_a_record_without_rows_or_of_other_ticks() -> None:
         ({"gyro_noise": 0.1}, r"passed as options=\{'gyro_noise': 0.1\}"),
     ],
 )
-def test_a_misplaced_argument_is_refused_with_the_nearest_name(
-    argument: dict[str, Any], message: str
-) -> None:
+def test_a_misplaced_argument_is_named_and_refused(argument: dict[str, Any], message: str) -> None:
     with pytest.raises(TypeError, match=message):
         EstimateObservation(gym.make(VISION), "exact-kf", **argument)
     with pytest.raises(TypeError, match=message):

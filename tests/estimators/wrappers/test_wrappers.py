@@ -42,9 +42,7 @@ def still(env: Any) -> Any:
     ],
 )
 @pytest.mark.parametrize("control_period", [1, 10, 33])
-def test_the_wrapped_filter_equals_the_filter_on_the_log(
-    env_id: Any, name: Any, control_period: Any
-) -> None:
+def test_the_wrapped_filter_equals_it_on_a_log(env_id: Any, name: Any, control_period: Any) -> None:
     """Equal bits for every control period, and what is observed is what the filter says."""
     seconds, options = {"duration": 0.7}, dict[str, Any]()
     if ":" in name:  # a user's own
