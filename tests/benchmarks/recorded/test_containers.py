@@ -418,3 +418,15 @@ def test_a_bag_without_what_is_asked_is_refused(tmp_path: Path, label: str, mess
         (path / "metadata.yaml").unlink()
     with pytest.raises(ValueError, match=message):
         read_parts(path, BAG | {"yaw_rate_radps": label})
+
+
+def test_a_value_that_is_not_available_is_no_measurement(tmp_path: Path) -> None:
+    def lose(i: int, frame: Any) -> None:
+        if frame.arbitration_id == 256 and 400 <= i < 410:
+            frame.data[2:4] = b"\xff\x7f"
+
+    path = write_trace(tmp_path, "drive.log", lose)
+    dbc = write_dbc(tmp_path, DBC + 'VAL_ 256 YawRate 32767 "Signal_Not_Available" ;\n')
+    (log,), remarks = read_parts(path, {**COLUMNS, "dbc": str(dbc)})
+    assert np.abs(log.record.fast[:, FAST.gyro]).max() < 3.9
+    assert any("not available are left out" in text for text in remarks)

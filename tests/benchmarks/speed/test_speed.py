@@ -28,6 +28,12 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plant, "CARS", 32)
 
 
+def measure(part: Any) -> tuple[Suite, dict[str, Any], dict[str, str]]:
+    """The suite, the times taken and the reasons of the absent ones of a part's workloads."""
+    measured, workloads = Suite("speed", "", ""), part.make_workloads()
+    return measured, workloads.measure(measured, SHORT), workloads.absent
+
+
 def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
     for name in packages:
         monkeypatch.setitem(sys.modules, name, None)
@@ -36,9 +42,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the optional packages: the suite needs none of them."""
     without(monkeypatch, "highway_env", "envpool")
-    measured = Suite("speed", "", "")
-    workloads = env_steps.make_workloads()
-    taken, absent = workloads.measure(measured, SHORT), workloads.absent
+    measured, taken, absent = measure(env_steps)
     assert {env_steps.FUSION_V1, env_steps.V1_AT_ONCE, env_steps.FILTERED} <= set(taken)
     assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
     assert absent == {
@@ -119,9 +123,7 @@ def test_a_compiler_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
 def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
-    measured = Suite("speed", "", "")
-    workloads = plant.make_workloads()
-    taken, absent = workloads.measure(measured, SHORT), workloads.absent
+    measured, taken, absent = measure(plant)
     assert set(taken) == {plant.PLANT}
     assert absent == {plant.C: "no C compiler"}
     assert "no C compiler" in measured.tables[0].note
@@ -130,9 +132,7 @@ def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) 
 def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "torch", "stable_baselines3")
     monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
-    measured = Suite("speed", "", "")
-    workloads = learning.make_workloads()
-    taken, absent = workloads.measure(measured, SHORT), workloads.absent
+    measured, taken, absent = measure(learning)
     assert taken == {} and measured.tables == []
     assert absent[learning.PENDULUM] == "stable-baselines3 is not installed"
 

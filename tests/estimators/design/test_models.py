@@ -16,6 +16,7 @@ from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
+from sideslip.estimators.design import kalman
 from sideslip.estimators.design.assemble import _make_signals
 from tests.envs.vehicle.test_linear import make_velocity_roll_model
 from tests.estimators.filters.literal import car
@@ -112,3 +113,36 @@ def test_the_second_layer_is_the_linear_model_at_every_yaw_rate(turning: float) 
     G, H = model.discretise(float(f.step))
     np.testing.assert_allclose(f.G[:4, :4], G, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(f.H[:4, :2], H, rtol=1e-12, atol=1e-15)
+
+
+def some(seed: Any) -> Any:
+    rng = np.random.default_rng(seed)
+    A, C = rng.standard_normal((4, 4)), rng.standard_normal((2, 4))
+    L = rng.standard_normal((2, 2))
+    return rng, A @ A.T, C, L @ L.T
+
+
+@pytest.mark.smoke
+@pytest.mark.plain
+def test_the_gain_is_conditioning_of_the_joint_gaussian() -> None:
+    rng, P, C, R = some(0)
+    x, y = rng.standard_normal(4), rng.standard_normal(2)
+    joint = np.block([[P, P @ C.T], [C @ P, C @ P @ C.T + R]])
+    S = np.linalg.inv(joint[4:, 4:])
+    K = kalman.kalman_gain(P, C, R)
+    mean, cov = x + K @ (y - C @ x), kalman.joseph_form(P, K, C, R)
+    np.testing.assert_allclose(mean, x + joint[:4, 4:] @ S @ (y - C @ x), rtol=1e-10)
+    np.testing.assert_allclose(cov, P - joint[:4, 4:] @ S @ joint[4:, :4], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.smoke
+@pytest.mark.plain
+def test_without_noise_the_gain_is_a_generalised_inverse() -> None:
+    _, P, C, _ = some(3)
+    zero = np.zeros((2, 2))
+    np.testing.assert_allclose(
+        kalman.kalman_gain(np.eye(4), C, zero), np.linalg.pinv(C), rtol=1e-10
+    )
+    np.testing.assert_allclose(C @ kalman.kalman_gain(P, C, zero), np.eye(2), atol=1e-12)
+    ridge = np.linalg.solve(C.T @ C + 0.1 * np.eye(4), C.T)
+    np.testing.assert_allclose(kalman.kalman_gain(np.eye(4), C, 0.1 * np.eye(2)), ridge, rtol=1e-9)

@@ -7,13 +7,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR
+from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
 from sideslip.envs.engine.config import make_car
+from sideslip.envs.engine.layout import Z
+from sideslip.envs.record import FAST, Record, concatenate
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.envs.vehicle.tyres import LINEAR, PlantVariant, TyreInputs, compute_tyre_load
-from sideslip.estimators import EstimateObservation, make_estimator, vector
+from sideslip.estimators import EstimateObservation, Estimator, make_estimator, vector
 from tests.estimators.drives import Drives, told
 from tests.estimators.simulation import CAMERA, GPS
 
@@ -165,18 +167,69 @@ def test_a_constant_bias_is_seen_and_no_warning_is_about_it(recwarn: Any) -> Non
     assert "bias" not in str(found[0].message)
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "error", "message"),
-    [
-        ("exact-kf", {"fast": ["accel_y"]}, ValueError, "fast is 'gyro' and any of accel_y"),
-        ("exact-kf", {"fast": ["gyro", "lidar"]}, ValueError, "got .*'lidar'"),
-        ("exact-kf", {"fast": ["gyro", "gyro"]}, ValueError, "fast is"),
-        ("exact-kf", {"bias_sd": -1.0}, ValueError, "bias_sd is in rad/s and not negative"),
-        ("exact-kf", {"accel_bias_sd": 0.1}, ValueError, "accel_bias_sd needs accel_y among fast"),
-        ("exact-kf", {"bias_sd": 0.1, "gains": "periodic"}, ValueError, "no settled gain"),
-        ("multirate-kf", {"fast": INERTIAL}, TypeError, "unknown option 'fast'"),
-    ],
-)
-def test_options_that_cannot_be(name: str, options: Any, error: Any, message: str) -> None:
-    with pytest.raises(error, match=message):
-        make_estimator(name, sensors={"camera": CAMERA}, **options)
+WINDING = make_scenario("tie-vision-fig7").replace(road="nominal-path", duration=4.0)
+CARS = 24
+SETS = [("camera",), ("gps",), ("camera", "gps")]
+LATE: dict[str, Any] = {"gps": {"delays": (0.25,)}}
+RULES: list[Any] = ["clone", "buffer"]
+
+
+def drives(**arguments: Any) -> list[Any]:
+    """(record, psi - theta at its end, the env): linear cars on linear tyres."""
+    found = []
+    for seed in range(CARS):
+        env = StabilityEnv("fusion", WINDING, control_period=1000, **arguments)
+        env.reset(seed=seed)
+        records, over = [env.record], False
+        while not over:
+            _, _, _, over, _ = env.step(np.zeros(1, np.float32))
+            records.append(env.record)
+        z = env.get_state()["state"]
+        psi = float(z[Z.motion.psi] - z[Z.motion.theta])
+        found.append((concatenate(records), psi, env))
+    return found
+
+
+@pytest.fixture(scope="module")
+def prompt() -> list[Any]:
+    return drives()
+
+
+def nees(found: list[Any], told: bool, sensors: tuple[str, ...], **options: Any) -> float:
+    """Mean squared error of psi over its variance at the ends; told: of the road's curvature."""
+    squares = []
+    for record, psi, env in found:
+        common = {"vehicle": env.vehicle, "sensors": env.slow_sensors, "speed": env.held_speed}
+        filter_: Estimator = make_estimator("exact-kf", slow=list(sensors), **common, **options)
+        fast = record.fast.copy()
+        fast[:, FAST.curvature] *= told
+        filter_.run(Record(fast, record.packets))
+        i = filter_.names.index("psi")
+        squares.append((filter_.x[i] - psi) ** 2 / filter_.P[i, i])
+    return float(np.mean(squares))
+
+
+@pytest.mark.parametrize("sensors", SETS, ids="-".join)
+def test_psi_is_the_heading_against_the_road_as_sure_as_it_says(
+    prompt: list[Any], sensors: Any
+) -> None:
+    """And does not where the input is missing; the course is one over the ground."""
+    assert 0.4 < nees(prompt, True, sensors) < 2.1  # chi-square of 24, 99.9 %
+    assert nees(prompt, False, sensors) > (3.0 if sensors == ("camera",) else 20.0)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_so_it_does_with_a_late_course(rule: str) -> None:
+    """Which is one over the road's direction when it was captured."""
+    late = drives(**LATE)
+    assert 0.4 < nees(late, True, ("gps",), delay=rule) < 2.1
+    assert nees(late, True, ("gps",), delay="ignore") > 3.0
+
+
+def test_a_record_without_the_column_has_a_straight_road(prompt: list[Any]) -> None:
+    record, _, env = prompt[0]
+    bare = Record(record.fast.copy(), record.packets, present=FAST._fields[:-1])
+    bare.fast[:, FAST.curvature] = 0.0
+    filter_ = make_estimator("exact-kf", sensors=env.slow_sensors, speed=env.held_speed)
+    assert "curvature" not in filter_.needs
+    assert math.isfinite(filter_.run(bare).x[-1, 2])

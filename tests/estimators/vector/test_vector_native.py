@@ -9,7 +9,6 @@ import pytest
 
 from sideslip.estimators import FILTERS
 from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
-from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS
 from tests.estimators.vector.fleets import BAD, VISION, drive_both, home, outputs, same_bits
@@ -77,27 +76,6 @@ def test_after_a_reset_that_is_refused_everything_is_as_it_was(options: Any) -> 
     mask = {"reset_mask": np.array([True, False])}
     one, other = (env.reset(seed=3, options=dict(mask))[0] for env in pairs)
     assert one.tobytes() == other.tobytes()
-
-
-def test_rows_of_different_scenarios_have_their_own_filters() -> None:
-    """Each row has the bits of the single env, wrapped and reset alone."""
-    layer: dict[str, Any] = {"estimator": "multirate-kf"}
-    scenarios = ["uneven-delay-fig5", "tie-vision-fig7", "sine"]
-    together = EstimateObservation(gym.make_vec(VISION, num_envs=3), **layer)
-    obs, infos = together.reset(seed=4, options={"scenario": scenarios, "friction": 0.8})
-    cars = [Single(gym.make(VISION), **layer) for _ in scenarios]
-    for i, car in enumerate(cars):
-        options = {"scenario": scenarios[i], "friction": 0.8}
-        alone, info = car.reset(seed=4 + i, options=options)
-        assert alone.tobytes() == obs[i].tobytes()
-        assert info == {key: infos[key][i] for key in info}
-    for step in range(40):
-        told = np.full((3, 1), 0.02 * step, np.float32)
-        obs, rewards, _, _, infos = together.step(told)
-        for i, car in enumerate(cars):
-            alone, reward, _, _, info = car.step(told[i])
-            assert alone.tobytes() == obs[i].tobytes() and reward == rewards[i]
-            assert info == {key: infos[key][i] for key in info}
 
 
 @pytest.mark.parametrize("mode", MODES)
