@@ -18,7 +18,6 @@ from sideslip.benchmarks.control.run import Chunk, _StoredDrives
 from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
 from sideslip.benchmarks.studies.policies import evaluate_policy, record_evaluation
 from tests.benchmarks.conftest import Run
-from tests.policies import VISION
 
 SHORT = {"base": "random-steering", "duration": 1.5}
 HERE = "sideslip/YawVision-v0"
@@ -157,21 +156,6 @@ def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -
     status, out, _ = run("run", HERE, "--agent", path, "--scenario", "lane-change")
     assert status == 0 and "lane-change" in out
     assert "distill-car-yaw" in run("list")[1]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("nobody",), "unknown policy 'nobody'; known: distill-car-"),
-        ((VISION, "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
-        ((VISION, "--scenario", "moon"), "unknown scenario 'moon'"),
-        ((VISION, "--html", "nowhere/report.html"), "no such folder"),
-        ((VISION, "--episodes", 0), "greater than or equal to 1"),
-    ],
-)
-def test_a_mistake_is_told(run: Run, arguments: tuple[object, ...], said: str) -> None:
-    status, _, err = run("enjoy", *arguments)
-    assert status == 2 and said in " ".join(err.split())
 
 
 @pytest.mark.parametrize(

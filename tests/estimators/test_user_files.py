@@ -21,6 +21,8 @@ from sideslip.estimators.registry import (
 )
 from tests.estimators.wrappers.constant import Constant
 
+pytestmark = pytest.mark.usefixtures("own_names")
+
 AGENT = """
 class Still:
     def __init__(self, env):
@@ -114,13 +116,6 @@ def test_a_reason_has_the_line_of_the_users_file(tmp_path: Path) -> None:
 
 
 CONSTANT = "tests.estimators.wrappers.constant:Constant"
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is gone after it."""
-    for registry in (ESTIMATORS, AGENTS):
-        monkeypatch.setattr(registry, "_factories", dict(registry._factories))
 
 
 @pytest.fixture

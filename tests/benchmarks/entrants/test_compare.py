@@ -302,25 +302,6 @@ def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) ->
         ComparisonRequest(**{"entries": (on_default("esc"),)} | options)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("control", "--fresh"), "go with --agent or --estimator"),
-        (("control", "--vehicle", "coms"), "--vehicle go with --agent or --estimator"),
-        (("papers", "--keep", "cases"), "--keep goes with the suite control, got papers"),
-        (("papers", "--data", "."), "--data goes with the suite logs, got papers"),
-        (("highway", "--episodes", "4"), "highway has a number of its own"),
-        (("papers", "--agent", "esc"), "go with the suite control alone"),
-        (("--estimator", "none"), "goes with --agent"),
-        (("papers", "--salt", "ab12"), "--salt goes with control, got"),
-        (("control", "--salt", "xyz"), "a salt is hexadecimal digits, got 'xyz'"),
-    ],
-)
-def test_options_that_do_not_fit(arguments: tuple[str, ...], message: str, run: Run) -> None:
-    status, _, error = run("bench", *arguments)
-    assert status == 2 and message in " ".join(error.split())
-
-
 @pytest.mark.long
 def test_the_baselines_on_file_still_cost_the_same() -> None:
     """Else: `python -m sideslip.benchmarks.entrants.baselines`."""

@@ -2,11 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 
 from sideslip.benchmarks.papers import theory
-from sideslip.benchmarks.papers.theory import COURSE_SD, RATIO, make_extended_model
-from sideslip.estimators.design import dual_rate as spread
 from sideslip.estimators.design.kalman import kalman_gain
 
 Array = npt.NDArray[np.float64]
@@ -54,42 +51,3 @@ def test_prediction_alone_moves_what_the_sample_left() -> None:
     A, C, L = rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), rng.normal(size=(3, 2))
     maps = theory.make_maps("predicted", A, C, L, 4)
     np.testing.assert_allclose(maps[3], A @ A @ A @ (np.eye(3) - L @ C))
-
-
-def radius_of_29(q: Array, printed: bool, frames: int = 30) -> float:
-    """Growth of dual-rate's error over a frame with gains from (29), its formulas one by one.
-
-    printed: the noise term is (I + C Lambda) V_k, as printed; else (G + C Lambda) V_k.
-    """
-    A, C = make_extended_model()
-    I, one, R, Q = np.eye(6), np.eye(1), np.array([[COURSE_SD**2]]), np.diag(q) * 1e-3  # noqa: E741
-    P = 0.01 * np.eye(6)
-    for _ in range(frames):
-        G, Psi, Lambda, noise = one, I, np.zeros((6, 1)), np.zeros((6, 6))
-        for i in range(RATIO):
-            R_star = R
-            if i > 0:
-                G = C @ Psi @ C.T @ np.linalg.inv(C @ C.T)  # (31)
-                of_v = (one if printed else G) + C @ Lambda
-                R_star = C @ noise @ C.T + of_v @ R @ of_v.T  # of V*, (29)
-            L = kalman_gain(P, C, R_star)
-            P = (I - L @ C) @ P
-            P = A @ (0.5 * (P + P.T)) @ A.T + Q
-            Psi = A @ (Psi - L @ G @ C)  # (26)
-            Lambda = A @ (Lambda + L @ G)  # (28)
-            noise = A @ noise @ A.T + Q  # (27)
-    return float(np.abs(np.linalg.eigvals(Psi)).max())
-
-
-@pytest.mark.parametrize("strength", [5.0, 20.0])
-def test_gains_from_the_pseudo_noise_grow(strength: float) -> None:
-    """An independent trial found a radius of 1.17 to 1.22, as printed and as corrected."""
-    q = np.array([1e-4, 1e-4, 1e-4, strength, strength, strength])
-    A, C = make_extended_model()
-    R = np.array([[COURSE_SD**2]])
-    shares = spread.SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
-    ours = float(np.abs(np.linalg.eigvals(spread.frame_map(A, C, shares))).max())
-    corrected, printed = radius_of_29(q, False), radius_of_29(q, True)
-    assert ours == pytest.approx(corrected, rel=1e-3)
-    assert 1.1 < corrected < 1.3
-    assert 1.1 < printed < 1.3

@@ -8,12 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import Vehicle
 
-assert sideslip.__version__
 EVERY = 10  # ticks to a row
 PLAIN = {"tyres": "linear", "roll": False, "lags": False}
 TURNS = {

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.recorded.emulate import LoggedMotion
 from sideslip.benchmarks.recorded.quality import (
@@ -33,7 +32,6 @@ from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 from .simulated import decimated
 from .slalom import VEHICLE, columns, saved
 
-assert sideslip.__version__
 DEG = math.pi / 180.0
 IDS = ("sideslip/YawGps-v0", "sideslip/YawFusion-v0", "sideslip/YawVision-v0")
 MANOEUVRES = ("random", "slalom", "sine", "step", "sine-with-dwell")

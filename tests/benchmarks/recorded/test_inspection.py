@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import sideslip
 from sideslip.benchmarks.recorded.checks import CHECKS, InspectedDrive
 from sideslip.benchmarks.recorded.inspection import _read_drive, inspect_file
 from sideslip.benchmarks.recorded.quality import BLOCKER, OK, WARNING, LogFinding
@@ -16,7 +15,6 @@ from tests.benchmarks.conftest import Run
 
 from .faulty_logs import FAULTS, drive, shift_fixes, spoil
 
-assert sideslip.__version__
 FAULTY, CLEAN = 7000, 8000  # first seeds; limits were set on others
 COUNT, FIRST = 100, len(FAULTS)
 _ROOT = Path(__file__).parents[3]

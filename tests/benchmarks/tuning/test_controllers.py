@@ -218,29 +218,6 @@ def test_defaults_stand_where_nothing_was_tuned() -> None:
             assert log["best"]["objective"] == min(known) <= (log["start"] or math.inf)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("kalman",), "unknown controller 'kalman'; known: two-dof, "),
-        (("lqr", "--class", "moon"), "unknown class 'moon'; known: coms-model, "),
-        (("lqr", "--class", "coms-model", "--trials", 0), "trials must be at least 1, got 0"),
-        (("lqr", "--class", "coms-model", "--seeds", 0), "0 seeds; both are needed"),
-        (("model-following", "--class", "car-yaw"), "needs an env whose action steers"),
-        (("lqr", "--out", "nowhere/tuned.toml"), "nowhere/tuned.toml"),
-    ],
-)
-def test_a_mistake_is_one_line_that_names_it(
-    run: Run,
-    arguments: tuple[Any, ...],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    status, _, err = run("tune", "controller", *arguments)
-    assert status == 2 and message in " ".join(err.split())
-
-
 def test_the_command_writes_both(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(controllers, "list_scored_tasks", lambda: [SHORT])

@@ -12,7 +12,7 @@ from sideslip.envs.record import PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator, smooth
 from tests.estimators.core.test_conditioning import CASES
-from tests.estimators.simulation import CAMERA, FIG7, GPS, Drive, simulate
+from tests.estimators.simulation import CAMERA, GPS, Drive, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -44,36 +44,6 @@ def test_every_tick_equals_dense_gaussian_conditioning(case: Any, lag: float) ->
                 sd = np.sqrt(np.diag(cov))
                 assert np.abs((found.x[k] - mean) / sd).max() < 1e-8
                 assert np.abs(found.std[k] / sd - 1.0).max() < 1e-8
-
-
-def test_more_future_never_knows_less() -> None:
-    log = simulate(SHORT, {"camera": CAMERA, "gps": GPS}, 0)
-    options: Any = {"slow": ["camera", "gps"], "speed": FIG7.speed}
-    filtered = make_estimator("exact-kf", sensors=log.slow, **options).run(log)
-    before = filtered.std
-    for lag in (0.02, 0.1, math.inf):
-        found = smooth("exact-kf", log, lag, **options)
-        assert (found.std <= before * (1.0 + 1e-9)).all()
-        before = found.std if lag == 0.1 else filtered.std
-    assert found.names == filtered.names and len(found.time) == len(filtered.time)
-    np.testing.assert_allclose(found.std[-1], smooth("exact-kf", log, 0.1, **options).std[-1])
-
-
-def test_the_truth_lies_nearer_and_as_near_as_it_says() -> None:
-    drive = Drive(duration=4.0, real=6000.0)
-    filter_ = make_estimator(
-        "exact-kf", vehicle=drive.truth, sensors={"camera": CAMERA}, speed=drive.speed
-    )
-    errors, nees = np.zeros(2), []
-    for seed in range(4):
-        log = simulate(drive, {"camera": CAMERA}, seed)
-        late = log.time > 1.0
-        error = (smooth(filter_, log, 0.5)["gamma"] - log.truth["gamma"])[late]
-        errors[0] += np.mean((filter_.run(log)["gamma"] - log.truth["gamma"])[late] ** 2)
-        errors[1] += np.mean(error**2)
-        nees.append(np.mean((error / smooth(filter_, log, 0.5).std[late, 1]) ** 2))
-    assert errors[1] < 0.5 * errors[0]
-    assert 0.8 < np.mean(nees) < 1.25
 
 
 def test_an_estimator_of_any_rule_is_smoothed_alike_and_left_alone() -> None:

@@ -182,17 +182,3 @@ def test_the_buffer_needs_no_clock(case: Any) -> None:
         assert differences(buffer, mean, cov) < EXACT
     clone.run(log)
     assert clone.counts["unknown"] > 0
-
-
-def test_a_late_sample_used_at_once_is_the_sample_used_in_time() -> None:
-    """With all samples in, the order of arrival has left no trace."""
-    told = CASES["forces, camera and gps"]
-    log = told.schedule(7)
-    in_time = log.record.packets.copy()
-    in_time[:, PACKET.arrived] = in_time[:, PACKET.captured]
-    in_time = in_time[np.lexsort((in_time[:, PACKET.sensor], in_time[:, PACKET.captured]))]
-    filter_ = told.build("clone")
-    filter_.run(log)
-    late = filter_.x, filter_.P
-    filter_.run(Log(Record(log.record.fast, in_time, dt=told.dt), log.slow))
-    assert differences(filter_, *late) < EXACT

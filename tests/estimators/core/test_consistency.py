@@ -134,16 +134,6 @@ def test_told_1_5_times_too_little_noise_or_no_delay_it_is_not(
     assert not verdict.consistent, verdict
 
 
-@pytest.mark.parametrize("sensors", SETS, ids="-".join)
-def test_what_it_says_of_every_state_is_the_textbooks_recursion(prompt: Runs, sensors: Any) -> None:
-    drives, log = prompt.drives, prompt.logs[0]
-    filter_ = exact(drives, log, sensors)
-    best = variances(drives.vehicle, sensors=told(log, *sensors), speed=drives.speed, seconds=1.0)
-    std = filter_.run(log).std[: len(best["beta"])]
-    for state, found in zip(filter_.names, std.T, strict=True):
-        np.testing.assert_allclose(found**2, best[state], rtol=1e-8, atol=1e-18, err_msg=state)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("rule", ["clone", "buffer"])
 def test_late_and_permuted_samples_leave_it_consistent(rule: Any) -> None:

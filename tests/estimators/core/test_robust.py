@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.record import FAST, PACKET
@@ -21,9 +20,6 @@ from sideslip.estimators.core.model import build_model
 from sideslip.estimators.core.predict import linearise
 from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.dense import WITH_TYRES
-
-assert sideslip.__version__
-
 
 SURE = {"force_share": 1e-3, "model_error": 0.0, "robust": 0.0, "noise_time": 2.0}
 SURE |= dict.fromkeys(("accel_bias_sd", "accel_scale_sd", "bias_sd", "bank_sd"), 0.0)

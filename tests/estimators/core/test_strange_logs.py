@@ -8,14 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.record import FAST
 from sideslip.estimators import Estimator, make_estimator
 from tests.estimators.dense import WITH_TYRES
-
-assert sideslip.__version__
 
 LINEAR: dict[str, Any] = {"base": "random-steering", "small_angle": True, "tyres": "linear"}
 LINEAR |= {"amplitude": 0.05, "amplitude_2": 0.04, "roll": True, "duration": 8.0}

@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.vehicle.tyres import FIALA, Tyre, compute_lateral_forces
@@ -16,7 +15,6 @@ from sideslip.estimators.analysis.bound import compute_error_bound
 from sideslip.estimators.core.predict import _compute_axle_force
 from tests.estimators.dense import WITH_TYRES
 
-assert sideslip.__version__
 LINEAR: dict[str, Any] = {
     "base": "random-steering",
     "speed": 25.0 / 3.6,

@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.record import PACKET, Array
@@ -18,7 +17,6 @@ from sideslip.estimators import Estimator, make_estimator
 from tests.estimators.core.test_tyres import LINEAR
 from tests.estimators.dense import WITH_TYRES
 
-assert sideslip.__version__
 FROM, TO = 4000, 7000  # ticks between which a sensor fails
 VALUE, CAPTURED, ARRIVED = PACKET.value, PACKET.captured, PACKET.arrived
 CAMERA, GPS = map(SLOW_NAMES.index, ("camera", "gps"))

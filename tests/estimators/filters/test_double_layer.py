@@ -169,28 +169,6 @@ def test_a_fix_of_three_satellites_is_refused() -> None:
     assert np.abs(wanted - literal(log_of(1, 12.0, gps, few), True, default)).max() > 1e-6
 
 
-def test_predicted_residuals_are_powers_of_q_d_for_square_c() -> None:
-    """(28): eps_{k+n} = Q_d^n eps_k as printed; in general the corrected form."""
-    rng = np.random.default_rng(0)
-    for p in (3, 2):
-        A, C, L = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(p, 3)), None
-        L = gain(np.eye(3), C, np.eye(p))
-        rest, C_plus = np.eye(3) - L @ C, C.T @ np.linalg.inv(C @ C.T)
-        Q_d = C @ A @ rest @ C_plus  # (29)
-        layer = Layer(C, 0, np.zeros((0, 0)), np.eye(3), True)
-        layer.K_gps, eps = L, rng.normal(size=p)
-        layer.e = (C_plus - L) @ eps
-        for n in range(1, 6):
-            layer.e = A @ layer.e
-            layer.ahead = C @ layer.e
-            general = C @ A @ np.linalg.matrix_power(rest @ A, n - 1) @ rest @ C_plus @ eps
-            np.testing.assert_allclose(layer.ahead, general, atol=1e-12)
-            printed = np.linalg.matrix_power(Q_d, n) @ eps
-            equal = np.allclose(layer.ahead, printed, rtol=1e-9, atol=1e-12)
-            assert equal == (p == 3 or n == 1)
-            layer.between()
-
-
 def test_the_second_layer_works_at_zero_yaw_rate() -> None:
     """5.2: the kinematic filter cannot see v_y there, the second layer can."""
     kinematic = make_estimator("kinematic-velocity-kf", speed=V)

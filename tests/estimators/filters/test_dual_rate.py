@@ -194,16 +194,6 @@ def test_placed_poles_are_where_they_were_placed(rule: Any, seed: Any) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_pseudo_measurement_and_ohs_gain_are_the_same(seed: Any) -> None:
-    """(31) and (35) for any gain."""
-    s = random_system(seed)
-    A, _, C, Q = extended(s)
-    L = sampled(A, C, Q, s["R"], s["ratio"]) / s["ratio"]
-    ours, ohs = gains_31(A, C, [L] * s["ratio"]), gains_35(A, C, L, s["ratio"])
-    np.testing.assert_allclose(ours, ohs, atol=1e-12 * max(1.0, np.abs(ohs).max()))
-
-
-@pytest.mark.parametrize("seed", range(6))
 def test_haras_error_map_is_the_single_rates(seed: Any) -> None:
     s = random_system(seed)
     A, _, C, Q = extended(s)

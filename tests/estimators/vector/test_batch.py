@@ -82,20 +82,6 @@ def test_every_row_is_the_filter_alone(name: Any, speed: Any) -> None:
         np.testing.assert_array_equal(one.std, other.std)
 
 
-@pytest.mark.parametrize("n", [1, 10])
-def test_covariances_are_each_rows_own(n: Any) -> None:
-    """Random delays: rows that differ in nothing but arrivals have their own P."""
-    drive = dataclasses.replace(FIG7, duration=0.4)
-    logs = [simulate(drive, {"camera": JITTERY}, seed) for seed in range(8)]
-    batch = make_batch("exact-kf", 8, sensors=logs[0].slow, speed=SPEED)
-    feed(batch, logs, n)
-    singles = [make_estimator("exact-kf", sensors=log.slow, speed=SPEED) for log in logs]
-    for single, log in zip(singles, logs, strict=True):
-        single.run(log)
-    same_bits(batch, singles)
-    assert len({each.P.tobytes() for each in batch}) > 4
-
-
 def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
     """Of other delays and gains of another shape, while the others keep what they know."""
     logs = drives(2, "camera", CAMERA, 0.3)

@@ -12,19 +12,15 @@ from gymnasium.vector import SyncVectorEnv
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator, smooth, vector
-from sideslip.estimators.make import ESTIMATORS, register_estimator
+from sideslip.estimators.make import register_estimator
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruthObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.estimators.wrappers.constant import Constant
 
+pytestmark = pytest.mark.usefixtures("own_names")
+
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
 STILL = np.zeros(1, np.float32)
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is gone after it."""
-    monkeypatch.setattr(ESTIMATORS, "_factories", dict(ESTIMATORS._factories))
 
 
 def without(member: str) -> Any:

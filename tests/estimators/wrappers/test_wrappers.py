@@ -9,7 +9,6 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
-import sideslip  # noqa: F401  registers the environments
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator
