@@ -100,8 +100,7 @@ def test_dakf_beats_the_kalman_filter() -> None:
 
 @pytest.mark.long
 def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
-    """tie-vision-fig7, 40 fixed seeds: within 3 % of the bound; the others in the paper's order
-    as far as it is true."""
+    """tie-vision-fig7: within 3 % of the bound; the others in the paper's order where true."""
     squares, _ = estimation.STUDY.measure(Request(episodes=40))
     assert _ratio(squares, estimation.TRUE_MODEL, estimation.BOUND) == pytest.approx(1.0, rel=0.03)
     for other in ("single-rate-kf", "multirate-kf", "multirate-residual-kf"):

@@ -149,11 +149,7 @@ SCORED = list_scored_tasks() if module.FILE.is_file() else ()
 @pytest.mark.long
 @pytest.mark.parametrize("contest", SCORED[4::9], ids=[contest.name for contest in SCORED[4::9]])
 def test_the_ladder_falls_in_some_scored_contests(contest: ControlTask) -> None:
-    """No baseline is surely better than one that knows more, and nominal is surely the worst.
-
-    On seeds the contests were not chosen on, the same in every version. All contests are in `make
-    bench-full`.
-    """
+    """No baseline is surely better than one that knows more, and nominal is surely the worst."""
     contest = dataclasses.replace(contest, changes={"lead_in": QUICK_LEAD_IN})
     cells = [(contest, Entry(rung)) for rung in (NOMINAL, PARAMETERS, STATE)]
     there = measure(cells, make_salted_seeds("0", 32), jobs=2)

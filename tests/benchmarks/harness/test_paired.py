@@ -134,8 +134,7 @@ def test_intervals_over_seeds_cover_93_of_100_data_sets(name: str) -> None:
 
 @pytest.mark.parametrize("n", [8, 64, 256])
 def test_failure_rates_are_covered_by_enumeration(n: int) -> None:
-    """Wilson's interval has its 95 % on average over the rates. Of few episodes it falls short of
-    93 % at one rate in six, of 64 and more nowhere but within 1 % of none and of all."""
+    """Wilson's interval has its 95 % on average over the rates."""
     ends = np.array([share(np.arange(n) < k)[1:] for k in range(n + 1)])
     rates = np.linspace(0.01, 0.99, 197)
     holds = (ends[:, :1] <= rates) & (rates <= ends[:, 1:])
@@ -145,8 +144,7 @@ def test_failure_rates_are_covered_by_enumeration(n: int) -> None:
 
 
 def test_no_mean_knows_the_failures_that_no_episode_shows() -> None:
-    """Two cars in a hundred fail, at a hundred times the cost. Where one of 64 does, the interval
-    of the mean covers; where none does, none can: hence rates of failure stand first."""
+    """Where one of 64 cars fails, the interval of the mean covers; where none does, none can."""
     rng = np.random.default_rng(10)
     true = 0.98 * math.exp(0.5) + 0.02 * 275.0
     cost = rng.lognormal(0.0, 1.0, (SETS, 64))
@@ -234,8 +232,7 @@ def far_away(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def test_the_interval_is_of_the_same_statistic_as_the_estimate() -> None:
-    """On the logarithm's scale the root's interval is the interval's root, on the plain one that
-    of a line is the line of the interval."""
+    """The root's interval is the interval's root, that of a line the line of the interval."""
     values = np.random.default_rng(4).gamma(0.5, 2.0, 40)  # the median is a third of the mean
     positive, signed = np.array(interval(values)), np.array(interval(values - 0.5))
     assert positive[1] * positive[2] == pytest.approx(positive[0] ** 2)
@@ -289,8 +286,7 @@ def test_no_spread_gives_a_point_and_too_few_seeds_no_interval() -> None:
 
 
 def test_definitions_are_those_of_rliable() -> None:
-    """Agarwal et al., NeurIPS 2021: the probability of improvement is the mean over tasks of
-    Mann and Whitney's U over the number of pairs. Our task is a seed, with one run each."""
+    """Agarwal et al., NeurIPS 2021: Mann and Whitney's U over the pairs; our task is a seed."""
     rng = np.random.default_rng(7)
     costs, others = (rng.integers(0, 6, 80).astype(float) for _ in range(2))
     U = [mannwhitneyu([-a], [-b]).statistic for a, b in zip(costs, others, strict=True)]

@@ -4,6 +4,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from sideslip.benchmarks.harness.metrics import METRICS
@@ -11,6 +12,7 @@ from sideslip.benchmarks.papers import theory
 from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, SimulationResult
 from sideslip.benchmarks.papers.suite import CLAIMS, FIGURES, SIMULATIONS, _split_seeds
 from sideslip.benchmarks.papers.tie_vision_theory import _compute_residuals
+from sideslip.estimators.design.kalman import kalman_gain
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
@@ -110,3 +112,50 @@ def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:
     for seed in range(3):
         for (label, _), value in _compute_residuals(seed)[0].items():
             assert value > 0.01 if label.endswith("printed") else value < 1e-12, label
+
+
+Array = npt.NDArray[np.float64]
+
+
+def test_pseudo_measurements_equal_fast_ones_for_square_c_only() -> None:
+    """dual-rate (33): the maps agree where (30) can be solved."""
+    rng = np.random.default_rng(5)
+    A = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for outputs, equal in ((3, True), (2, False)):
+        C = rng.normal(size=(outputs, 3))
+        L = kalman_gain(np.eye(3), C, np.eye(outputs))
+        ours = theory.make_maps("pseudo", A, C, L, 10)
+        off = theory.compute_difference(ours, theory.make_maps("fast", A, C, L, 10))
+        assert off < 1e-12 if equal else off > 0.1
+
+
+def test_the_maps_are_what_a_simulated_error_does() -> None:
+    """(13)-(14), (17), (19) and (31)-(32) step by step, without noise."""
+    rng = np.random.default_rng(6)
+    A, C = 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(1, 3))
+    L = 0.3 * rng.normal(size=(3, 1))
+    maps = theory.make_maps("pseudo", A, C, L, 3)
+    x, start = rng.normal(size=3), rng.normal(size=3)
+    hat = x - start
+    innovation = C @ (x - hat)  # (13)
+    hat = hat + L @ innovation
+    np.testing.assert_allclose(maps[0] @ start, x - hat)
+    C_plus = C.T @ np.linalg.inv(C @ C.T)
+    G1 = C @ A @ (np.eye(3) - L @ C) @ C_plus  # (32)
+    x, hat = A @ x, A @ hat
+    pseudo = C @ hat + G1 @ innovation  # (14)
+    hat = hat + L @ (pseudo - C @ hat)  # (19)
+    np.testing.assert_allclose(maps[1] @ start, x - hat)
+    Psi = A @ A @ (np.eye(3) - L @ C) - A @ L @ G1 @ C  # (26) for i = 2
+    G2 = C @ Psi @ C_plus  # (31)
+    x, hat = A @ x, A @ hat
+    hat = hat + L @ G2 @ innovation
+    np.testing.assert_allclose(maps[2] @ start, x - hat)
+
+
+def test_prediction_alone_moves_what_the_sample_left() -> None:
+    """(34)."""
+    rng = np.random.default_rng(7)
+    A, C, L = rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), rng.normal(size=(3, 2))
+    maps = theory.make_maps("predicted", A, C, L, 4)
+    np.testing.assert_allclose(maps[3], A @ A @ A @ (np.eye(3) - L @ C))

@@ -71,8 +71,7 @@ def with_lagging_gyro(log: Log, lag: float) -> Log:
 
 
 def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
-    """A gyro behind a low-pass is what no model here has; the stated tyres are 1.3 times too stiff.
-    Without priors tyres and inertia stay 1.3 and 1.5 times the true ones, within 5 %."""
+    """A lagging gyro; the stated tyres are 1.3 times too stiff. Priors bound what is left open."""
     log = with_lagging_gyro(without(driven(NEUTRAL), accel=True, course=True), 0.08)
     found = identify([log], NEUTRAL.scale_stiffness(1.3))
     true = (2.0 * NEUTRAL.front_stiffness, 2.0 * NEUTRAL.rear_stiffness, NEUTRAL.yaw_inertia)
@@ -167,9 +166,7 @@ def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
     ],
 )
 def test_estimators_get_no_worse_elsewhere(seeds: range, laws: tuple[str | None, ...]) -> None:
-    """By the drawn cars together, for the chosen law and the linear one of a replay: with the
-    steering, latency and noise that were found, and with the car alone. The chosen law's intervals
-    hold the small-slip stiffness and the inertia per mass."""
+    """By all drawn cars together, and the chosen law's intervals hold stiffness and inertia."""
     errors: list[tuple[str | None, Array, Array]] = []
     outside = []
     for seed in seeds:

@@ -188,12 +188,6 @@ def test_nees_coverage_and_score_of_normal_errors(factor: float) -> None:
     assert _compute_held_shares(error, deviation) == pytest.approx(shares, abs=0.02)
 
 
-def test_the_score_is_best_at_the_true_deviation() -> None:
-    error = np.random.default_rng(1).normal(0.0, 0.01, 20_000)
-    scores = [compute_honesty(error, np.full(20_000, 0.01 * f))[2] for f in (0.7, 1.0, 1.4)]
-    assert max(scores) == scores[1]
-
-
 def test_without_truth_innovations_say_whom_not_to_believe() -> None:
     text = describe_innovations({"joint": 7.25, "exact-kf": 1.1})
     assert "do not believe joint (7.2)" in text and "exact-kf" not in text

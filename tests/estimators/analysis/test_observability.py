@@ -43,8 +43,7 @@ def test_every_pair_but_one_is_seen_straight_on() -> None:
 
 
 def test_camera_s_yaw_steering_s_offset_and_bank_hide_behind_each_other() -> None:
-    """A car that is held askew by the bank and the wheels goes straight: beta = -psi, yaw = -psi.
-    The accelerometer feels the bank's force, unless it has a bias of its own."""
+    """A car held askew by bank and wheels goes straight; an accelerometer feels the bank."""
     for slow in (("camera",), BOTH):
         names, basis = _find_unobservable_subspace((*GYRO, *slow), ASKEW)
         v = dict(zip(names, basis[:, 0] / basis[names.index("beta"), 0], strict=True))
@@ -80,8 +79,7 @@ def test_wheels_show_in_turns_and_to_the_gps_s_speed() -> None:
 
 @pytest.mark.parametrize("fast", [GYRO, ACCEL])
 def test_the_filter_learns_nothing_of_what_is_unobservable(fast: Any) -> None:
-    """By the definition, C F^k v = 0, and by the filter itself: the information v^T P^-1 v never
-    exceeds the prior's; along any of its states alone it does."""
+    """By the definition, C F^k v = 0, and v^T P^-1 v never exceeds the prior's."""
     unknowns = [name for name in UNKNOWNS if name != WHEELS]
     if fast == GYRO:
         unknowns.remove("accel_bias")

@@ -11,8 +11,10 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs.record import PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator, smooth
+from sideslip.estimators.analysis.bound import compute_error_bound
 from tests.estimators.core.test_conditioning import CASES
-from tests.estimators.simulation import CAMERA, GPS, Drive, simulate
+from tests.estimators.riccati import riccati
+from tests.estimators.simulation import CAMERA, FIG7, GPS, Drive, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -116,3 +118,21 @@ def test_options_are_for_a_name_and_a_log_for_its_filter() -> None:
     periodic = make_estimator("multirate-kf", sensors=log.slow, speed=7.0)
     with pytest.raises(ValueError, match=r"multirate-kf: a smoother needs .*gains='covariance'"):
         smooth(periodic, log)
+
+
+SETS = {
+    "camera": {"camera": CAMERA},
+    "uneven": {"camera": SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))},
+    "gps": {"gps": GPS},
+    "both": {"camera": CAMERA, "gps": SlowSensor(0.1, (0.25,))},
+}
+
+
+@pytest.mark.parametrize("which", SETS)
+def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which: Any) -> None:
+    sensors = SETS[which]
+    log = simulate(FIG7, sensors, 0)
+    along = compute_error_bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)
+    P, names = riccati(FIG7.truth, sensors=sensors, speed=FIG7.speed, seconds=4.0)
+    assert names[0] == "beta"
+    np.testing.assert_allclose(along[3000:4000], np.sqrt(P[3000:, 0, 0]), rtol=1e-10)

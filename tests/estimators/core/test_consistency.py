@@ -145,9 +145,7 @@ def test_late_and_permuted_samples_leave_it_consistent(rule: Any) -> None:
 
 @pytest.mark.long
 def test_monte_carlo_variances_are_riccatis() -> None:
-    """900 runs of 10 s, averaged over time from 2 s on: beta within 3 %, every other state within
-    four standard errors, which the spread over the runs tells (within a run errors are
-    correlated)."""
+    """900 runs of 10 s, from 2 s on: beta within 3 %, other states within four standard errors."""
     drives, runs, start = Drives("tie-vision-fig7"), 900, 2000
     log = drives.run(0)
     filters = {sensors: exact(drives, log, sensors) for sensors in SETS}

@@ -168,8 +168,7 @@ def shrinks(case: Case) -> None:
 )
 @pytest.mark.parametrize("rule", ["pseudo-residual", "predict"])
 def test_so_it_does_in_the_layers_of_double_layer(rule: str) -> None:
-    """The rates differ by 1 % with the first rule and by 20 % (0.950 told, 0.940 true) with the
-    second, where the second layer is the slowest: its map has the noise of no packet."""
+    """The rates differ by 1 % with the first rule, by 20 % with the second."""
     shrinks(Case("double-layer", GPS, {"disturbances": "none", "intersample": rule}))
 
 

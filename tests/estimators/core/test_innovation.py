@@ -86,10 +86,7 @@ def test_the_first_course_that_is_refused_is_not_the_first() -> None:
 
 
 def test_late_courses_that_set_the_heading_set_it_alike() -> None:
-    """The first to arrive turns the heading of the past too, in clones as in the buffer.
-
-    Nearly: by its clone, the turn knows the gyro since the capture.
-    """
+    """The first to arrive turns the heading of the past too, in clones as in the buffer."""
     sensors = {"gps": SlowSensor(0.2, (0.350, 0.010, 0.120))}
     log = simulate(Drive(duration=3.0), sensors, 4)
     packets = log.record.packets

@@ -104,8 +104,7 @@ def test_a_filter_with_two_slow_sensors_is_checked_with_the_first_alone() -> Non
 
 
 def test_a_filter_is_checked_with_the_rows_of_the_speed() -> None:
-    """An accelerometer's row depends on the speed: the map at 3 m/s is that of a filter of 3 m/s,
-    whose settled gains let no error grow, whatever the car."""
+    """An accelerometer's row depends on the speed; settled gains let no error grow."""
     options: dict[str, Any] = {"fast": ["gyro", "accel_y"], "bank_sd": 0.01, "slow": "camera"}
     car = replace(COMS, rear_stiffness=1.4 * COMS.rear_stiffness)
     arguments = options | {"vehicle": car, "sensors": {"camera": CAMERA}}

@@ -230,10 +230,7 @@ COURSE_10_HZ = SlowSensor(period=0.1)
 
 @pytest.mark.parametrize(("rule", "gains"), CASES)
 def test_course_alone(rule: Any, gains: Any) -> None:
-    """4.2-4.3: (37)-(38) at 10 Hz, a disturbance on every state (per second) that leaks.
-
-    100 Hz where gains are from (29), whose products are dear.
-    """
+    """4.2-4.3: (37)-(38) at 10 Hz, or 100 Hz where gains are from (29), whose products are dear."""
     quick = gains == "from-29"
     ratio, leak = (10, 20.0) if quick else (100, 0.5)
     log = excited(simulate(SLALOM, {"gps": SlowSensor(period=ratio * T)}, 0))

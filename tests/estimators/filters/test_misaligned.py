@@ -27,8 +27,7 @@ RUNS = 24
 
 
 def test_an_estimated_tyre_s_model_is_the_force_at_the_angle_less_the_offset() -> None:
-    """Its value, and its slope by the offset, which is a difference of the law's. The tyre has a
-    limit: a force that is linear in the slip would hide where it is expanded."""
+    """Its value, and its slope by the offset, which is a difference of the law's."""
     options = SDS | WITH_TYRES | {"inverse_friction_sd": 0.1}
     filter_ = make_estimator("exact-kf", sensors={"camera": CAMERA}, speed=7.0, **options)
     f, names, steer = filter_.filters[0], filter_.names, 0.08

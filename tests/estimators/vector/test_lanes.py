@@ -87,8 +87,7 @@ def test_so_it_is_with_options(options: Any) -> None:
 
 
 def test_a_capture_is_of_its_own_tick() -> None:
-    """A course over the ground, on a road that turns, noisier the slower: the car speeds up so much
-    that its model is another one in most ticks, or by some of its captures alone."""
+    """A car so much faster that its model is another in most ticks, or by some captures alone."""
     clock = dataclasses.replace(GPS, delays=(0.03,))
     logs = drives(COUNT, "gps", clock, seconds=0.6)
     for i, log in enumerate(logs):
