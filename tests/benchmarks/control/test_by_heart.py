@@ -97,13 +97,9 @@ def test_what_is_known_by_heart_is_worth_nothing_on_salted_seeds() -> None:
 
 
 MINE: dict[str, Any] = {
-    "name": "my bend",
-    "steering": "held-step",
-    "amplitude": (0.03, 0.05),
-    "front_stiffness": (0.8, 1.2),
-    "mirror": True,
-    "duration": 2.0,
-}
+    "name": "my bend", "steering": "held-step", "amplitude": (0.03, 0.05),
+    "front_stiffness": (0.8, 1.2), "mirror": True, "duration": 2.0,
+}  # fmt: skip
 
 
 class Damper(Controller):

@@ -15,18 +15,10 @@ from sideslip.envs.vehicle.parameters import Vehicle
 EVERY = 10  # ticks to a row
 PLAIN = {"tyres": "linear", "roll": False, "lags": False}
 TURNS = {
-    "base": "random-steering",
-    "duration": 40.0,
-    "speed": (18.0, 22.0),
-    "amplitude": (0.01, 0.02),
-    "amplitude_2": (0.005, 0.01),
-    "surge": 0.7,
-    "surge_frequency": 0.05,
-    "disturbance_force": 100.0,
-    "disturbance_moment": 60.0,
-    "front_stiffness": (0.7, 1.3),
-    "rear_stiffness": (0.7, 1.3),
-}
+    "base": "random-steering", "duration": 40.0, "speed": (18.0, 22.0), "amplitude": (0.01, 0.02),
+    "amplitude_2": (0.005, 0.01), "surge": 0.7, "surge_frequency": 0.05, "disturbance_force": 100.0,
+    "disturbance_moment": 60.0, "front_stiffness": (0.7, 1.3), "rear_stiffness": (0.7, 1.3),
+}  # fmt: skip
 
 
 @functools.cache

@@ -34,14 +34,9 @@ from .slalom import columns, saved
 
 ESTIMATORS = ("bicycle-kf", "multirate-kf", "exact-kf")
 NEUTRAL = PASSENGER_CAR.replace(  # steers nearly neutrally: the valley is exact
-    mass=1776.0,
-    sprung_mass=1500.0,
-    front_arm=1.3,
-    rear_arm=1.45,
-    front_stiffness=72500.0,
-    rear_stiffness=65000.0,
-    yaw_inertia=3180.0,
-)
+    mass=1776.0, sprung_mass=1500.0, front_arm=1.3, rear_arm=1.45, front_stiffness=72500.0,
+    rear_stiffness=65000.0, yaw_inertia=3180.0,
+)  # fmt: skip
 
 
 def share(car: Vehicle) -> float:

@@ -35,13 +35,9 @@ def exact(drives: Drives, log: Log, sensors: tuple[str, ...], **options: Any) ->
     """exact-kf told the truth, which starts from the known start as the bound does."""
     options.setdefault("prior", dict.fromkeys(select_states(sensors), 0.0))
     return make_estimator(
-        "exact-kf",
-        vehicle=drives.vehicle,
-        sensors=told(log, *sensors),
-        slow=list(sensors),
-        speed=drives.speed,
-        **options,
-    )
+        "exact-kf", vehicle=drives.vehicle, sensors=told(log, *sensors), slow=list(sensors),
+        speed=drives.speed, **options,
+    )  # fmt: skip
 
 
 def variances(vehicle: Any, **options: Any) -> dict[str, np.ndarray]:

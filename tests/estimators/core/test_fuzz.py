@@ -88,19 +88,11 @@ def test_nor_do_a_hundred_thousand(key: str) -> None:
 
 
 COUNTER = {
-    "nan": "invalid",
-    "inf": "invalid",
-    "huge": "invalid",
-    "sensor": "unknown",
-    "future capture": "future",
-    "future arrival": "future",
-    "negative": "refused",
-    "arrived before": "unknown",
-    "fraction": "unknown",
-    "off clock": "unknown",
-    "quality": "poor",
+    "nan": "invalid", "inf": "invalid", "huge": "invalid", "sensor": "unknown",
+    "future capture": "future", "future arrival": "future", "negative": "refused",
+    "arrived before": "unknown", "fraction": "unknown", "off clock": "unknown", "quality": "poor",
     "satellites": "poor",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", COUNTER)

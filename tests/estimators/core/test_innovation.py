@@ -147,13 +147,9 @@ def test_the_gps_scale_is_of_what_the_hdop_table_says() -> None:
     packets[:, PACKET.value] += 3.0 * noise
     packets[:, PACKET.value + 4] = 4.0
     filter_ = make_estimator(
-        "exact-kf",
-        vehicle=drive.truth,
-        sensors=sensors,
-        speed=drive.speed,
-        adapt=0.02,
+        "exact-kf", vehicle=drive.truth, sensors=sensors, speed=drive.speed, adapt=0.02,
         hdop_table=[(1.0, 1.0), (8.0, 8.0)],
-    )
+    )  # fmt: skip
     found = []
     for start in range(0, 40_000, 1000):
         due = (packets[:, 2] >= start) & (packets[:, 2] < start + 1000)

@@ -18,17 +18,10 @@ from sideslip.estimators.core.predict import _compute_axle_force
 from tests.estimators.dense import WITH_TYRES
 
 LINEAR: dict[str, Any] = {
-    "base": "random-steering",
-    "speed": 25.0 / 3.6,
-    "small_angle": True,
-    "tyres": "linear",
-    "roll": False,
-    "lags": False,
-    "amplitude": (0.03, 0.08),
-    "amplitude_2": (0.02, 0.05),
-    "front_stiffness": (0.6, 1.4),
-    "rear_stiffness": (0.6, 1.4),
-}
+    "base": "random-steering", "speed": 25.0 / 3.6, "small_angle": True, "tyres": "linear",
+    "roll": False, "lags": False, "amplitude": (0.03, 0.08), "amplitude_2": (0.02, 0.05),
+    "front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4),
+}  # fmt: skip
 SETTLED = 2000  # ticks
 
 

@@ -16,15 +16,11 @@ from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
 ALL = [
-    ("bicycle-kf", {}),
-    ("single-rate-kf", {"camera": CAMERA}),
-    ("multirate-kf", {"camera": CAMERA}),
-    ("multirate-residual-kf", {"camera": CAMERA}),
-    ("exact-kf", {"camera": CAMERA}),
-    ("course-kf", {"gps": GPS}),
-    ("multirate-residual-kf", {"gps": GPS}),
-    ("exact-kf", {"gps": SlowSensor(0.1, (0.25,))}),
-]
+    ("bicycle-kf", {}), ("single-rate-kf", {"camera": CAMERA}),
+    ("multirate-kf", {"camera": CAMERA}), ("multirate-residual-kf", {"camera": CAMERA}),
+    ("exact-kf", {"camera": CAMERA}), ("course-kf", {"gps": GPS}),
+    ("multirate-residual-kf", {"gps": GPS}), ("exact-kf", {"gps": SlowSensor(0.1, (0.25,))}),
+]  # fmt: skip
 
 
 def quiet(drive: Any, sensors: Any) -> Any:

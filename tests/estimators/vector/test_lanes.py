@@ -137,12 +137,9 @@ def test_a_snapshot_of_another_speed_brings_its_model_along() -> None:
 def test_which_filters_are_in_lanes() -> None:
     """All of one shape: a block of five is counted by what it has loaded."""
     cases: list[tuple[str, dict[str, Any], int]] = [
-        ("exact-kf", {}, 5),
-        ("multirate-kf", {}, 5),
-        ("exact-kf", {"delay": "stored"}, 5),
-        ("exact-kf", WITH_TYRES, 0),
-        ("exact-kf", {"delay": "buffer"}, 0),
-    ]
+        ("exact-kf", {}, 5), ("multirate-kf", {}, 5), ("exact-kf", {"delay": "stored"}, 5),
+        ("exact-kf", WITH_TYRES, 0), ("exact-kf", {"delay": "buffer"}, 0),
+    ]  # fmt: skip
     for name, options, there in cases:
         logs = drives(5, *home(name), seconds=0.05)
         batch = make_batch(name, 5, sensors=[log.slow for log in logs], speed=7.0, **options)

@@ -94,12 +94,9 @@ def test_it_gets_the_whole_record_and_what_the_env_offers() -> None:
     """Every tick once and in order, every packet, the clocks drawn at the reset; as copies."""
     env: Any = gym.make(VISION, camera={"phase": None}, control_period=7)
     wrapped: Any = EstimateObservation(
-        env,
-        Constant,
-        outputs=["gamma", "mu"],
-        vehicle=COMS.scale_stiffness(0.8),
+        env, Constant, outputs=["gamma", "mu"], vehicle=COMS.scale_stiffness(0.8),
         options={"gain": 3},
-    )
+    )  # fmt: skip
     base, records = env.unwrapped, []
     for seed in (1, 2):
         wrapped.reset(seed=seed)

@@ -137,13 +137,9 @@ def test_several_estimators_stand_side_by_side() -> None:
 @pytest.mark.smoke
 def test_one_json_string_names_env_and_estimator() -> None:
     env: Any = EstimateObservation(
-        gym.make(VISION, **FIG7),
-        "multirate-kf",
-        outputs=("beta",),
-        vehicle=COMS.scale_stiffness(0.8),
-        options={"q_beta": 1e-3},
-        name="mine",
-    )
+        gym.make(VISION, **FIG7), "multirate-kf", outputs=("beta",),
+        vehicle=COMS.scale_stiffness(0.8), options={"q_beta": 1e-3}, name="mine",
+    )  # fmt: skip
     text = env.spec.to_json()
     json.loads(text)
     again: Any = gym.make(EnvSpec.from_json(text))
