@@ -12,7 +12,6 @@ from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import EstimateObservation, Estimator, make_estimator
 from sideslip.estimators.analysis.bound import compute_error_bound
-from sideslip.estimators.delayed_channels import LateEstimator
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
@@ -123,19 +122,6 @@ def test_without_a_latency_it_is_the_filter_that_it_was() -> None:
         filter_ = make_estimator("exact-kf", **facts, latency=none)
         assert type(filter_) is Estimator
         assert (filter_.run(log).x == make_estimator("exact-kf", **facts).run(log).x).all()
-
-
-def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
-    """Bit for bit, but for the prediction: at the time of the latest channel nothing was lost."""
-    log, facts = drive()
-    punctual = log.record.fast.copy()
-    punctual[:-60, FAST.gyro] = log.record.fast[60:, FAST.gyro]
-    here = log.record.packets[:, PACKET.arrived] < 1930
-    late, plain = (make_estimator("exact-kf", **facts, latency=each) for each in (LATE, {}))
-    late.run(log)
-    plain.run(Log(Record(punctual[:1930], log.record.packets[here]), log.slow))
-    assert isinstance(late, LateEstimator)
-    assert (late.delayed_filters[0].x[:8] == plain.x).all()
 
 
 def test_the_bound_that_knows_it_is_a_bound() -> None:

@@ -58,12 +58,6 @@ def test_punctual_samples_equal_the_table() -> None:
     assert last.healthy
 
 
-@pytest.mark.parametrize("late", [{"course_rad": 0.35}, {"accel_y_mps2": 0.07, "steer_rad": 0.02}])
-def test_late_samples_change_nothing(late: dict[str, float]) -> None:
-    punctual = samples(20.0)
-    assert run(sorted(punctual, key=lambda x: x[1] + late.get(x[0], 0.0))) == run(punctual)
-
-
 def test_any_order_within_the_memory_changes_nothing() -> None:
     punctual = samples(12.0)
     rng = np.random.default_rng(0)

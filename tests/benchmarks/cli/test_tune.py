@@ -51,12 +51,6 @@ def test_write_changes_ours(run: Run, tmp_path: Path, monkeypatch: pytest.Monkey
     assert [e["estimator"] for e in options.read_tunings(options.FILE)] == ["dakf", "bicycle-kf"]
 
 
-def test_a_storage_that_is_no_database_is_refused(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "study.db").write_bytes(b"not a database at all" * 100)
-    status, _, err = run(*FIG8, "--storage", "study.db")
-    assert status == 2 and "file is not a database" in err and err.count("\n") == 1
-
-
 @pytest.mark.parametrize("missing", ["optuna", "cmaes"])
 def test_without_the_extra_the_command_names_it(
     run: Run, missing: str, monkeypatch: pytest.MonkeyPatch

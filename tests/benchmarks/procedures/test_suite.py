@@ -62,12 +62,6 @@ def test_a_car_that_passes_its_own_series_does_not_fail_beside_one_with_a_longer
     assert record["passed"] == (7.5, 7.5, 0) and record["text"] == "passes"
 
 
-def test_who_plans_is_left_out_of_a_quick_run() -> None:
-    driven = {ENTRIES[case.entry_index].agent for case in suite._make_cases(quick=True)}
-    assert "adaptive-nmpc" not in driven
-    assert {"adaptive-lqr", "policy on joint"} <= driven
-
-
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "_HAS_OUTSIDE", False)
     kinds = {case.procedure for case in suite._make_cases(quick=True)}

@@ -1,7 +1,5 @@
 """Each filter, whatever it is made of, refuses what is bad or skips and counts it."""
 
-import functools
-import itertools
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
 from tests.estimators.dense import WITH_TYRES
-from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
+from tests.estimators.simulation import CAMERA, simulate
 from tests.estimators.test_bad_input import BOTH, SHORT, counted, packet
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -130,74 +128,65 @@ def test_a_car_that_stands_is_no_division_by_zero(name: Any, speed: Any) -> None
     assert (found.std >= 0.0).all()
 
 
-SEEN: dict[str, Any] = {"camera": CAMERA}
+def late(rule: str, name: str, period: float, delay: float, **link: Any) -> dict[str, Any]:
+    """A rule for late samples, and the one sensor whose samples are late."""
+    return {"delay": rule, "sensors": {name: SlowSensor(period, (delay,), **link)}}
 
 
-def call(name: str, sensors: Any = None, **options: Any) -> Any:
-    sensors = {"camera": CAMERA, "gps": GPS} if sensors is None else sensors
-    return functools.partial(make_estimator, name, sensors=sensors, speed=FIG7.speed, **options)
-
-
-exact = functools.partial(call, "exact-kf")
-joint = functools.partial(call, "exact-kf", slow=["camera", "gps"], **WITH_TYRES)
-NEEDS = ": gate, adapt.* need gains='covariance'"
-BETWEEN_0_AND_1 = "gate is a probability between 0 and 1, got"
-NAN = float("nan")
-REFUSED: dict[str, list[Any]] = {
+SEEN: dict[str, Any] = {"sensors": {"camera": CAMERA}}
+TYRES: dict[str, Any] = {"slow": ["camera", "gps"]} | WITH_TYRES
+COVARIANCE, SHARE = ": gate, adapt.* need gains='covariance'", "adapt is a share from 0 to 1, got"
+PROBABILITY = "gate is a probability between 0 and 1, got"
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
     # sensors that are later than the window
-    r"exact-kf: the gps can be 0.5 s late; delay='buffer' has a window of 0.496 s \(496 t": [
-        exact({"gps": SlowSensor(0.2, (0.3,), jitter=0.2)}, delay="buffer")
-    ],
-    r"the camera can be 0.512 s late; delay='stored' has a window of 0.511 s \(511 ticks": [
-        exact({"camera": SlowSensor(0.033, (0.512,))}, delay="stored")
-    ],
-    r"assumed_delay of 0.512 s is not within the window of 0.512 s \(512 ticks\)": [
-        exact({"camera": SlowSensor(0.033)}, delay="constant", assumed_delay=0.512)
-    ],
-    "86 samples of gps can come within the longest delay; delay='buffer' stores 64": [
-        exact({"gps": SlowSensor(0.005, (0.4,))}, delay="buffer")
-    ],
-    "the camera can be 0.1 s late, 4 of its periods .* delay='larsen' can hold 1": [
-        exact({"camera": SlowSensor(0.033, (0.100,))}, delay="larsen")
-    ],
+    ("exact-kf", late("buffer", "gps", 0.2, 0.3, jitter=0.2), "gps can be 0.5 s late.* of 0.496 s"),
+    ("exact-kf", late("stored", "camera", 0.033, 0.512), "can be 0.512 s late.* of 0.511 s"),
+    (
+        "exact-kf",
+        late("constant", "camera", 0.033, 0.0) | {"assumed_delay": 0.512},
+        "of 0.512 s is",
+    ),
+    ("exact-kf", late("buffer", "gps", 0.005, 0.4), "86 samples of gps can come .* stores 64"),
+    (
+        "exact-kf",
+        late("larsen", "camera", 0.033, 0.1),
+        "0.1 s late, 4 of its periods .* can hold 1",
+    ),
     # rules that do not go together
-    "delay='larsen' weighs a sample before it is here, so it takes no gate": [
-        exact(SEEN, delay="larsen", gate=0.99)
-    ],
-    "no hdop_table": [
-        exact({"gps": SlowSensor(0.2, (0.1,))}, delay="larsen", hdop_table=[(1.0, 1.0), (2.0, 2.0)])
-    ],
-    "delay='buffer' is for filters that listen at every tick": [
-        call("single-rate-kf", SEEN, delay="buffer")
-    ],
-    "does not store the noise that noise_time=": [call("joint", SEEN, delay="buffer")],
-    f"multirate-kf{NEEDS}": [
-        call("multirate-kf", gains="periodic", gate=0.99),
-        call("multirate-kf", gains="periodic", adapt=0.02),
-    ],
-    f"multirate-residual-kf{NEEDS}": [call("multirate-residual-kf", gate=0.99)],
-    f"double-layer{NEEDS}": [call("double-layer", gate=0.99)],
-    f"dual-rate{NEEDS}": [call("dual-rate", adapt=0.1)],
-    f"lob{NEEDS}": [call("lob", gate=0.5)],
-    BETWEEN_0_AND_1: [exact(gate=gate) for gate in (0.0, 1.0, -0.5, 2.0, NAN)],
-    "adapt is a share from 0 to 1, got": [exact(adapt=adapt) for adapt in (-0.1, 1.0, NAN)],
+    (
+        "exact-kf",
+        SEEN | {"delay": "larsen", "gate": 0.99},
+        "before it is here, so it takes no gate",
+    ),
+    (
+        "exact-kf",
+        late("larsen", "gps", 0.2, 0.1) | {"hdop_table": [(1, 1), (2, 2)]},
+        "no hdop_table",
+    ),
+    ("single-rate-kf", SEEN | {"delay": "buffer"}, "is for filters that listen at every tick"),
+    ("joint", SEEN | {"delay": "buffer"}, "does not store the noise that noise_time="),
+    ("multirate-kf", {"gains": "periodic", "gate": 0.99}, COVARIANCE),
+    ("multirate-kf", {"gains": "periodic", "adapt": 0.02}, COVARIANCE),
+    *(
+        (name, {"gate": 0.99}, COVARIANCE)
+        for name in ("multirate-residual-kf", "double-layer", "lob")
+    ),
+    ("dual-rate", {"adapt": 0.1}, COVARIANCE),
+    *(("exact-kf", {"gate": gate}, PROBABILITY) for gate in (0.0, 1.0, -0.5, 2.0, float("nan"))),
+    *(("exact-kf", {"adapt": share}, SHARE) for share in (-0.1, 1.0, float("nan"))),
     # tyres as states
-    "another tyre's state": [joint(front_tyres_sd=0.0)],
-    "not negative": [joint(rear_tyres_sd=-1.0)],
-    "accel_scale_sd needs tyres": [exact(fast=["gyro", "accel_y"], accel_scale_sd=0.1)],
-    "accel_scale_sd needs accel_y among fast": [joint(accel_scale_sd=0.1)],
-}
+    ("exact-kf", TYRES | {"front_tyres_sd": 0.0}, "another tyre's state"),
+    ("exact-kf", TYRES | {"rear_tyres_sd": -1.0}, "not negative"),
+    (
+        "exact-kf",
+        {"fast": ["gyro", "accel_y"], "accel_scale_sd": 0.1},
+        "accel_scale_sd needs tyres",
+    ),
+    ("exact-kf", TYRES | {"accel_scale_sd": 0.1}, "accel_scale_sd needs accel_y among fast"),
+]
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        pytest.param(build, message, id=f"{build.args[0]}: {message}")
-        for message, build in itertools.chain.from_iterable(
-            [(message, build) for build in builds] for message, builds in REFUSED.items()
-        )
-    ],
-)
-def test_what_a_filter_cannot_have_is_refused(build: Any, message: str) -> None:
+@pytest.mark.parametrize(("name", "options", "message"), REFUSED)
+def test_what_a_filter_cannot_have_is_refused(name: str, options: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        build()
+        everywhere(name, **options)

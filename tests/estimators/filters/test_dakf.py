@@ -105,14 +105,3 @@ def test_the_lateral_force_observer() -> None:
     found = make_estimator("lateral-force-observer", speed=V).run(log)
     scale = np.array([1.0, m, m])
     np.testing.assert_allclose(found.x / scale, wanted / scale, rtol=0.0, atol=1e-8)
-
-
-def test_the_force_observer_finds_the_forces() -> None:
-    """In a steady turn: F_yf + F_yr = m a_y, l_f F_yf = l_r F_yr."""
-    log = log_of(4)
-    log.record.fast[:] = 0.0
-    log.record.fast[:, FAST.gyro], log.record.fast[:, FAST.accel_y] = 0.3, 0.3 * V
-    found = make_estimator("lateral-force-observer", speed=V).run(log).x[-1]
-    front = COMS.mass * 0.3 * V * COMS.rear_arm / (COMS.front_arm + COMS.rear_arm)
-    np.testing.assert_allclose(found[1], front, rtol=1e-6)
-    np.testing.assert_allclose(found[1] * COMS.front_arm, found[2] * COMS.rear_arm, rtol=1e-6)

@@ -104,8 +104,6 @@ def test_with_states_a_misaligned_car_is_estimated_as_well_as_a_clean_one() -> N
     askew = [misalign(log, seed, drives.vehicle)[0] for seed, log in enumerate(clean)]
     low, high = within(2 * RUNS)
     best, plain, ours = judge(clean, drives), judge(askew, drives), judge(askew, drives, **SDS)
-    for label, (nees, rmse, _) in {"clean": best, "without": plain, "with": ours}.items():
-        print(f"{label}: NEES {nees:.2f}, RMSE of beta {1e3 * rmse:.3f} mrad")
     assert low < best[0] < high and low < ours[0] < high
     assert ours[1] < 1.03 * best[1] < plain[1]
     assert plain[0] > 5.0

@@ -84,19 +84,6 @@ def test_the_rival_assumes_a_constant_delay(assumed: Any) -> None:
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)
 
 
-def test_samples_come_at_the_uneven_periods_of_16() -> None:
-    """T_smp = T_l - T_d^{i-1} + T_d^i: the estimate first moves by frame i just then."""
-    log = log_of(UNEVEN, 2)
-    still = make_estimator("uneven-delay-kf", sensors=log.slow, speed=V, **Q)
-    found, moments = still.run(log).x, []
-    for i in range(8):
-        other = log_of(UNEVEN, 2)
-        other.record.packets[i, PACKET.value] += 0.01
-        moments.append(int(np.flatnonzero((still.run(other).x != found).any(1))[0]))
-    T_d = np.array([20, 15, 10, 25] * 2)
-    np.testing.assert_array_equal(np.diff(moments), 33 - T_d[:-1] + T_d[1:])
-
-
 @pytest.mark.plain
 def test_slip_from_vision_alone() -> None:
     """2.3: without the gyro, the delayed frames alone, as a Kalman filter on six states."""
