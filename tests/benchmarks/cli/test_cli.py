@@ -71,12 +71,6 @@ def test_list_names_everything(run: Run) -> None:
         assert name in out
 
 
-def test_a_narrow_list_leaves_no_letter_out(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "console", Console(width=40))
-    status, out, _ = run("list")
-    assert status == 0 and "…" not in out and max(map(len, out.splitlines())) <= 40
-
-
 def test_an_episodes_line_stays_one_on_a_narrow_screen() -> None:
     class Drive(dict[str, Any]):
         log, cost, failed = SimpleNamespace(name="a-long-name"), 1.0, True

@@ -13,7 +13,7 @@ from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import Chunk
 from sideslip.benchmarks.control.tasks import YAW, ControlTask
 from sideslip.benchmarks.entrants.challenge import ComparisonRequest, make_user_entries
-from sideslip.benchmarks.entrants.worker import IsolatedDrive, _find_place, run_user_chunk
+from sideslip.benchmarks.entrants.worker import IsolatedDrive, run_user_chunk
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 GUST = ControlTask(scenario="gust", changes=SHORT)
@@ -75,12 +75,6 @@ def test_what_ends_a_process_is_a_result(tmp_path: Path, monkeypatch: pytest.Mon
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)
     assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
-
-
-def test_a_hang_is_found_in_the_users_file() -> None:
-    stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
-    assert _find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
-    assert _find_place(("pd", ""), stack) == ""
 
 
 FILTER = """

@@ -9,14 +9,12 @@ import pytest
 
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
-from sideslip.benchmarks.harness.parallel import split_seeds
 from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS, PaperFilter, make_filters
 from sideslip.benchmarks.papers.manoeuvres import (
     EstimationSimulation,
     FollowingSimulation,
     SlipSimulation,
 )
-from sideslip.benchmarks.papers.suite import _split_seeds
 from sideslip.estimators import make_estimator
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -77,13 +75,6 @@ def test_following_has_the_reference_beside_the_car() -> None:
     expected = np.sqrt(np.mean(error**2))
     assert found.numbers["without", "rms_gamma"] == pytest.approx(expected)
     assert found.numbers["without", "saturated"] == 0.0
-
-
-def test_seeds_are_split_and_shared() -> None:
-    assert split_seeds(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
-    following = FollowingSimulation("f", "dakf-fig7", {}, share=0.25)
-    assert _split_seeds(following, 8) == [(0, 1)]
-    assert _split_seeds(following, 1) == [(0,)]
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:

@@ -13,7 +13,6 @@ from sideslip.benchmarks.speed.ptx import _assemble_kernel, _count_by_kind
 torch = pytest.importorskip("torch")
 
 from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
-from sideslip.envs.device import make_device_env  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -34,17 +33,6 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
         assert dtype == "float64"
         low, high = map(float, spread.split(" .. "))
         assert 0.0 < low <= float(rate) <= high, count
-
-
-def test_every_round_takes_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One round more than is counted, the first of them."""
-    env: Any = make_device_env(ENV_ID, 2)
-    steps: list[Any] = []
-    env.step = steps.append
-    monkeypatch.setattr(device_speed, "_STEPS", 3)
-    monkeypatch.setattr(device_speed, "_ROUNDS", 2)
-    found = device_speed._measure(env, 1e9)
-    assert len(steps) == (2 + 1) * 3 and found.size == 2
 
 
 @pytest.mark.parametrize(

@@ -166,11 +166,3 @@ def test_the_scale_of_the_accelerometer_is_found(wrong: float) -> None:
     plain = built_for("exact-kf", log, **WITH_TYRES, **known).run(log)
     errors = [np.std((each["beta"] - log.truth["beta"])[2000:]) for each in (run, plain)]
     assert errors[0] < 0.9 * errors[1]
-
-
-def test_tyres_are_expanded_every_row_of_a_slow_log() -> None:
-    """Every 4 ms, or every row where rows are further apart."""
-    _, log = drive()
-    assert built_for("exact-kf", log, **WITH_TYRES).filters[0].linearise_every == 4
-    facts = {"vehicle": drive()[0].nominal, "sensors": {}, "slow": []}
-    assert make_estimator("joint", dt=0.01, **facts).filters[0].linearise_every == 1

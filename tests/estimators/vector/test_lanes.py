@@ -153,20 +153,6 @@ def test_which_filters_are_in_lanes() -> None:
     assert (few._lanes["model_speed"] == 0.0).all()
 
 
-def test_a_capture_leaves_its_tick_in_lanes() -> None:
-    """Of all filters on the same clock, and each captures once."""
-    log = drives(1, "camera", CAMERA, seconds=0.05)[0]
-    batch = make_batch("exact-kf", 5, sensors=log.slow, speed=7.0)
-    due = int(batch.filters[0, 0].next[0])
-    feed(batch, [log] * 5, 1, last=due + 1)  # what it measured is stored in the next tick
-    assert (batch.filters["next"][:, 0, 0] == due).all()
-    feed(batch, [log] * 5, 1, first=due + 1, last=due + 2)
-    lanes = batch._lanes[0]
-    assert (lanes["here"][:5] == 1.0).all() and (lanes["apart"] == 0.0).all()
-    assert (batch.filters["next"][:, 0, 0] > due).all()
-    assert (lanes["next"][:5] > lanes["now"][:5]).all()
-
-
 def test_blocks_and_records_lie_on_cache_lines() -> None:
     """A copy's, too, and next to each other what is fetched together."""
     made, batch = make_blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)

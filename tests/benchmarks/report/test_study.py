@@ -1,4 +1,4 @@
-"""What a suite prints: every column of every row, on a narrow screen too."""
+"""A suite is its study, and prints every column of every row, on a narrow screen too."""
 
 import io
 import re
