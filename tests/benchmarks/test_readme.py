@@ -1,6 +1,5 @@
 """The tables and numbers of README and docs/results/benchmark.md are those of their files."""
 
-import importlib.util
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,7 +16,6 @@ from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_task
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.papers.ledger import make_filters
-from sideslip.benchmarks.report import study
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies import estimation, traffic
 from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
@@ -163,10 +161,3 @@ def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
     assert "lqr 90 % [" in lines[1] and "none 60 % [" in lines[1]
     assert "spin 20 %, collision 10 %, departure 10 %" in lines[2] and "100 % [" in lines[2]
     assert "multirate-residual-kf holds 10 cm" in lines[3] and "30 cm" in lines[3]
-
-
-def test_without_highway_env_the_suite_has_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "find_spec", lambda name: None)
-    suite = traffic.STUDY.run(Request())
-    assert not suite.rows and "sideslip[highway]" in suite.verdict
-    assert importlib.util.find_spec("highway_env") is not None
