@@ -23,7 +23,6 @@ from sideslip.benchmarks.studies.policies import (
     prepare_start,
 )
 from sideslip.envs.vehicle.parameters import VEHICLES
-from tests.benchmarks.conftest import Run
 from tests.policies import GRU, TRACES
 
 
@@ -38,9 +37,7 @@ def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
             assert each.teacher.width == 1
 
 
-def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contests(
-    tmp_path: Path,
-) -> None:
+def test_what_a_student_sees_besides_stands_in_lessons_card_and_tasks(tmp_path: Path) -> None:
     seen: dict[str, Any] = {"with_map": True, "fast": "all"}
     lessons = Lessons("coms-zero-slip", "", "none", 2, observation_options=seen)
     card, lesson = lessons.make_card(), lessons.make_tasks()[0]
@@ -153,25 +150,6 @@ def test_every_contest_is_in_one_class() -> None:
     assert sum(len(_list_tasks(kind)) for kind in kinds) == len(list_scored_tasks())
     for kind in kinds:
         assert len({(each.env_id, each.vehicle) for each in _list_tasks(kind)}) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--class", "coms"), "unknown class of tasks 'coms'; known: coms-model"),
-        (("--class", "coms-model", "--estimator", "dakf"), "unknown estimator 'dakf'"),
-        (("--class", "coms-model", "--teacher", "oracle"), "unknown agent 'oracle'"),
-        (("--class", "coms-model", "--teacher", "lane-keeping"), "needs psi_hat, y_l_hat"),
-        (("--class", "coms-model", "--rounds", 0), "1 at least"),
-        (("--class", "coms-model", "--option", "map=true"), "unknown option 'map'"),
-    ],
-)
-def test_a_distillation_that_cannot_be_is_one_line(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    status, _, err = run("distill", "mine", *arguments)
-    assert status == 2 and said in err and not list(tmp_path.iterdir())
 
 
 def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None:

@@ -1,9 +1,12 @@
 """The tables and numbers of README and docs/results/benchmark.md are those of their files."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -11,6 +14,11 @@ from sideslip.benchmarks import own_ground, readme
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, read_json
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES
+from sideslip.benchmarks.papers.ledger import make_filters
+from sideslip.benchmarks.report.study import Request
+from sideslip.benchmarks.studies import estimation, traffic
+from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]
 
@@ -79,3 +87,77 @@ def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(readme, "measure", lambda x, *_, **__: dict.fromkeys(x, wrong))
     with pytest.raises(ValueError, match=r"in .*: no action"):
         readme._measure_entries()
+
+
+def _ratio(squares: Mapping[str, Any], of: str, to: str) -> float:
+    return float(np.sqrt(squares[of][:, 0].mean() / squares[to][:, 0].mean()))
+
+
+def test_dakf_beats_the_kalman_filter() -> None:
+    """dakf-stability: DAKF < KF, at most 0.75 of its error."""
+    drives = estimation._run_filters((estimation.EXPERIMENTS[1], range(8)))
+    squares = {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
+    assert _ratio(squares, "dakf", "course-kf") <= 0.75
+
+
+@pytest.mark.long
+def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
+    """tie-vision-fig7: within 3 % of the bound; the others in the paper's order where true."""
+    squares, _ = estimation.STUDY.measure(Request(episodes=40))
+    assert _ratio(squares, estimation.TRUE_MODEL, estimation.BOUND) == pytest.approx(1.0, rel=0.03)
+    for other in ("single-rate-kf", "multirate-kf", "multirate-residual-kf"):
+        assert _ratio(squares, "bicycle-kf", other) >= 1.05
+    assert _ratio(squares, "multirate-residual-kf", "multirate-kf") <= 1.10
+
+
+@pytest.mark.parametrize("experiment", estimation.EXPERIMENTS)
+def test_an_experiments_filters_exist_at_its_speed(experiment: estimation.Experiment) -> None:
+    base: Any = gym.make(experiment.env_id, scenario=experiment.scenario).unwrapped
+    assert base.held_speed == pytest.approx(25 / 3.6)
+    made = make_filters(experiment.filters, base)
+    assert list(made) == [each.label for each in experiment.filters]
+    assert {"exact-kf", "joint"} < {each.name for each in made.values()}
+
+
+pytest.importorskip("highway_env")
+
+
+def made(*ends: int) -> np.ndarray:
+    """(10, 3) of `simulate_swerve`: the ends first, then successes."""
+    failures = np.array([*ends, *[RUNNING] * (10 - len(ends))], float)
+    costs = np.where(failures == RUNNING, 1.0, 300.0)
+    return np.stack([costs, failures, np.full(10, 0.1)], axis=1)
+
+
+def test_an_episode_is_that_of_the_environment() -> None:
+    """Everybody drives the same seeds; without control the first numbers are the env's own."""
+    import gymnasium as gym
+
+    env = gym.make(traffic.ID, on_bad_action="fail")
+    env.reset(seed=traffic.FIRST_SEED)
+    cost, over = 0.0, False
+    while not over:
+        _, reward, terminated, truncated, info = env.step([0.0])
+        cost, over = cost - float(reward), terminated or truncated
+    ((found, failure, slip),) = traffic._simulate_swerve(("none", (0,)))
+    assert (found, failure) == (cost, info["failure"])
+    assert 0.0 < slip < 0.6
+
+
+@pytest.mark.parametrize("who", traffic.CONTROLLERS)
+def test_every_contestant_drives(who: str) -> None:
+    numbers = traffic._simulate_swerve((who, (1,)))
+    assert np.shape(numbers) == (1, 3) and np.isfinite(numbers).all()
+
+
+def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
+    swerves = {who: made(SPIN, DEPARTURE) for who in traffic.CONTROLLERS}
+    swerves["none"] = made(SPIN, SPIN, COLLISION, DEPARTURE)
+    swerves["lqr"], swerves[traffic.ORACLE] = made(COLLISION), made()
+    lanes = {name: np.full((2, 5), 0.1 * (1 + i)) for i, name in enumerate(traffic.READERS)}
+    text = traffic.STUDY.compose_verdict((swerves, lanes))
+    lines = text.splitlines()
+    assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
+    assert "lqr 90 % [" in lines[1] and "none 60 % [" in lines[1]
+    assert "spin 20 %, collision 10 %, departure 10 %" in lines[2] and "100 % [" in lines[2]
+    assert "multirate-residual-kf holds 10 cm" in lines[3] and "30 cm" in lines[3]

@@ -47,15 +47,9 @@ class Drive:
 
 FIG7 = Drive()
 FIG6 = Drive(
-    amplitude=0.2,
-    frequency=0.2,
-    onset=0.5,
-    periods=1.0,
-    real=7000.0,
-    nominal=10000.0,
-    wind=(200.0, 0.2, 4.0, 8.0),
-    outage=(4.0, 6.0),
-)
+    amplitude=0.2, frequency=0.2, onset=0.5, periods=1.0, real=7000.0, nominal=10000.0,
+    wind=(200.0, 0.2, 4.0, 8.0), outage=(4.0, 6.0),
+)  # fmt: skip
 
 
 def simulate(

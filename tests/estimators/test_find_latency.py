@@ -9,7 +9,7 @@ import pytest
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.envs.recordings.log_file import read_parts
 from sideslip.estimators import make_estimator
-from sideslip.estimators.delayed_channels import _align_rows, _LatencySearch
+from sideslip.estimators.delayed_channels import _LatencySearch
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_frame import drive
@@ -61,20 +61,6 @@ def test_between_the_lags_that_are_tried_a_parabola_has_the_least(least: float) 
     search = _LatencySearch((FAST.gyro,), 0.001)
     lag, bend, _ = search._minimise_nis(lambda lag: 7.0 + 0.25 * (lag - least) ** 2)
     assert lag == round(least) and bend == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("lag", [0, 1, 7, 20, 30])
-def test_aligned_rows_are_those_that_were_never_late(lag: int) -> None:
-    """As far as they have come; other columns stay as they are."""
-    true = np.random.default_rng(0).normal(size=(20 + lag, len(FAST)))
-    late = true[lag:].copy()
-    late[:, FAST.gyro] = true[:20, FAST.gyro]
-    come = max(20 - lag, 0)
-    wanted = true[lag:].copy()
-    wanted[come:, FAST.gyro] = np.nan
-    before = late.copy()
-    np.testing.assert_array_equal(_align_rows(late, {FAST.gyro: lag}), wanted)
-    np.testing.assert_array_equal(late, before)
 
 
 def straight(rows: int) -> Log:

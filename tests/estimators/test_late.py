@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import EstimateObservation, Estimator, make_estimator
 from sideslip.estimators.analysis.bound import compute_error_bound
-from sideslip.estimators.delayed_channels import LateEstimator
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate
@@ -124,19 +124,6 @@ def test_without_a_latency_it_is_the_filter_that_it_was() -> None:
         assert (filter_.run(log).x == make_estimator("exact-kf", **facts).run(log).x).all()
 
 
-def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
-    """Bit for bit, but for the prediction: at the time of the latest channel nothing was lost."""
-    log, facts = drive()
-    punctual = log.record.fast.copy()
-    punctual[:-60, FAST.gyro] = log.record.fast[60:, FAST.gyro]
-    here = log.record.packets[:, PACKET.arrived] < 1930
-    late, plain = (make_estimator("exact-kf", **facts, latency=each) for each in (LATE, {}))
-    late.run(log)
-    plain.run(Log(Record(punctual[:1930], log.record.packets[here]), log.slow))
-    assert isinstance(late, LateEstimator)
-    assert (late.delayed_filters[0].x[:8] == plain.x).all()
-
-
 def test_the_bound_that_knows_it_is_a_bound() -> None:
     """A late gyro costs, a punctual one that is slower costs no less; the filter reaches it."""
     log, facts = drive()
@@ -148,30 +135,22 @@ def test_the_bound_that_knows_it_is_a_bound() -> None:
 
 
 @pytest.mark.parametrize(
-    "latency, match",
+    ("name", "options", "error", "message"),
     [
-        ({"gyro": -0.01}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": np.nan}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": 0.6}, "latency of gyro is 0 to 0.5 s"),
-        ({"gyro": 0.0605}, "a latency of gyro of 0.0605 s is no whole number of ticks"),
-        ({"sonar": 0.1}, "latency is of steer, gyro"),
-        ({"gyro": "find", "steer": "find"}, "is 'find' for one channel"),
+        ("exact-kf", {"gyro": -0.01}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": np.nan}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": 0.6}, ValueError, "latency of gyro is 0 to 0.5 s"),
+        ("exact-kf", {"gyro": 0.0605}, ValueError, "gyro of 0.0605 s is no whole number of ticks"),
+        ("exact-kf", {"sonar": 0.1}, ValueError, "latency is of steer, gyro"),
+        ("joint", {"gyro": "find", "steer": "find"}, ValueError, "is 'find' for one channel"),
+        ("exact-kf", {"gyro": "find"}, ValueError, "for one channel of a filter with tyres as sta"),
+        ("multirate-residual-kf", LATE, ValueError, "latency, delay='larsen' and delay='buffer' n"),
+        ("exact-kf", 0.06, TypeError, "latency is seconds by channel"),
     ],
 )
-def test_what_a_latency_cannot_be(latency: Any, match: str) -> None:
-    sensors = {"camera": CAMERA}
-    with pytest.raises(ValueError, match=match):
-        make_estimator("exact-kf", **WITH_TYRES, sensors=sensors, speed=7.0, latency=latency)
-
-
-def test_filters_that_cannot_have_one() -> None:
-    common: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": 7.0}
-    with pytest.raises(ValueError, match="'find' for one channel of a filter with tyres as states"):
-        make_estimator("exact-kf", **common, latency={"gyro": "find"})
-    with pytest.raises(ValueError, match="latency, delay='larsen' and delay='buffer' need"):
-        make_estimator("multirate-residual-kf", **common, latency=LATE)
-    with pytest.raises(TypeError, match="latency is seconds by channel"):
-        make_estimator("exact-kf", **common, latency=0.06)
+def test_what_a_latency_cannot_be(name: str, options: Any, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        make_estimator(name, sensors={"camera": CAMERA}, speed=7.0, latency=options)
 
 
 def test_a_lost_filter_says_so_with_a_latency_too() -> None:
@@ -188,3 +167,53 @@ def test_a_lost_filter_says_so_with_a_latency_too() -> None:
     (healthy, deviation), (late_healthy, late_deviation) = found
     assert healthy < 0.5 and late_healthy == pytest.approx(healthy, abs=0.05)
     assert late_deviation == pytest.approx(deviation, rel=0.2)
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """0.5 s of a drive with both slow sensors."""
+    return rollout(gym.make("sideslip/YawFusion-v0"), seed=3, options={"duration": 0.5}).log
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "layers"),
+    [
+        ("exact-kf", {}, [0]),
+        pytest.param(  # side by side, uncorrelated
+            "double-layer",
+            {},
+            [0, 1],
+            marks=pytest.mark.filterwarnings("ignore:double-layer cannot see"),
+        ),
+        ("joint", {}, [0]),
+    ],
+)
+def test_it_is_its_records(log: Log, name: str, options: dict[str, Any], layers: list[int]) -> None:
+    estimator = make_estimator(name, sensors=log.slow, **options)
+    estimator.run(log)
+    x, P = np.zeros(0), np.zeros((len(estimator.names),) * 2)
+    for f in estimator.filters[layers]:
+        rows = slice(len(x), len(x) + int(f.n))
+        x, P[rows, rows] = np.append(x, f.x[: f.n]), f.P[: f.n, : f.n]
+    assert np.array_equal(estimator.x, x)
+    assert np.array_equal(estimator.P, P)
+
+
+@pytest.mark.parametrize("name", ["multirate-kf", "multirate-residual-kf", "lob-2"])
+def test_with_periodic_gains_it_is_a_triangle_of_the_table(log: Log, name: str) -> None:
+    estimator = make_estimator(name, sensors=log.slow)
+    estimator.run(log)
+    f, n = estimator.filters[0], len(estimator.names)
+    row = estimator.gains[f.cell, 1 + f.at * max(int(f.fasts), 1)]
+    upper = np.zeros((n, n))
+    upper[np.triu_indices(n)] = row[int(f.total) : int(f.total) + n * (n + 1) // 2]
+    assert np.array_equal(estimator.P, upper + np.triu(upper, 1).T)
+    assert np.array_equal(estimator.x, f.x[:n])
+
+
+def test_a_table_that_is_missing_is_made_for_the_covariance_alone(log: Log) -> None:
+    estimator = make_estimator("multirate-kf", sensors=log.slow)
+    assert not estimator.x.any()
+    assert not estimator.gains.any()
+    settled = estimator.P
+    assert estimator.gains[0].any() and np.linalg.eigvalsh(settled).min() > 0.0

@@ -13,6 +13,14 @@ from rich.console import Console
 from sideslip.benchmarks.cli import main as cli
 from sideslip.benchmarks.cli.common import show_episode
 from sideslip.benchmarks.cli.names import KINDS, complete
+from sideslip.benchmarks.control import calibration
+from sideslip.benchmarks.control.calibration import (
+    CalibrationRecord,
+    ClairvoyantEpisode,
+    _derive_seeds,
+    _read_calibration,
+)
+from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.suites import SUITES
 from tests.benchmarks.conftest import Run
 
@@ -61,12 +69,6 @@ def test_list_names_everything(run: Run) -> None:
     assert status == 0
     for name in ("sideslip/YawGps-v0", "tie-vision-fig7", "coms", "dakf", "two-dof", "estimation"):
         assert name in out
-
-
-def test_a_narrow_list_leaves_no_letter_out(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "console", Console(width=40))
-    status, out, _ = run("list")
-    assert status == 0 and "…" not in out and max(map(len, out.splitlines())) <= 40
 
 
 def test_an_episodes_line_stays_one_on_a_narrow_screen() -> None:
@@ -132,3 +134,51 @@ def test_quick_bench_gives_rows_tables_and_report(run: Run, tmp_path: Path) -> N
     assert all(row["n"] >= 1 and row["value"] is not None for row in rows)
     assert "the bound" in out and "single-rate" in out
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names.values())
+
+
+FIRST = list_scored_tasks()[0]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder; the package's file is another one; nothing is solved."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(calibration, "FILE", tmp_path / "package" / "clairvoyant.json")
+    (tmp_path / "package").mkdir()
+
+    def stand_in(case: Any) -> ClairvoyantEpisode:
+        return ClairvoyantEpisode(case.seed, 1.0, "from none", {"none": 2.0}, {"none": "ok"}, 0.0)
+
+    monkeypatch.setattr(calibration, "_solve", stand_in)
+    return tmp_path
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "written"),
+    [
+        ((), "clairvoyant.json"),
+        (("mine.json",), "mine.json"),
+        (("--write",), "package/clairvoyant.json"),
+    ],
+)
+def test_it_writes_beside(arguments: tuple[str, ...], written: str, run: Run, here: Path) -> None:
+    status, out, _ = run("calibrate", *arguments, "--contest", FIRST.name, "--seeds", 2, "-j", 1)
+    assert status == 0 and "wrote " in out
+    assert files(here) == [written]
+    (entry,) = _read_calibration(here / written).values()
+    assert entry.task == FIRST and [e.seed for e in entry.episodes] == _derive_seeds(FIRST, 2)
+    assert entry.command.startswith("sideslip calibrate")
+
+
+def test_the_matrix_refuses_a_stale_file_before_it_drives(run: Run, here: Path) -> None:
+    old = CalibrationRecord(*(FIRST.tier, FIRST.env_id, FIRST.vehicle, FIRST.reference,
+                              FIRST.scenario),
+                0, "by hand", ())  # fmt: skip
+    (here / "old.json").write_text(json.dumps([vars(old)]))
+    status, _, err = run("bench", "control", "--quick", "--clairvoyant", "old.json")
+    assert status == 2
+    assert f"{FIRST.name}, is stale: of world 0" in " ".join(err.split())

@@ -82,9 +82,7 @@ def test_a_film_is_read_and_its_losses_are_counted(run: Run, camera: Path, tmp_p
     assert status == 0 and "the film ends after" in text and "of the 6 frames" in text
 
 
-def test_what_cannot_be_read_is_one_line_and_nothing_is_written(
-    run: Run, camera: Path, tmp_path: Path
-) -> None:
+def test_what_cannot_be_read_is_one_line_alone(run: Run, camera: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.png"
     cv2.imwrite(str(broken), PAINTER.render_picture(RoadScene()))
     whole = broken.read_bytes()

@@ -167,57 +167,33 @@ CASES = [
     *_of(TUNE, "benchmarks.tuning.controllers.write_log",
          ("--log logs", "path", Path("logs/coms-model.lqr.json"))),
 ]
-# fmt: on
 NOTHING = SimpleNamespace(spec=None, search={}, car=None, wires=None, reason="")
+BASE = SimpleNamespace(base=SimpleNamespace(spec=SimpleNamespace(id="")))
 RETURNED: dict[str, dict[str, Any]] = {
-    "run": {
-        f"{CLI}.common.make_driver": (NOTHING, None),
-        f"{CLI}.common.show_episode": None,
-        "agents.rollout.rollout": None,
-    },
-    "bench": {
-        f"{CLI}.main.check_page": None,
-        f"{CLI}.main.use_engine": nullcontext(),
-        f"{CLI}.main.run_suites": [],
-        f"{CLI}.common.write_output": None,
-    },
-    "inspect": {
-        "benchmarks.recorded.inspection.inspect_file": NOTHING,
-        f"{CLI}.data.write_output": None,
-    },
-    "identify": {
-        "benchmarks.recorded.replay.identify_file": (NOTHING, None),
-        f"{CLI}.data.print_suite": None,
-    },
-    "live": {
-        f"{CLI}.live.make_driver": (None, None),
-        f"{CLI}.live._watch_signals": [],
-        "agents.live.controller.OnboardController": SimpleNamespace(
-            base=SimpleNamespace(spec=SimpleNamespace(id=""))
-        ),
-        "agents.live.loop.Loop.run": None,
-        f"{CLI}.live.gym.make": None,
-    },
-    "distill": {
-        "benchmarks.studies.policies.Lessons.make_card": None,
-        "benchmarks.studies.policies.Lessons.make_tasks": None,
-        "agents.training.distill.distill": None,
-        f"{CLI}.policies.evaluate_on_tasks": "",
-    },
-    "tune": {
-        "benchmarks.tuning.estimator.make_estimator_tuning": NOTHING,
-        "benchmarks.tuning.controllers.make_controller_tuning": None,
-        "benchmarks.tuning.controllers.tune": {"options": {}},
-        "benchmarks.tuning.controllers.make_suite": None,
-        "benchmarks.tuning.controllers.write_log": None,
-        "benchmarks.tuning.estimator.write_tuned": None,
-        f"{CLI}.search.use_engine": nullcontext(),
-        f"{CLI}.search.print_suite": None,
-    },
+    "run": {f"{CLI}.common.make_driver": (NOTHING, None), f"{CLI}.common.show_episode": None,
+            "agents.rollout.rollout": None},
+    "bench": {f"{CLI}.main.check_page": None, f"{CLI}.main.use_engine": nullcontext(),
+              f"{CLI}.main.run_suites": [], f"{CLI}.common.write_output": None},
+    "inspect": {"benchmarks.recorded.inspection.inspect_file": NOTHING,
+                f"{CLI}.data.write_output": None},
+    "identify": {"benchmarks.recorded.replay.identify_file": (NOTHING, None),
+                 f"{CLI}.data.print_suite": None},
+    "live": {f"{CLI}.live.make_driver": (None, None), f"{CLI}.live._watch_signals": [],
+             "agents.live.controller.OnboardController": BASE,
+             "agents.live.loop.Loop.run": None, f"{CLI}.live.gym.make": None},
+    "distill": {"benchmarks.studies.policies.Lessons.make_card": None,
+                "benchmarks.studies.policies.Lessons.make_tasks": None,
+                "agents.training.distill.distill": None, f"{CLI}.policies.evaluate_on_tasks": ""},
+    "tune": {"benchmarks.tuning.estimator.make_estimator_tuning": NOTHING,
+             "benchmarks.tuning.controllers.make_controller_tuning": None,
+             "benchmarks.tuning.controllers.tune": {"options": {}},
+             "benchmarks.tuning.controllers.make_suite": None,
+             "benchmarks.tuning.controllers.write_log": None,
+             "benchmarks.tuning.estimator.write_tuned": None,
+             f"{CLI}.search.use_engine": nullcontext(), f"{CLI}.search.print_suite": None},
 }
 """What functions on a command's way give back instead of working."""
-
-
+# fmt: on
 ABSENT = object()
 
 

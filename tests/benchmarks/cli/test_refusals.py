@@ -13,9 +13,10 @@ from tests.policies import VISION
 LQR = ("run", "--agent", "lqr", "--estimator", "exact-kf")
 SCENARIO = "tie-vision-fig8"
 TUNE = ("tune", "estimator", "--seeds", 1, "--test-seeds", 2, "--jobs", 1)
+LAW, DISTIL = ("tune", "controller"), ("distill", "mine", "--class")
 FIG8 = (*TUNE, "bicycle-kf", "--scenario", SCENARIO)
 DRIVES = cache(tuning._simulate_case)  # each is driven once for all tests
-NEEDS = {"train": "stable_baselines3", "tune": "optuna"}
+NEEDS = {"distill": "torch", "train": "stable_baselines3", "tune": "optuna"}
 MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
     (("run", "--beside", "none"), "'none' can only drive beside in a film: --video"),
@@ -52,6 +53,20 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("list", "scenario"), "unknown kind of name 'scenario'; did you mean 'scenarios'"),
     (("bench", "weather"), "unknown suite 'weather'; known: estimation"),
     (("enjoy", VISION, "--parquet", "rows.txt"), "a file that ends in .parquet"),
+    (("enjoy", "nobody"), "unknown policy 'nobody'; known: distill-car-"),
+    (("enjoy", VISION, "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
+    (("enjoy", VISION, "--scenario", "moon"), "unknown scenario 'moon'"),
+    (("enjoy", VISION, "--html", "nowhere/report.html"), "no such folder"),
+    (("enjoy", VISION, "--episodes", 0), "greater than or equal to 1"),
+    (("bench", "control", "--fresh"), "go with --agent or --estimator"),
+    (("bench", "control", "--vehicle", "coms"), "--vehicle go with --agent or --estimator"),
+    (("bench", "papers", "--keep", "cases"), "--keep goes with the suite control, got papers"),
+    (("bench", "papers", "--data", "."), "--data goes with the suite logs, got papers"),
+    (("bench", "highway", "--episodes", "4"), "highway has a number of its own"),
+    (("bench", "papers", "--agent", "esc"), "go with the suite control alone"),
+    (("bench", "--estimator", "none"), "goes with --agent"),
+    (("bench", "papers", "--salt", "ab12"), "--salt goes with control, got"),
+    (("bench", "control", "--salt", "xyz"), "a salt is hexadecimal digits, got 'xyz'"),
     (("replay", "nowhere.csv", "--parquet", "rows.txt"), "a file that ends in .parquet"),
     (("replay", "nowhere.csv"), "nowhere.csv"),
     (("inspect", "nowhere.csv", "--html", "page.txt"), "a file that ends in .html"),
@@ -90,6 +105,18 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("train", "--num-envs", "0"), "greater than or equal to 1"),
     (("train", "--seed", "-1"), "seed is at least 0, got -1"),
     (("train", "--scenarios", "moon"), "scenario 0 of the mixture: unknown scenario 'moon'"),
+    ((*DISTIL, "coms"), "unknown class of tasks 'coms'; known: coms-model"),
+    ((*DISTIL, "coms-model", "--estimator", "dakf"), "unknown estimator 'dakf'"),
+    ((*DISTIL, "coms-model", "--teacher", "oracle"), "unknown agent 'oracle'"),
+    ((*DISTIL, "coms-model", "--teacher", "lane-keeping"), "needs psi_hat, y_l_hat"),
+    ((*DISTIL, "coms-model", "--rounds", 0), "1 at least"),
+    ((*DISTIL, "coms-model", "--option", "map=true"), "unknown option 'map'"),
+    ((*LAW, "kalman"), "unknown controller 'kalman'; known: two-dof, "),
+    ((*LAW, "lqr", "--class", "moon"), "unknown class 'moon'; known: coms-model, "),
+    ((*LAW, "lqr", "--class", "coms-model", "--trials", 0), "trials must be at least 1, got 0"),
+    ((*LAW, "lqr", "--class", "coms-model", "--seeds", 0), "0 seeds; both are needed"),
+    ((*LAW, "model-following", "--class", "car-yaw"), "needs an env whose action steers"),
+    ((*LAW, "lqr", "--out", "nowhere/tuned.toml"), "nowhere/tuned.toml"),
     ((*TUNE, "kalman", "--scenario", SCENARIO), "unknown estimator 'kalman'"),
     ((*TUNE, "dafk", "--scenario", SCENARIO), "did you mean 'dakf'"),
     ((*TUNE, "dakf", "--scenario", "moon"), "unknown scenario 'moon'"),

@@ -16,7 +16,7 @@ from sideslip.agents.training.callbacks import CURVE, POLICY
 from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.cli import train as train_command
 from sideslip.benchmarks.cli.options import parse_options
-from sideslip.benchmarks.cli.train import _choose_folder, _make_command
+from sideslip.benchmarks.cli.train import _make_command
 from sideslip.benchmarks.studies import policies as enjoy
 from sideslip.benchmarks.studies.policies import _list_tasks
 from tests.benchmarks.conftest import Run
@@ -51,7 +51,7 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert f"policy {costs['policy']['mean']:.4g}" in out
 
 
-def test_it_goes_on_with_what_the_folder_holds(
+def test_it_goes_on_with_a_folder(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: NO_COSTS)
@@ -78,9 +78,7 @@ def test_it_goes_on_with_what_the_folder_holds(
     assert status == 2 and "is of seed 0, not 4" in err
 
 
-def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gpu_that_is_not_there_is_refused(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     status, _, err = run(*TINY, "--steps", 64, "--device", "cuda:0")
     assert status == 2 and "torch finds no CUDA device, got 'cuda:0'" in " ".join(err.split())
@@ -116,16 +114,7 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     assert status == 2 and "options of an estimator need an estimator" in err
 
 
-def test_the_folder_is_named_by_what_is_trained() -> None:
-    task = TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert _choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
-    assert _choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
-    assert _choose_folder(task, "", Path("here"), None) == Path("here")
-    zoos = _choose_folder(task, "", None, Path("logs"))
-    assert zoos == Path("logs/ppo/sideslip-YawGps-v0_1")
-
-
-def test_a_log_folder_is_the_zoo_s_and_numbered(
+def test_log_folders_are_the_zoos(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: NO_COSTS)

@@ -44,19 +44,11 @@ def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -
     assert options.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
 
 
-def test_write_changes_the_shipped_file(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_changes_ours(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "FILE", tmp_path / "shipped.toml")
     tune_file.update(options.FILE, ENTRY)
     assert run(*FIG8, *FEW, "--write")[0] == 0
     assert [e["estimator"] for e in options.read_tunings(options.FILE)] == ["dakf", "bicycle-kf"]
-
-
-def test_a_storage_that_is_no_database_is_refused(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "study.db").write_bytes(b"not a database at all" * 100)
-    status, _, err = run(*FIG8, "--storage", "study.db")
-    assert status == 2 and "file is not a database" in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("missing", ["optuna", "cmaes"])

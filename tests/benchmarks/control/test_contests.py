@@ -112,9 +112,7 @@ def test_a_rung_that_cannot_be_computed_leaves_the_other_or_the_reason() -> None
         assert "no plant" in lost.verdict and lost.slip_gap == 0.0
 
 
-def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions(
-    tmp_path: Path,
-) -> None:
+def test_the_file_holds_every_number_of_this_version_alone(tmp_path: Path) -> None:
     path = tmp_path / "contests.json"
     entry = found(ONE, BOTH)
     path.write_text(json.dumps([dataclasses.asdict(entry)]))
@@ -151,11 +149,7 @@ SCORED = list_scored_tasks() if module.FILE.is_file() else ()
 @pytest.mark.long
 @pytest.mark.parametrize("contest", SCORED[4::9], ids=[contest.name for contest in SCORED[4::9]])
 def test_the_ladder_falls_in_some_scored_contests(contest: ControlTask) -> None:
-    """No baseline is surely better than one that knows more, and nominal is surely the worst.
-
-    On seeds the contests were not chosen on, the same in every version. All contests are in `make
-    bench-full`.
-    """
+    """No baseline is surely better than one that knows more, and nominal is surely the worst."""
     contest = dataclasses.replace(contest, changes={"lead_in": QUICK_LEAD_IN})
     cells = [(contest, Entry(rung)) for rung in (NOMINAL, PARAMETERS, STATE)]
     there = measure(cells, make_salted_seeds("0", 32), jobs=2)

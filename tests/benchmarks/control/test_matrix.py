@@ -21,12 +21,7 @@ from sideslip.benchmarks.control.entries import (
     make_cases,
 )
 from sideslip.benchmarks.control.run import Chunk, measure
-from sideslip.benchmarks.control.tasks import (
-    YAW,
-    ControlTask,
-    list_scored_tasks,
-    make_salt,
-)
+from sideslip.benchmarks.control.tasks import YAW, ControlTask, list_scored_tasks, make_salt
 from sideslip.benchmarks.report.study import Request
 from sideslip.envs import COMS, FAILURES, SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
@@ -109,16 +104,6 @@ def test_in_a_world_a_filter_has_the_levels_of_nominals() -> None:
     assert own == {}
     for name in names:
         Entry("lqr", name).make(contest)
-
-
-def test_truth_is_told_without_error() -> None:
-    env, _ = Entry("two-dof", "truth").make(GUST, 2)
-    obs, infos = env.reset(seed=[1, 2])
-    names = [entry.name for entry in env.layout]
-    for _ in range(30):
-        obs, *_, infos = env.step(np.full((2, 1), 0.3, np.float32))
-    assert np.array_equal(obs[:, names.index("beta_hat")], infos["beta"].astype(np.float32))
-    assert np.array_equal(obs[:, names.index("gamma_hat")], infos["gamma"].astype(np.float32))
 
 
 class Broken:
@@ -212,11 +197,6 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         cached(Chunk(GUST, chunk.entry, SEEDS[:2], keep=True))
     monkeypatch.setattr(drive, "hash_sources", lambda: "edited")
     with pytest.raises(pytest.fail.Exception):  # other sources: driven again
-        cached(chunk)
-    monkeypatch.undo()
-    (found,) = tmp_path.iterdir()
-    found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
-    with pytest.raises(pytest.fail.Exception):
         cached(chunk)
 
 

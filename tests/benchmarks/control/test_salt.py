@@ -46,12 +46,6 @@ def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.Monke
     assert len(set(costs)) == 5
 
 
-def test_another_salt_is_other_episodes() -> None:
-    drawn = (make_salted_seeds(salt, 3) for salt in (ONE, OTHER))
-    one, other = (measure([NONE], seeds, jobs=1)[NONE] for seeds in drawn)
-    assert not set(one.costs) & set(other.costs)
-
-
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The cases that are to be driven from now on; none is, and all numbers are 1."""
     cases: list[Any] = []
@@ -98,9 +92,7 @@ def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("name", [*SALTED, "readme"])
-def test_a_suite_drives_the_salt_that_it_is_given(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_suite_drives_the_salt_it_is_given(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows from before and after a change of the sources compare; without one it follows them."""
     found: list[list[int]] = []
 
@@ -121,9 +113,7 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     assert found == [make_salted_seeds(salt, 4, GUST.seed_text) for salt in salts]
 
 
-def test_the_salt_follows_every_file_of_the_contestants(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_salt_follows_entries_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     contestants = (
         *("estimators/core/a.py", "estimators/b.toml", "agents/c/d.py"),
         *(f"agents/e{SUFFIX}", f"estimators/learned/h{SUFFIX}"),

@@ -2,14 +2,18 @@
 
 import re
 from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.entries import Entry
+import sideslip
+from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import Chunk
-from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.entrants.worker import IsolatedDrive, _find_place, run_user_chunk
+from sideslip.benchmarks.control.tasks import YAW, ControlTask
+from sideslip.benchmarks.entrants.challenge import ComparisonRequest, make_user_entries
+from sideslip.benchmarks.entrants.worker import IsolatedDrive, run_user_chunk
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 GUST = ControlTask(scenario="gust", changes=SHORT)
@@ -60,9 +64,7 @@ def test_one_nan_ends_its_episode_alone(tmp_path: Path) -> None:
     assert driven.mark_failures("bad-action").tolist() == [0.0, 1.0, 0.0]
 
 
-def test_what_it_does_to_its_process_is_its_result(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_ends_a_process_is_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends, or never returns; the numbers of one that drives are those of this process."""
     gone = IsolatedDrive()(chunk(tmp_path, "os._exit(3)"))
     assert gone.error == "its process ended with status 3"
@@ -73,12 +75,6 @@ def test_what_it_does_to_its_process_is_its_result(
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)
     assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
-
-
-def test_a_hang_is_found_in_the_users_file() -> None:
-    stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
-    assert _find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
-    assert _find_place(("pd", ""), stack) == ""
 
 
 FILTER = """
@@ -109,3 +105,38 @@ def test_a_filter_in_a_child_gives_the_bits_of_one_in_this_process(tmp_path: Pat
     apart, here = (drive(chunk) for drive in (IsolatedDrive(), run_user_chunk))
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)
+
+
+@pytest.mark.long
+def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
+    """On the observation that it was trained on."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    from sideslip.agents.training.export import export_zip
+    from sideslip.agents.vec_env import make_vec_env
+
+    zipped, exported = tmp_path / "mine.zip", tmp_path / "mine.safetensors"
+    sb3.A2C("MlpPolicy", make_vec_env(YAW, 1), policy_kwargs={"net_arch": [4]}).save(zipped)
+    export_zip(zipped, exported, YAW, trust=True)
+    short = {"base": "gust", "duration": 0.3}
+    options: dict[str, Any] = {"scenarios": short, "seeds": (1, 2), "jobs": 1, "estimator": ""}
+    found = [
+        sideslip.score(str(path), YAW, trust=path == zipped, **options)
+        for path in (zipped, exported)
+    ]
+    assert not found[0].error and found[0].cost == found[1].cost
+
+
+def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
+    """Alone, without a filter that it did not see in training."""
+    mine = str(tmp_path / "mine.zip")
+    with ZipFile(mine, "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", "")
+    (pair, other) = make_user_entries([mine, "esc"], [], trust=True)
+    assert pair.estimator == "" and ControlCase(ControlTask(), pair).options["controller"] == {
+        "trust": True
+    }
+    assert not other.trust
+    ComparisonRequest((pair,))
+    with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
+        ComparisonRequest(tuple(make_user_entries([mine], [])))

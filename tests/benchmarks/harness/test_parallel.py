@@ -216,9 +216,7 @@ def test_off_a_terminal_a_line_says_how_far_it_is(
 
 
 @pytest.mark.parametrize("term", ["dumb", "xterm"])
-def test_a_terminal_that_draws_nothing_has_lines_too(
-    capsys: pytest.CaptureFixture[str], term: str
-) -> None:
+def test_a_terminal_without_bar_has_lines(capsys: pytest.CaptureFixture[str], term: str) -> None:
     screen = Console(file=io.StringIO(), force_terminal=True, _environ={"TERM": term})
     run_cases(abs, [1, 2], "mine", jobs=1, console=screen)
     assert ("mine: 0 of 2 cases" in capsys.readouterr().err) == (term == "dumb")

@@ -6,12 +6,10 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Array, Log
 from sideslip.envs.vehicle.parameters import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
 
-assert sideslip.__version__
 EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace
 NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0407}
 

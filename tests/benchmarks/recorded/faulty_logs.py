@@ -8,12 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-import sideslip
 from sideslip.benchmarks.harness.drives import draw_steering, record_drive
 from sideslip.envs.record import FAST, PACKET, Array
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 
-assert sideslip.__version__
 DT, EVERY = 0.01, 10  # s of a row; ticks
 REST = 300  # rows at a standstill before every second drive
 _SIGNALS = {

@@ -8,27 +8,17 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import Vehicle
 
-assert sideslip.__version__
 EVERY = 10  # ticks to a row
 PLAIN = {"tyres": "linear", "roll": False, "lags": False}
 TURNS = {
-    "base": "random-steering",
-    "duration": 40.0,
-    "speed": (18.0, 22.0),
-    "amplitude": (0.01, 0.02),
-    "amplitude_2": (0.005, 0.01),
-    "surge": 0.7,
-    "surge_frequency": 0.05,
-    "disturbance_force": 100.0,
-    "disturbance_moment": 60.0,
-    "front_stiffness": (0.7, 1.3),
-    "rear_stiffness": (0.7, 1.3),
-}
+    "base": "random-steering", "duration": 40.0, "speed": (18.0, 22.0), "amplitude": (0.01, 0.02),
+    "amplitude_2": (0.005, 0.01), "surge": 0.7, "surge_frequency": 0.05, "disturbance_force": 100.0,
+    "disturbance_moment": 60.0, "front_stiffness": (0.7, 1.3), "rear_stiffness": (0.7, 1.3),
+}  # fmt: skip
 
 
 @functools.cache

@@ -22,12 +22,9 @@ def columns() -> dict[str, Array]:
     for k in range(ROWS - 1):
         x[k + 1] = G @ x[k] + H[:, 0] * SLALOM[k]
     return {
-        "time_s": 100.0 + DT * np.arange(ROWS),
-        "speed_x_mps": np.full(ROWS, SPEED),
-        "yaw_rate_radps": x[:, 1],
-        "steer_rad": SLALOM,
-        "sideslip_rad": x[:, 0],
-    }
+        "time_s": 100.0 + DT * np.arange(ROWS), "speed_x_mps": np.full(ROWS, SPEED),
+        "yaw_rate_radps": x[:, 1], "steer_rad": SLALOM, "sideslip_rad": x[:, 0],
+    }  # fmt: skip
 
 
 def saved(folder: Path, **changes: Array | None) -> Path:

@@ -75,10 +75,13 @@ def write_dbc(folder: Path, text: str = DBC) -> Path:
     return path
 
 
-def write_trace(folder: Path, name: str) -> Path:
+def write_trace(
+    folder: Path, name: str, change: Callable[[int, Any], None] = lambda i, frame: None
+) -> Path:
     write_dbc(folder)
     with can.Logger(folder / name) as logger:
-        for frame in frames():
+        for i, frame in enumerate(frames()):
+            change(i, frame)
             logger.on_message_received(frame)
     return folder / name
 
@@ -321,12 +324,11 @@ def test_a_container_that_is_cut_is_refused_in_one_line(tmp_path: Path, kind: st
 
 
 def test_a_clock_that_jumps_divides_the_trace(tmp_path: Path) -> None:
-    write_dbc(tmp_path)
-    path = tmp_path / "drive.log"
-    with can.Logger(path) as logger:
-        for i, frame in enumerate(frames()):
-            frame.timestamp += 100.0 * (i > 600)
-            logger.on_message_received(frame)
+
+    def jump(i: int, frame: Any) -> None:
+        frame.timestamp += 100.0 * (i > 600)
+
+    path = write_trace(tmp_path, "drive.log", jump)
     logs, remarks = read_parts(path, {**COLUMNS, "dbc": str(tmp_path / "car.dbc")})
     assert len(logs) == 2 and any("parts" in text for text in remarks)
 
@@ -334,49 +336,27 @@ def test_a_clock_that_jumps_divides_the_trace(tmp_path: Path) -> None:
 def test_a_formula_in_an_mdf_runs_nothing(tmp_path: Path) -> None:
     """asammdf hands what is no arithmetic to Python's eval."""
     frame, marker = table(), tmp_path / "ran"
-    for formula, is_refused in (
-        (f"__import__('os').mkdir('{marker}') or X1", True),
-        ("2*X1", False),
-    ):
-        signals = [
-            asammdf.Signal(
-                frame[x].to_numpy(),
-                frame["time_s"].to_numpy(),
-                name=x,
-                conversion={"formula": formula} if x == "yaw_rate_radps" else None,
-            )
-            for x in FAST_COLUMNS
-        ]
+
+    def save_scaled(formula: str) -> Path:
+        scaled = {"yaw_rate_radps": {"formula": formula}}
+        columns = [(x, frame[x].to_numpy(), scaled.get(x)) for x in FAST_COLUMNS]
+        time = frame["time_s"].to_numpy()
         with asammdf.MDF(version="4.10") as file:
-            file.append(signals)
-            path = Path(file.save(tmp_path / "drive.mf4", overwrite=True))
-        if is_refused:
-            with pytest.raises(
-                ValueError, match="yaw_rate_radps has a formula that is no arithmetic"
-            ):
-                read_parts(path)
-        else:
-            (log,), _ = read_parts(path)
-            np.testing.assert_allclose(log.record.fast[:, FAST.gyro], 2.0 * frame["yaw_rate_radps"])
+            file.append([asammdf.Signal(v, time, name=x, conversion=c) for x, v, c in columns])
+            return Path(file.save(tmp_path / "drive.mf4", overwrite=True))
+
+    path = save_scaled(f"__import__('os').mkdir('{marker}') or X1")
+    with pytest.raises(ValueError, match="yaw_rate_radps has a formula that is no arithmetic"):
+        read_parts(path)
     assert not marker.exists()
-
-
-def write_frames(path: Path, change: Callable[[int, Any], None]) -> Path:
-    write_dbc(path.parent)
-    with can.Logger(path) as logger:
-        for i, frame in enumerate(frames()):
-            change(i, frame)
-            logger.on_message_received(frame)
-    return path
+    (log,), _ = read_parts(save_scaled("2*X1"))
+    np.testing.assert_allclose(log.record.fast[:, FAST.gyro], 2.0 * frame["yaw_rate_radps"])
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda i, frame: setattr(frame, "channel", f"can{i % 2}"),
-            "0x100 is on several buses: can0",
-        ),
+        (lambda i, frame: setattr(frame, "channel", f"can{i % 2}"), "0x100 is on several buses"),
         (
             lambda i, frame: setattr(frame, "timestamp", frame.timestamp - 5.0 * (i > 600)),
             "the clock is set back, .* s after .* s; cut the file there",
@@ -386,7 +366,7 @@ def write_frames(path: Path, change: Callable[[int, Any], None]) -> Path:
 def test_a_trace_of_two_buses_or_clocks_is_refused(
     tmp_path: Path, change: Callable[[int, Any], None], message: str
 ) -> None:
-    path = write_frames(tmp_path / "drive.log", change)
+    path = write_trace(tmp_path, "drive.log", change)
     with pytest.raises(ValueError, match=message):
         read_parts(path, {**COLUMNS, "dbc": str(tmp_path / "car.dbc")})
 
@@ -402,19 +382,14 @@ def test_a_message_names_one_of_two_signals(tmp_path: Path) -> None:
 
 OTHER = DBC.replace("BO_ 256", "BO_ 300").replace("BO_ 512", "BO_ 600")
 TWICE = DBC.replace('Quality : 16|16@1+ (0.0625,0) [0|99] ""', 'Speed : 16|16@1+ (0.1,0) [0|99] ""')
+IDLE = DBC + 'BO_ 700 Idle: 8 Car\n SG_ Rack : 0|8@1+ (1,0) [0|1] "" Car\n'
 REFUSALS: dict[str, tuple[str, Mapping[str, str], str]] = {
     "no description": ("", COLUMNS, "needs its description: --map dbc=FILE"),
     "another car's": (OTHER, COLUMNS, r"none of its 2 ids \(0x100, 0x200, ...\) is in .*car.dbc"),
     "no description at all": ("hello", COLUMNS, "car.dbc describes no CAN frames"),
     "two of one name": (TWICE, COLUMNS, "share a name; --map one of Motion.Speed, Gps.Speed"),
     "no such signal": (DBC, {**COLUMNS, "steer_rad": "Rack"}, "no column 'Rack' for steer_rad"),
-    "an empty channel": (
-        DBC.replace(
-            "BO_ 512", 'BO_ 700 Idle: 8 Car\n SG_ Rack : 0|8@1+ (1,0) [0|1] "" Car\nBO_ 512'
-        ),
-        {**COLUMNS, "steer_rad": "Rack"},
-        "no column 'Rack' for steer_rad",
-    ),
+    "an empty channel": (IDLE, {**COLUMNS, "steer_rad": "Rack"}, "no column 'Rack' for steer_rad"),
 }
 
 
@@ -431,6 +406,7 @@ def test_a_trace_with_a_wrong_description_is_refused(tmp_path: Path, case: str) 
 @pytest.mark.parametrize(
     ("label", "message"),
     [
+        ("", "expected a file, found a folder"),
         ("/imu:twist.angular.z", "no topic '/imu'; the bag has /gps, /motion"),
         ("/motion:twist.angular.w", "no field 'twist.angular.w': 'w' is none of x, y, z"),
         ("/motion:twist.angular", "is no number, but"),
@@ -438,12 +414,19 @@ def test_a_trace_with_a_wrong_description_is_refused(tmp_path: Path, case: str) 
 )
 def test_a_bag_without_what_is_asked_is_refused(tmp_path: Path, label: str, message: str) -> None:
     path = write_bag(tmp_path, "SQLITE3")
+    if not label:  # no bag at all
+        (path / "metadata.yaml").unlink()
     with pytest.raises(ValueError, match=message):
         read_parts(path, BAG | {"yaw_rate_radps": label})
 
 
-def test_a_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, "SQLITE3")
-    (path / "metadata.yaml").unlink()
-    with pytest.raises(ValueError, match="expected a file, found a folder"):
-        read_parts(path, BAG)
+def test_a_value_that_is_not_available_is_no_measurement(tmp_path: Path) -> None:
+    def lose(i: int, frame: Any) -> None:
+        if frame.arbitration_id == 256 and 400 <= i < 410:
+            frame.data[2:4] = b"\xff\x7f"
+
+    path = write_trace(tmp_path, "drive.log", lose)
+    dbc = write_dbc(tmp_path, DBC + 'VAL_ 256 YawRate 32767 "Signal_Not_Available" ;\n')
+    (log,), remarks = read_parts(path, {**COLUMNS, "dbc": str(dbc)})
+    assert np.abs(log.record.fast[:, FAST.gyro]).max() < 3.9
+    assert any("not available are left out" in text for text in remarks)

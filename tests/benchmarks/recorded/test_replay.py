@@ -12,13 +12,13 @@ from pandas import read_csv
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.emulate import Emulation, LoggedMotion
 from sideslip.benchmarks.recorded.replay import replay_file
-from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, corners, replay
-from sideslip.envs.record import Log
+from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, _compute_path, corners, replay
+from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators import make_estimator
 from tests.envs.recordings.drives import read_log
 
-from .slalom import ROWS, VEHICLE, columns, saved
+from .slalom import DT, ROWS, SPEED, VEHICLE, columns, saved
 
 STANFORD = Path(__file__).parents[3] / "shared" / "data" / "stanford_250lm" / "log.csv"
 DEG = math.pi / 180.0
@@ -118,9 +118,7 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
         assert text
 
 
-def test_a_log_without_truth_or_slow_sensors_runs_and_says_what_it_leaves_out(
-    tmp_path: Path,
-) -> None:
+def test_a_log_without_truth_or_slow_sensors_says_what_is_left_out(tmp_path: Path) -> None:
     log = read_log(saved(tmp_path, sideslip_rad=None))
     suite = replay(log, PASSENGER_CAR)
     assert set(values(suite, "us_per_tick")) == {GYRO_ONLY}
@@ -214,9 +212,7 @@ def test_no_course_is_emulated_in_a_part_that_lacks_the_logs_own(tmp_path: Path)
     assert "Part 2 has no sample of gps." in suite.text and "emulated" not in suite.text
 
 
-def test_without_gps_and_truth_the_inertial_sensors_serve_more_than_one_filter(
-    tmp_path: Path,
-) -> None:
+def test_without_gps_and_truth_inertial_sensors_serve_two_filters(tmp_path: Path) -> None:
     rows = read_csv(saved(tmp_path))
     rows = rows.drop(columns=[name for name in ("course_rad", "sideslip_rad") if name in rows])
     rows.assign(accel_y_mps2=0.0).to_csv(tmp_path / "bare.csv", index=False)
@@ -250,3 +246,64 @@ def test_an_option_of_an_emulated_course_is_refused_beside_a_real_one(tmp_path: 
     rows.to_csv(tmp_path / "course.csv", index=False)
     with pytest.raises(ValueError, match="delay is of an emulated course"):
         replay_file(tmp_path / "course.csv", PASSENGER_CAR, delay=0.5)
+
+
+def test_a_noiseless_course_is_truth_plus_the_integral_of_the_yaw_rate(log: Log) -> None:
+    seen = Emulation(course_noise_deg=0.0, bias_deg=1.0).apply(log, 0)
+    packets = seen.record.select_packets("gps")
+    captured = packets[:, PACKET.captured].astype(int)
+    np.testing.assert_array_equal(captured, np.arange(10_000, 11_001, 10))
+    gamma, beta = log.record.fast[:, FAST.gyro], log.truth["beta"]
+    for packet, row in zip(packets, captured - 10_000, strict=True):
+        psi = sum(0.5 * (gamma[i] + gamma[i + 1]) * DT for i in range(row))  # slowly
+        assert packet[PACKET.value] == pytest.approx(psi + beta[row] + 1.0 * DEG, abs=1e-12)
+    assert (packets[:, PACKET.quality] == 1.0).all()
+    assert seen.slow["gps"].period == pytest.approx(0.1)
+    assert seen.truth is log.truth
+
+
+def test_a_late_course_arrives_so_many_rows_later(log: Log) -> None:
+    fresh = Emulation().apply(log, 3).record.packets
+    late = Emulation(delay=0.2).apply(log, 3)
+    packets = late.record.packets
+    np.testing.assert_array_equal(packets[:, PACKET.arrived], packets[:, PACKET.captured] + 20)
+    np.testing.assert_array_equal(packets[:, PACKET.value], fresh[: len(packets), PACKET.value])
+    assert packets[-1, PACKET.arrived] <= log.record.ticks[-1]
+    assert late.slow["gps"].delays == pytest.approx((0.2,))
+
+
+def test_the_noise_has_its_seed_and_size(log: Log) -> None:
+    how = Emulation(course_rate=100.0, course_noise_deg=0.5)
+    one, same, other = (how.apply(log, seed).record.packets for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    noise = one[:, PACKET.value] - (log.truth["beta"] + LoggedMotion(log).heading)
+    assert np.std(noise) == pytest.approx(0.5 * DEG, rel=0.1)
+    assert not np.array_equal(one, other)
+
+
+def test_a_gyro_bias_reaches_the_estimators_but_not_the_heading(log: Log) -> None:
+    plain, biased = Emulation(), Emulation(gyro_bias_degps=0.2)
+    one, two = plain.apply(log, 0).record, biased.apply(log, 0).record
+    np.testing.assert_allclose(two.fast[:, FAST.gyro] - one.fast[:, FAST.gyro], 0.2 * DEG)
+    np.testing.assert_array_equal(two.packets, one.packets)
+
+
+def test_no_course_without_truth_and_none_to_use_at_a_standstill(tmp_path: Path) -> None:
+    beta, speed = columns()["sideslip_rad"], np.full(ROWS, SPEED)
+    beta[95:105] = np.nan
+    speed[:50] = 0.5
+    log = read_log(saved(tmp_path, sideslip_rad=beta, speed_x_mps=speed))
+    packets = Emulation().apply(log, 0).record.packets
+    assert 10_100 not in packets[:, PACKET.captured]
+    np.testing.assert_array_equal(packets[:6, PACKET.quality], [0, 0, 0, 0, 0, 1])
+
+
+def test_a_path_of_a_circle() -> None:
+    """Constant speed, yaw rate and sideslip drive a circle of radius V / gamma."""
+    fast = np.zeros((20_001, len(FAST)))
+    fast[:, FAST.gyro] = 0.1
+    fast[:, [FAST.wheel_left, FAST.wheel_right]] = 10.0
+    drive = Log(Record(fast, np.zeros((0, PACKET_WIDTH))), {})
+    x, y = _compute_path(drive, np.zeros(20_001))
+    radius = np.hypot(x, y - 100.0)
+    np.testing.assert_allclose(radius, 100.0, atol=0.01)

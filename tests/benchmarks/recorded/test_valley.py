@@ -21,12 +21,7 @@ from sideslip.benchmarks.recorded.bicycle_fit import (
     fit,
     make_windows,
 )
-from sideslip.benchmarks.recorded.identify import (
-    POSSIBLE,
-    TYRES,
-    IdentificationResult,
-    identify,
-)
+from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, IdentificationResult, identify
 from sideslip.benchmarks.recorded.quality import find_saturated
 from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
 from sideslip.envs.record import FAST, Array, Log
@@ -39,14 +34,9 @@ from .slalom import columns, saved
 
 ESTIMATORS = ("bicycle-kf", "multirate-kf", "exact-kf")
 NEUTRAL = PASSENGER_CAR.replace(  # steers nearly neutrally: the valley is exact
-    mass=1776.0,
-    sprung_mass=1500.0,
-    front_arm=1.3,
-    rear_arm=1.45,
-    front_stiffness=72500.0,
-    rear_stiffness=65000.0,
-    yaw_inertia=3180.0,
-)
+    mass=1776.0, sprung_mass=1500.0, front_arm=1.3, rear_arm=1.45, front_stiffness=72500.0,
+    rear_stiffness=65000.0, yaw_inertia=3180.0,
+)  # fmt: skip
 
 
 def share(car: Vehicle) -> float:
@@ -76,8 +66,7 @@ def with_lagging_gyro(log: Log, lag: float) -> Log:
 
 
 def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
-    """A gyro behind a low-pass is what no model here has; the stated tyres are 1.3 times too stiff.
-    Without priors tyres and inertia stay 1.3 and 1.5 times the true ones, within 5 %."""
+    """A lagging gyro; the stated tyres are 1.3 times too stiff. Priors bound what is left open."""
     log = with_lagging_gyro(without(driven(NEUTRAL), accel=True, course=True), 0.08)
     found = identify([log], NEUTRAL.scale_stiffness(1.3))
     true = (2.0 * NEUTRAL.front_stiffness, 2.0 * NEUTRAL.rear_stiffness, NEUTRAL.yaw_inertia)
@@ -124,9 +113,7 @@ def test_rows_that_are_alike_count_once() -> None:
         assert _estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
 
 
-def test_a_car_that_cannot_be_is_not_identified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_car_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is written, the exit status is 1, and a replay keeps the stated car."""
     results: list[IdentificationResult] = []
 
@@ -173,12 +160,8 @@ def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
         pytest.param(range(100, 130), (None, TYRES[0]), marks=pytest.mark.long),
     ],
 )
-def test_estimators_do_not_get_worse_on_another_drive(
-    seeds: range, laws: tuple[str | None, ...]
-) -> None:
-    """By the drawn cars together, for the chosen law and the linear one of a replay: with the
-    steering, latency and noise that were found, and with the car alone. The chosen law's intervals
-    hold the small-slip stiffness and the inertia per mass."""
+def test_estimators_get_no_worse_elsewhere(seeds: range, laws: tuple[str | None, ...]) -> None:
+    """By all drawn cars together, and the chosen law's intervals hold stiffness and inertia."""
     errors: list[tuple[str | None, Array, Array]] = []
     outside = []
     for seed in seeds:

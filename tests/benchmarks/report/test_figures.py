@@ -130,18 +130,6 @@ def test_small_ranges_far_from_zero_keep_their_shape() -> None:
     assert line.y.dtype == np.float32
 
 
-def test_curves_have_dots_and_whiskers() -> None:
-    x, y = np.array([1.0, 1024.0, 65536.0]), np.array([8.0, 1.0, 1.0])
-    figure = figures.draw_curves(x, {"gym.make": y}, "environments", "CPU time / us")
-    (line,) = figure.data
-    assert list(line.x) == list(x) and list(line.y) == list(y)
-    assert line.mode == "lines+markers"
-    assert figure.layout.yaxis.title.text == "CPU time / us"
-    figure = figures.draw_curves(x, {"gym.make": (y, y - 1.0, y + 2.0)}, "n", "us")
-    whiskers = figure.data[0].error_y
-    assert list(whiskers.array) == [2.0] * 3 and list(whiskers.arrayminus) == [1.0] * 3
-
-
 def test_tracks_have_equal_axes() -> None:
     figure = figures.draw_track({"truth": (np.arange(5000.0), np.arange(5000.0))})
     assert figure.layout.yaxis.scaleanchor == "x"

@@ -23,20 +23,11 @@ FINGER, MOUSE = (f"primaryHoverType={n},availableHoverTypes={n}" for n in (1, 2)
 DARK, LIGHT = (f"preferredColorScheme={n}" for n in (0, 1))
 
 OPTIONS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-dev-shm-usage",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--no-first-run",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
-    "--enable-logging=stderr",
-    "--v=0",
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-quic",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--no-first-run", "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
     "--virtual-time-budget=20000",
-)
+)  # fmt: skip
 
 # Each runs when everything is drawn, and leaves what it found in the document.
 OPEN = """

@@ -10,6 +10,9 @@ import pytest
 
 pytest.importorskip("optuna")
 
+import pytest
+from rich.console import Console
+
 from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
 from sideslip.benchmarks.control.entries import ControlCase
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
@@ -25,6 +28,14 @@ from sideslip.benchmarks.tuning.controllers import (
     tune,
 )
 from sideslip.benchmarks.tuning.estimator import SearchOptions, write_tuned
+from sideslip.benchmarks.tuning.levels import (
+    _convert_levels,
+    _search,
+    draw_drive,
+    get_levels,
+    run_filter,
+)
+from sideslip.benchmarks.tuning.next_car import PARTS, main
 from tests.benchmarks.conftest import Run
 
 SHORT = ControlTask(scenario="sine-with-dwell")
@@ -86,9 +97,7 @@ def test_the_objective_is_minus_the_mean_score() -> None:
     assert _compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_an_adaptive_contestant_is_tuned_on_the_filter_it_follows(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_adaptive_contestant_is_tuned_on_its_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which takes no option, and drives after a short lead-in."""
     asked: list[ControlCase] = []
     monkeypatch.setattr(controllers, "run_chunk", lambda x: asked.append(x.case))
@@ -120,9 +129,7 @@ def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPa
     assert _compute_objective(bad, SEEDS, {"pole": -1.0}) == math.inf
 
 
-def test_of_a_slow_contestant_the_worse_half_stops_early(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_of_slow_entries_half_stops_early(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The rest goes on with new seeds, and is judged by the mean of all that it has driven."""
     asked: list[tuple[int, ...]] = []
 
@@ -146,26 +153,6 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
     assert best["objective"] == pytest.approx(wanted, abs=2e-3)  # numbers have three digits
     nearest = min(log["trials"], key=lambda row: abs(math.log(row["numbers"]["grip"] / 0.5)))
     assert best["numbers"] == nearest["numbers"]  # the best trial is never stopped
-
-
-def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    calls: list[float] = []
-
-    def fake(task: ControllerTuning, seeds: tuple[int, ...], found: dict[str, float]) -> float:
-        if len(calls) == 11:
-            raise KeyboardInterrupt
-        calls.append(found["gain"])
-        return found["gain"]
-
-    monkeypatch.setattr(controllers, "_compute_objective", fake)
-    once = task(SearchNumber("gain", 1.0, 0.1, 10.0))
-    with pytest.raises(KeyboardInterrupt):
-        tune(once, SearchOptions(16, storage(tmp_path), jobs=1))
-    before, calls[:] = calls[:8], []  # a whole batch
-    log = tune(once, SearchOptions(16, storage(tmp_path), jobs=1))
-    assert len(calls) == 8
-    driven = [row["numbers"]["gain"] for row in log["trials"]]
-    assert driven == [float(f"{each:.3g}") for each in before + calls]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -230,32 +217,7 @@ def test_defaults_stand_where_nothing_was_tuned() -> None:
             assert log["best"]["objective"] == min(known) <= (log["start"] or math.inf)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("kalman",), "unknown controller 'kalman'; known: two-dof, "),
-        (("lqr", "--class", "moon"), "unknown class 'moon'; known: coms-model, "),
-        (("lqr", "--class", "coms-model", "--trials", 0), "trials must be at least 1, got 0"),
-        (("lqr", "--class", "coms-model", "--seeds", 0), "0 seeds; both are needed"),
-        (("model-following", "--class", "car-yaw"), "needs an env whose action steers"),
-        (("lqr", "--out", "nowhere/tuned.toml"), "nowhere/tuned.toml"),
-    ],
-)
-def test_a_mistake_is_one_line_that_names_it(
-    run: Run,
-    arguments: tuple[Any, ...],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    status, _, err = run("tune", "controller", *arguments)
-    assert status == 2 and message in " ".join(err.split())
-
-
-def test_the_command_writes_options_and_log(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_both(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(controllers, "list_scored_tasks", lambda: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
@@ -265,3 +227,41 @@ def test_the_command_writes_options_and_log(
     assert len(log["trials"]) == 2 and log["seeds"] == make_tuning_seeds(1)
     held = {part: options for part, options in log["options"].items() if options}
     assert read_tuned(Path("t.toml"))["coms-model"]["two-dof"] == held
+
+
+def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
+    first, again = (draw_drive(3, 4.0) for _ in range(2))
+    assert np.array_equal(first.log.record.fast, again.log.record.fast)
+    drives = [draw_drive(seed, 4.0) for seed in range(5)]
+    assert [" ".join(sorted(x.log.slow)) for x in drives] == [
+        "camera",
+        "gps",
+        "camera gps",
+        "gps",
+        "",
+    ]
+    assert [x.log.record.dt for x in drives] == [0.001] * 3 + [0.01] * 2
+    assert all(x.facts["vehicle"] != drives[0].facts["vehicle"] for x in drives[1:])
+    for drive in drives:  # the levels in use are the defaults
+        error, deviation = run_filter(drive, _convert_levels(get_levels(), drive.log))
+        assert np.isfinite(error).all() and (deviation > 0.0).all()
+
+
+def test_every_part_can_be_left_out() -> None:
+    drive = draw_drive(2, 3.0)
+    whole = run_filter(drive, {})[0]
+    for name, options in list(PARTS.items())[1:]:
+        assert not np.array_equal(run_filter(drive, options)[0], whole), name
+
+
+@pytest.mark.long
+def test_levels_that_are_far_off_are_left() -> None:
+    start = get_levels() | {"gyro_noise": 0.1, "force_share": 0.5}
+    _, found, before = _search(start, 36, 10, 1, Console(quiet=True))
+    assert found < before - 0.1
+
+
+@pytest.mark.long
+def test_the_table_of_parts_is_written(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    main(3, tmp_path / "table.json", 1)
+    assert "without tyres" in (tmp_path / "table.json").read_text()

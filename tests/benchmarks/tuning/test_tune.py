@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.drives import LoggedEpisode
-from sideslip.benchmarks.tuning import estimator as tune_file
 from sideslip.benchmarks.tuning import estimator as tune_task
-from sideslip.benchmarks.tuning import study as tune
 from sideslip.benchmarks.tuning import study as tune_study
 from sideslip.benchmarks.tuning.estimator import EstimatorTuning, SearchOptions
 from sideslip.estimators import make_estimator
@@ -34,6 +32,11 @@ def drives(task: EstimatorTuning) -> list[LoggedEpisode]:
 
 def storage(folder: Path) -> str:
     return f"sqlite:///{folder}/study.db"
+
+
+def search(task: EstimatorTuning, drives: list[LoggedEpisode], url: str, trials: int) -> Any:
+    study = tune_study.create_study(task, url)
+    return tune_study._search(study, task, drives, SearchOptions(trials, jobs=1))
 
 
 def tried(task: EstimatorTuning, url: str) -> list[Any]:
@@ -69,9 +72,7 @@ def test_found_is_the_best_that_was_tried(
     task: EstimatorTuning, drives: list[LoggedEpisode], tmp_path: Path
 ) -> None:
     url = storage(tmp_path)
-    found = tune_study._search(
-        tune_study.create_study(task, url), task, drives, SearchOptions(12, jobs=1)
-    )
+    found = search(task, drives, url, 12)
     trials = tried(task, url)
     assert len(trials) == 12
     best = min(trials, key=lambda trial: trial.value)
@@ -125,20 +126,16 @@ def test_a_stopped_search_goes_on(
 
     monkeypatch.setattr(tune_study, "_evaluate_file", stopping)
     with pytest.raises(KeyboardInterrupt):
-        tune_study._search(
-            tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1)
-        )
+        search(task, drives, url, 16)
     monkeypatch.setattr(tune_study, "_evaluate_file", score)
     kept = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(kept) == 8  # a whole batch
-    tune_study._search(tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1))
+    search(task, drives, url, 16)
     finished = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(finished) == 16 and finished[:8] == kept
     assert len({tuple(params.values()) for params in finished}) == 16  # nothing is tried twice
-    monkeypatch.setattr(
-        tune_study, "_evaluate_file", lambda *_: pytest.fail("there is nothing to do")
-    )
-    tune_study._search(tune_study.create_study(task, url), task, drives, SearchOptions(16, jobs=1))
+    monkeypatch.setattr(tune_study, "_evaluate_file", lambda *_: pytest.fail("all is done"))
+    search(task, drives, url, 16)
 
 
 def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> None:
@@ -151,9 +148,8 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
     )
     (drive,) = tune_task.simulate(task, task.seeds, "", 1, None)
     fast = [LoggedEpisode(drive.log, drive.facts | {"speed": 40.0})]
-    study = tune_study.create_study(task, storage(tmp_path))
     with pytest.raises(ValueError, match="its error grows by a factor"):
-        tune_study._search(study, task, fast, SearchOptions(3, jobs=1))
+        search(task, fast, storage(tmp_path), 3)
     assert [trial.value for trial in tried(task, storage(tmp_path))] == [np.inf] * 3
 
 
@@ -176,30 +172,19 @@ def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
     assert (task.env_id, task.sensors, task.unit) == ("sideslip/YawVision-v0", "camera", "rad")
 
 
-@pytest.mark.parametrize(
-    ("name", "env_id"),
-    [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")],
-)
-def test_the_environment_has_the_sensors_the_filter_needs(name: str, env_id: str) -> None:
-    assert tune_task.make_estimator_tuning(name, "slalom", seeds=1).env_id == env_id
-
-
 def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Path) -> None:
     held = {"q_gamma": 1e-2}
     task = tune_task.make_estimator_tuning(
         "bicycle-kf", SCENARIO, options=held, search={"q_beta": (1e-12, 1.2e-12)}, seeds=2
     )
-    suite, found = tune.run(task, SearchOptions(8, storage(tmp_path), jobs=1), 3)
+    suite, found = tune_study.run(task, SearchOptions(8, storage(tmp_path), jobs=1), 3)
     comparison, numbers = suite.tables
     assert comparison.header == ("tuning", "2 training seeds", "3 test seeds")
     assert [row[0] for row in comparison.cells] == ["default", "found"]
     assert numbers.cells[0][0] == "q_beta" and "over default" in comparison.note
-    entry = tune.make_entry(task, found, "a command")
+    entry = tune_study.make_entry(task, found, "a command")
     assert entry["q"] == {"gamma": 1e-2, "beta": found["q_beta"]}
     assert numbers.cells[0][3] == "at its end"
-
-
-# The file of tunings.
 
 
 ENTRY = {"estimator": "dakf", "sensors": "gps", "command": 'say "x"', "q": {"beta": 1e-9}}
@@ -209,13 +194,13 @@ def test_an_entry_is_replaced_and_its_note_and_the_others_stay(tmp_path: Path) -
     path = tmp_path / "found.toml"
     by_hand = ENTRY | {"note": "chosen by hand"}
     by_hand.pop("command")
-    tune_file.update(path, by_hand)
-    tune_file.update(path, ENTRY)
+    tune_task.update(path, by_hand)
+    tune_task.update(path, ENTRY)
     assert options.read_tunings(path) == [ENTRY]
-    tune_file.update(path, ENTRY | {"note": "why: \\ \u00e4"})
-    tune_file.update(path, ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}})
+    tune_task.update(path, ENTRY | {"note": "why: \\ \u00e4"})
+    tune_task.update(path, ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}})
     path.write_text("# a remark\n" + path.read_text())
-    tune_file.update(path, ENTRY | {"q": {"beta": 2.0}, "command": "again"})
+    tune_task.update(path, ENTRY | {"q": {"beta": 2.0}, "command": "again"})
     first, second = options.read_tunings(path)
     assert first == ENTRY | {"q": {"beta": 2.0}, "command": "again", "note": "why: \\ \u00e4"}
     assert second == ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}}
@@ -224,7 +209,7 @@ def test_an_entry_is_replaced_and_its_note_and_the_others_stay(tmp_path: Path) -
 
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "found.toml"
-    tune_file.update(path, ENTRY)
+    tune_task.update(path, ENTRY)
     before = path.read_bytes()
 
     def full(_: int) -> None:
@@ -232,7 +217,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="no space"):
-        tune_file.update(path, ENTRY | {"q": {"beta": 3.0}})
+        tune_task.update(path, ENTRY | {"q": {"beta": 3.0}})
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
@@ -262,27 +247,16 @@ def test_a_shipped_tuning_says_how_it_was_found(entry: dict[str, Any]) -> None:
         assert entry["q"][name.removeprefix("q_")] == float(value)
 
 
-# The command line.
-
-
-def test_a_study_that_holds_something_else_is_refused(
-    task: EstimatorTuning, tmp_path: Path
-) -> None:
-    url = storage(tmp_path)
-    study = optuna.create_study(storage=url, study_name=task.study)
+def test_a_study_that_is_damaged_or_none_is_refused(task: EstimatorTuning, tmp_path: Path) -> None:
+    study = optuna.create_study(storage=storage(tmp_path), study_name=task.study)
     study.add_trial(optuna.trial.create_trial(value=1.0))
     with pytest.raises(ValueError, match="holds something else"):
-        tune_study.create_study(task, url)
-
-
-def test_a_damaged_study_is_one_line(task: EstimatorTuning, tmp_path: Path) -> None:
-    url = storage(tmp_path)
-    tune_study.create_study(task, url)
+        tune_study.create_study(task, storage(tmp_path))
     with (tmp_path / "study.db").open("r+b") as database:
         database.seek(2000)
         database.write(b"?" * 20000)
     with pytest.raises(ValueError, match="malformed"):
-        tune_study.create_study(task, url)
+        tune_study.create_study(task, storage(tmp_path))
 
 
 def test_several_scenarios_count_alike() -> None:

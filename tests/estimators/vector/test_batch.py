@@ -82,54 +82,6 @@ def test_every_row_is_the_filter_alone(name: Any, speed: Any) -> None:
         np.testing.assert_array_equal(one.std, other.std)
 
 
-@pytest.mark.parametrize("n", [1, 10])
-def test_covariances_are_each_rows_own(n: Any) -> None:
-    """Random delays: rows that differ in nothing but arrivals have their own P."""
-    drive = dataclasses.replace(FIG7, duration=0.4)
-    logs = [simulate(drive, {"camera": JITTERY}, seed) for seed in range(8)]
-    batch = make_batch("exact-kf", 8, sensors=logs[0].slow, speed=SPEED)
-    feed(batch, logs, n)
-    singles = [make_estimator("exact-kf", sensors=log.slow, speed=SPEED) for log in logs]
-    for single, log in zip(singles, logs, strict=True):
-        single.run(log)
-    same_bits(batch, singles)
-    assert len({each.P.tobytes() for each in batch}) > 4
-
-
-def test_a_masked_reset_starts_some_rows_anew() -> None:
-    logs = drives(3, *home("multirate-kf"), seconds=0.08)
-    batch = make_batch("multirate-kf", 3, sensors=[log.slow for log in logs], speed=SPEED)
-    feed(batch, logs, 10)
-    before = states(batch)
-    other = EstimatorSpec(COMS, {"camera": dataclasses.replace(CAMERA, phase=0.008)}, SPEED)
-    batch.configure([1], [other])
-    batch.reset(np.array([False, True, False]))
-    np.testing.assert_array_equal(states(batch)[[0, 2]], before[[0, 2]])
-    assert batch[1].x.tolist() == [0.0] * len(batch.names)
-    assert [each.filters[0].phase[0] for each in batch] == [0, 8, 6]
-    assert [each.tick for each in batch] == [80, -1, 80]
-
-
-@pytest.mark.plain
-def test_a_row_without_ticks_and_packets_stands_still() -> None:
-    logs = drives(2, *home("bicycle-kf"), seconds=0.05)
-    batch = make_batch("bicycle-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
-    fast = np.array([log.record.fast[:20] for log in logs])
-    step(batch, fast, np.zeros((2, 0, PACKET_WIDTH)), rows=[20, 0])
-    assert [each.tick for each in batch] == [19, -1]
-    alone = make_estimator("bicycle-kf", sensors=logs[0].slow, speed=SPEED)
-    alone.step(fast[0], np.zeros((0, PACKET_WIDTH)))
-    np.testing.assert_array_equal(batch[0].P, alone.P)
-
-
-def test_rows_that_are_told_the_same_share_their_gains() -> None:
-    cars = [COMS, COMS.scale_stiffness(0.9), COMS, COMS.scale_stiffness(0.9)]
-    batch = make_batch("multirate-kf", 4, vehicle=cars, sensors={"camera": CAMERA}, speed=SPEED)
-    first, other = batch[0].gains, batch[1].gains
-    assert np.shares_memory(first, batch[2].gains) and np.shares_memory(other, batch[3].gains)
-    assert not np.shares_memory(first, other)
-
-
 def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
     """Of other delays and gains of another shape, while the others keep what they know."""
     logs = drives(2, "camera", CAMERA, 0.3)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS
-from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
@@ -18,11 +17,9 @@ from tests.estimators.vector.fleets import (
     VISION,
     actions,
     drive_both,
-    make_batch,
     native,
     pair,
     same_bits,
-    step,
 )
 from tests.estimators.wrappers.constant import Constant
 
@@ -93,15 +90,6 @@ def test_a_nan_of_one_row_ends_its_episode_alone() -> None:
     assert np.isnan(obs).any(axis=1).tolist() == [False, True, False]
     _, _, terminated, _, _ = env.step(obs[:, -2:-1])
     assert terminated.tolist() == [False, True, False]
-
-
-def test_a_batch_by_itself() -> None:
-    """Of a user's own: each row has its speed, rows and packets."""
-    batch = make_batch(Constant, 2, speed=[7.0, 8.0])
-    assert [each.inner.arguments["speed"] for each in batch] == [7.0, 8.0]
-    fast, packets = np.zeros((2, 4, FAST_WIDTH)), np.zeros((2, 1, PACKET_WIDTH))
-    step(batch, fast, packets, rows=[4, 2], counts=[0, 1])
-    assert [len(each) for each in batch[1].inner.calls[-1]] == [2, 1]
 
 
 def test_the_spec_builds_rows_with_their_own() -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from sideslip.envs import COMS
 from sideslip.envs.numerics.simd import LANES
-from sideslip.envs.numerics.simd8 import pad_to_cache_line
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
@@ -88,8 +87,7 @@ def test_so_it_is_with_options(options: Any) -> None:
 
 
 def test_a_capture_is_of_its_own_tick() -> None:
-    """A course over the ground, on a road that turns, noisier the slower: the car speeds up so much
-    that its model is another one in most ticks, or by some of its captures alone."""
+    """A car so much faster that its model is another in most ticks, or by some captures alone."""
     clock = dataclasses.replace(GPS, delays=(0.03,))
     logs = drives(COUNT, "gps", clock, seconds=0.6)
     for i, log in enumerate(logs):
@@ -139,12 +137,9 @@ def test_a_snapshot_of_another_speed_brings_its_model_along() -> None:
 def test_which_filters_are_in_lanes() -> None:
     """All of one shape: a block of five is counted by what it has loaded."""
     cases: list[tuple[str, dict[str, Any], int]] = [
-        ("exact-kf", {}, 5),
-        ("multirate-kf", {}, 5),
-        ("exact-kf", {"delay": "stored"}, 5),
-        ("exact-kf", WITH_TYRES, 0),
-        ("exact-kf", {"delay": "buffer"}, 0),
-    ]
+        ("exact-kf", {}, 5), ("multirate-kf", {}, 5), ("exact-kf", {"delay": "stored"}, 5),
+        ("exact-kf", WITH_TYRES, 0), ("exact-kf", {"delay": "buffer"}, 0),
+    ]  # fmt: skip
     for name, options, there in cases:
         logs = drives(5, *home(name), seconds=0.05)
         batch = make_batch(name, 5, sensors=[log.slow for log in logs], speed=7.0, **options)
@@ -156,20 +151,6 @@ def test_which_filters_are_in_lanes() -> None:
     )
     feed(few, logs[: _MIN_LANES - 1], 10)
     assert (few._lanes["model_speed"] == 0.0).all()
-
-
-def test_a_capture_leaves_its_tick_in_lanes() -> None:
-    """Of all filters on the same clock, and each captures once."""
-    log = drives(1, "camera", CAMERA, seconds=0.05)[0]
-    batch = make_batch("exact-kf", 5, sensors=log.slow, speed=7.0)
-    due = int(batch.filters[0, 0].next[0])
-    feed(batch, [log] * 5, 1, last=due + 1)  # what it measured is stored in the next tick
-    assert (batch.filters["next"][:, 0, 0] == due).all()
-    feed(batch, [log] * 5, 1, first=due + 1, last=due + 2)
-    lanes = batch._lanes[0]
-    assert (lanes["here"][:5] == 1.0).all() and (lanes["apart"] == 0.0).all()
-    assert (batch.filters["next"][:, 0, 0] > due).all()
-    assert (lanes["next"][:5] > lanes["now"][:5]).all()
 
 
 def test_blocks_and_records_lie_on_cache_lines() -> None:
@@ -189,11 +170,3 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     small = list(itertools.takewhile(lambda each: each[0].itemsize <= 64 * 8, behind))
     assert small[-1][1] + small[-1][0].itemsize == 8 * (P + N_TOTAL * N_TOTAL + N_SMALL)
     assert len(small) > 80
-
-
-def test_a_dtype_is_whole_lines_whatever_its_fields_are() -> None:
-    """They are many as a filter's are, or few; what is filled up has no name of theirs."""
-    for count in (1, 7, 8, 9):
-        made = pad_to_cache_line([("rest", np.float64, (count,)), ("x", np.int64)])
-        assert made.itemsize == 64 * -(-(count + 1) // 8) and made.names is not None
-        assert made.names[:2] == ("rest", "x")

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from sideslip.envs import COMS
@@ -159,39 +159,3 @@ def test_copies_continue_bit_for_bit(options: dict[str, Any]) -> None:
         env.step(actions(env, step))
     twin = copy.deepcopy(env)
     assert drive_both(env, twin, 12, 8) > 2
-
-
-class Native(VectorEnv[Any, Any, Any]):
-    """A vector env that offers its records as arrays of all cars, as `records.BatchedEnv` says."""
-
-    held = ("rows", "packets", "ticks_done", "delivered")
-
-    def __init__(self, inner: SyncVectorEnv[Any, Any]) -> None:
-        self._inner, self.num_envs, self.metadata = inner, inner.num_envs, inner.metadata
-        self.single_observation_space = inner.single_observation_space
-        self.observation_space = inner.observation_space
-
-    def reset(self, **kwargs: Any) -> Any:
-        return self._inner.reset(**kwargs)
-
-    def step(self, actions: Any) -> Any:
-        return self._inner.step(actions)
-
-    def __getattr__(self, name: str) -> Any:
-        cars: list[Any] = [each.unwrapped for each in self._inner.envs]
-        if name in ("layout", "dt"):
-            return getattr(cars[0], name)
-        if name.removeprefix("final_") in self.held:
-            return np.array([getattr(car, name) for car in cars])
-        if name in ("slow_sensors", "nominal", "held_speed"):
-            return [getattr(car, name) for car in cars]
-        raise AttributeError(name)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_an_env_that_offers_its_records_as_arrays(mode: Any) -> None:
-    layer: dict[str, Any] = {"estimator": "exact-kf"}
-    alone, _ = pair(UNEVEN, 3, mode, [layer], camera={"phase": None})
-    native = Native(fleet(UNEVEN, 3, mode, camera={"phase": None}))
-    together = EstimateObservation(native, **layer)
-    assert drive_both(alone, together, 30, seed=6) > 3

@@ -9,7 +9,6 @@ import pytest
 
 from sideslip.estimators import FILTERS
 from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
-from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS
 from tests.estimators.vector.fleets import BAD, VISION, drive_both, home, outputs, same_bits
@@ -79,27 +78,6 @@ def test_after_a_reset_that_is_refused_everything_is_as_it_was(options: Any) -> 
     assert one.tobytes() == other.tobytes()
 
 
-def test_rows_of_different_scenarios_have_their_own_filters() -> None:
-    """Each row has the bits of the single env, wrapped and reset alone."""
-    layer: dict[str, Any] = {"estimator": "multirate-kf"}
-    scenarios = ["uneven-delay-fig5", "tie-vision-fig7", "sine"]
-    together = EstimateObservation(gym.make_vec(VISION, num_envs=3), **layer)
-    obs, infos = together.reset(seed=4, options={"scenario": scenarios, "friction": 0.8})
-    cars = [Single(gym.make(VISION), **layer) for _ in scenarios]
-    for i, car in enumerate(cars):
-        options = {"scenario": scenarios[i], "friction": 0.8}
-        alone, info = car.reset(seed=4 + i, options=options)
-        assert alone.tobytes() == obs[i].tobytes()
-        assert info == {key: infos[key][i] for key in info}
-    for step in range(40):
-        told = np.full((3, 1), 0.02 * step, np.float32)
-        obs, rewards, _, _, infos = together.step(told)
-        for i, car in enumerate(cars):
-            alone, reward, _, _, info = car.step(told[i])
-            assert alone.tobytes() == obs[i].tobytes() and reward == rewards[i]
-            assert info == {key: infos[key][i] for key in info}
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_nees_is_told_where_the_truth_is(mode: str) -> None:
     """With infos at the ends only, that is where a row's episode ended."""
@@ -129,18 +107,6 @@ def test_nees_is_told_where_the_truth_is(mode: str) -> None:
             assert not other[4]["nees"][~ended].any()
         else:
             assert "nees" not in other[4]
-
-
-@pytest.mark.parametrize("told", [{}, {"autoreset_mode": "SameStep", "info": "ends"}])
-def test_the_spec_builds_environments_wrapped_one_by_one(told: dict[str, Any]) -> None:
-    env = gym.make_vec(VISION, num_envs=2, **told)
-    together = EstimateObservation(env, "multirate-kf")
-    assert together.spec is not None
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
-    assert again.num_envs == 2
-    assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
-    one, other = again.reset(seed=4)[0], together.reset(seed=4)[0]
-    assert one.tobytes() == other.tobytes()
 
 
 def test_the_spec_tells_of_the_truth_too() -> None:

@@ -56,18 +56,14 @@ REFUSALS: dict[type[Exception], dict[str, Callable[[], Any]]] = {
         "CartPoleEnv has no rows": lambda: wrap(SyncVectorEnv([CartPoleEnv])),
         "CartPoleVectorEnv has no rows": lambda: wrap(gym.make_vec("CartPole-v1", num_envs=2)),
         r"no vector env.*sideslip\.estimators\.EstimateObs": lambda: wrap(gym.make(VISION)),
-        "unknown option 'q'": lambda: wrap(options={"q": 1}),
         "one Constant cannot estimate 3 rows: pass its class": lambda: wrap(
             native("NextStep"), Constant()
         ),
         "of filters of ours or of none": lambda: reset(wavering, FIG7),
         "SyncVectorEnv makes no snapshots; the vector env that": lambda: wrap().get_state(),
-        "multirate-kf: unknown option 'p'": lambda: batch(p=1.0),
     },
     ValueError: {
         r"must reset rows itself.*DISABLED": lambda: wrap(fleet(VISION, 2, "Disabled")),
-        "dakf needs the slow sensor gps; there is: camera": lambda: wrap(estimator="dakf"),
-        "no state 'psi'": lambda: wrap(estimator="bicycle-kf", outputs=["psi"]),
         r"x has shape \(3,\)": lambda: reset(Constant, options={"value": (1.0, 2.0)}),
         "filters of a batch have the same states, row 0 has": lambda: reset(changing, FIG7),
         "needs the slow sensor camera": lambda: batch(sensors={"gps": GPS}, slow="camera"),

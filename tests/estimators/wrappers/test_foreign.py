@@ -16,7 +16,7 @@ from sideslip.benchmarks.harness.drives import LoggedEpisode, make_filter_argume
 from sideslip.benchmarks.tuning.estimator import make_estimator_tuning
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, EstimatorFactory, EstimatorLike, make_estimator
-from sideslip.estimators.make import ESTIMATORS, register_estimator
+from sideslip.estimators.make import register_estimator
 from sideslip.estimators.protocol import ForeignEstimator
 from tests.envs.helpers import bits
 from tests.estimators.wrappers.constant import Constant
@@ -24,17 +24,13 @@ from tests.estimators.wrappers.constant import Constant
 if TYPE_CHECKING:
     from tests.estimators.wrappers.ukf import Ukf
 
+pytestmark = pytest.mark.usefixtures("own_names")
+
 VISION = "sideslip/YawVision-v0"
 FIG7: dict[str, Any] = {"scenario": "tie-vision-fig7"}
 UKF = "tests.estimators.wrappers.ukf:Ukf"
 CONSTANT = "tests.estimators.wrappers.constant:Constant"
 STILL = np.zeros(1, np.float32)
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is gone after it."""
-    monkeypatch.setattr(ESTIMATORS, "_factories", dict(ESTIMATORS._factories))
 
 
 def ukf() -> EstimatorFactory:
@@ -98,12 +94,9 @@ def test_it_gets_the_whole_record_and_what_the_env_offers() -> None:
     """Every tick once and in order, every packet, the clocks drawn at the reset; as copies."""
     env: Any = gym.make(VISION, camera={"phase": None}, control_period=7)
     wrapped: Any = EstimateObservation(
-        env,
-        Constant,
-        outputs=["gamma", "mu"],
-        vehicle=COMS.scale_stiffness(0.8),
+        env, Constant, outputs=["gamma", "mu"], vehicle=COMS.scale_stiffness(0.8),
         options={"gain": 3},
-    )
+    )  # fmt: skip
     base, records = env.unwrapped, []
     for seed in (1, 2):
         wrapped.reset(seed=seed)

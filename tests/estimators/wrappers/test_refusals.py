@@ -12,19 +12,15 @@ from gymnasium.vector import SyncVectorEnv
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator, smooth, vector
-from sideslip.estimators.make import ESTIMATORS, register_estimator
+from sideslip.estimators.make import register_estimator
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruthObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.estimators.wrappers.constant import Constant
 
+pytestmark = pytest.mark.usefixtures("own_names")
+
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
 STILL = np.zeros(1, np.float32)
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is gone after it."""
-    monkeypatch.setattr(ESTIMATORS, "_factories", dict(ESTIMATORS._factories))
 
 
 def without(member: str) -> Any:
@@ -151,9 +147,7 @@ def test_a_record_without_rows_or_of_other_ticks() -> None:
         ({"gyro_noise": 0.1}, r"passed as options=\{'gyro_noise': 0.1\}"),
     ],
 )
-def test_a_misplaced_argument_is_refused_with_the_nearest_name(
-    argument: dict[str, Any], message: str
-) -> None:
+def test_a_misplaced_argument_is_named_and_refused(argument: dict[str, Any], message: str) -> None:
     with pytest.raises(TypeError, match=message):
         EstimateObservation(gym.make(VISION), "exact-kf", **argument)
     with pytest.raises(TypeError, match=message):

@@ -102,9 +102,7 @@ def _wrapped(vector: bool, env: Any, states: tuple[str, ...]) -> Any:
     ("mode", "states"),
     [("NextStep", ()), ("SameStep", ()), ("NextStep", tuple(TRUE_STATE._fields))],
 )
-def test_rows_of_a_vector_env_have_the_bits_of_single_ones(
-    mode: str, states: tuple[str, ...]
-) -> None:
+def test_rows_of_a_vector_env_have_bits_of_single_ones(mode: str, states: tuple[str, ...]) -> None:
     def made(i: int, wrap: bool) -> Any:
         env = gym.make(FUSION, scenario={"base": "random-steering", "duration": 0.05 + 0.02 * i})
         return _wrapped(False, env, states) if wrap else env

@@ -9,7 +9,6 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
-import sideslip  # noqa: F401  registers the environments
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator
@@ -42,9 +41,7 @@ def still(env: Any) -> Any:
     ],
 )
 @pytest.mark.parametrize("control_period", [1, 10, 33])
-def test_the_wrapped_filter_equals_the_filter_on_the_log(
-    env_id: Any, name: Any, control_period: Any
-) -> None:
+def test_the_wrapped_filter_equals_it_on_a_log(env_id: Any, name: Any, control_period: Any) -> None:
     """Equal bits for every control period, and what is observed is what the filter says."""
     seconds, options = {"duration": 0.7}, dict[str, Any]()
     if ":" in name:  # a user's own
@@ -89,17 +86,9 @@ def test_layout_and_space_describe_the_observation() -> None:
         check_env(alone, skip_render_check=True)
 
 
-def test_nees_is_the_normalised_error_per_output() -> None:
-    env: Any = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
-    env.reset(seed=1)
-    for _ in range(40):
-        *_, info = env.step(still(env))
-        e = env.estimator.x[:2] - [info["beta"], info["gamma"]]
-        P = env.estimator.P[:2, :2]
-        assert info["nees"] == pytest.approx(e @ np.linalg.solve(P, e) / 2.0, rel=1e-9)
-        assert isinstance(info["nees"], float)
+def test_nees_is_the_normalised_error_of_the_outputs_alone() -> None:
     for output, i in (("beta", 0), ("gamma", 1)):
-        env = EstimateObservation(gym.make(VISION, **FIG7), "multirate-kf", outputs=[output])
+        env: Any = EstimateObservation(gym.make(VISION, **FIG7), "multirate-kf", outputs=[output])
         env.reset(seed=1)
         *_, info = env.step(still(env))
         e = env.estimator.x[i] - info[output]
@@ -148,13 +137,9 @@ def test_several_estimators_stand_side_by_side() -> None:
 @pytest.mark.smoke
 def test_one_json_string_names_env_and_estimator() -> None:
     env: Any = EstimateObservation(
-        gym.make(VISION, **FIG7),
-        "multirate-kf",
-        outputs=("beta",),
-        vehicle=COMS.scale_stiffness(0.8),
-        options={"q_beta": 1e-3},
-        name="mine",
-    )
+        gym.make(VISION, **FIG7), "multirate-kf", outputs=("beta",),
+        vehicle=COMS.scale_stiffness(0.8), options={"q_beta": 1e-3}, name="mine",
+    )  # fmt: skip
     text = env.spec.to_json()
     json.loads(text)
     again: Any = gym.make(EnvSpec.from_json(text))
