@@ -289,9 +289,11 @@ def test_a_mapping_stands_in_a_file(tmp_path: Path) -> None:
     entries = {"dbc": "car.dbc", **COLUMNS}
     preset = tmp_path / "bus.toml"
     preset.write_text("\n".join(f'{name} = "{column}"' for name, column in entries.items()))
-    mapping = parse_mapping([str(preset), "course_deg=Other"][:1])
+    mapping = parse_mapping([str(preset)])
     assert mapping == entries | {"dbc": str(tmp_path / "car.dbc")}
     assert len(read(write_trace(tmp_path, "a.blf"), mapping).record.fast) == 1200
+    with pytest.raises(ValueError, match="course_rad is mapped twice, to 'Course' and to 'Other'"):
+        parse_mapping([str(preset), "course_rad=Other"])
 
 
 def cut(path: Path) -> Path:
