@@ -270,9 +270,7 @@ def rollout(
         info = step.info | {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
         info["y_l"] = motion.y + base.vehicle.preview * (motion.psi - motion.theta)
         info |= {"X": motion.X, "Y": motion.Y}  # y_l: tie-vision (4)
-        info = {
-            x: value for x, value in info.items() if isinstance(value, Real | np.number | np.bool_)
-        }
+        info = {x: value for x, value in info.items() if isinstance(value, _NUMBER)}
         info.pop("is_success", None)
         rows.append([*map(float, (*info.values(), step.reward, *step.action, *np.ravel(step.obs)))])
         records.append(base.record)

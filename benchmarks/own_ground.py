@@ -98,7 +98,7 @@ _FILTERS = (
 SYSTEMS = (
     _System(
         "tie-vision",
-        Entry("two-dof", "multirate-residual-kf", {"filter": {}, "controller": {}}),  # its numbers
+        Entry("two-dof", "multirate-residual-kf", {"filter": {}, "controller": {}}),  # untuned
         _RECOMMENDED_ENTRY,
         _make_task("YawVision", tie_vision_control.FIG8, "zero-slip", control_period=1),
         "rms_slip",

@@ -51,11 +51,10 @@ ENTRIES: dict[str, Sequence[tuple[str, str]]] = {
     "no control": [("none", "")],
 }
 """The lines of README's table, and who stands for each: of a policy the one of the task's car."""
-PAGE_ENTRIES = ENTRIES | {
+PAGE_ENTRIES = ENTRIES | {  # the lines of the page's tables
     "policy on late samples alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
     "a controller given the true car, not its state": [(PARAMETERS, "")],
 }
-"""The lines of the page's tables."""
 _BEST, _TUNED = "`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`"
 _FAST = "road", "limit"  # tiers of the passenger car
 _PROCEDURES = {"distill-car-steering": "policy on joint"}
@@ -64,15 +63,14 @@ _TRANSFER = {
     "another plant": ("outside multi-body", "ratio", 100.0, ".0f"),
 }
 """Columns of transfer: scenario, metric, factor and format."""
-EPISODES, _DOUBLED_EPISODES, _DOUBLED = 64, 32, ", ranges doubled"  # drives of a task
+EPISODES, _DOUBLED_EPISODES = 64, 32  # a task
+_DOUBLED = ", ranges doubled"
 
 
 def _measure_entries(
-    jobs: int | None = None,
-    console: Console | None = None,
-    salt: str = "",
+    jobs: int | None = None, console: Console | None = None, salt: str = "",
     keep: Path | None = None,
-) -> list[ResultRow]:
+) -> list[ResultRow]:  # fmt: skip
     """Drive the entries and nominal in every scored task with steering; return their rows."""
     policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
     pairs = [(NOMINAL, ""), *(pair for pairs in PAGE_ENTRIES.values() for pair in pairs)]
@@ -170,7 +168,7 @@ def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str
         line = [name, *(cells.format(f"tier {tier}", pairs, False) for tier in TITLES)]
         for scenario, metric, factor, form in _TRANSFER.values():
             row = far.get((scenario, agent, metric))
-            is_rival = (agent, metric) == (REFERENCE_CONTROLLER, "ratio")  # of whom the others are
+            is_rival = (agent, metric) == (REFERENCE_CONTROLLER, "ratio")  # beside itself: 1
             value = row.value if row else 1.0 if is_rival else None
             line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)

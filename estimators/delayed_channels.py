@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from .core.filter import (
-    NO_OUTPUTS,
-    FilterOutputs,
-    StepRecord,
-    advance,
-    process_packet_all,
-)
+from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord, advance, process_packet_all
 from .core.record import FILTER, FilterRecords
 from .design.options import FAST_CHANNELS, FIND
 from .design.periodic import count_ticks

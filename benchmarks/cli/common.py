@@ -129,16 +129,16 @@ def write_output(
         print_written(console, html)
 
 
-def check_used(command: Any, names: str, what: str) -> None:
-    """Check that a command has no option that it would ignore; ValueError otherwise.
+def refuse_unused_options(command: Any, used: str, what: str) -> None:
+    """Raise ValueError for options that a command would ignore.
 
     Args:
         command: Command.
-        names: Names of the options that are used.
+        used: Names of the options that it uses.
         what: What uses no others.
     """
     changed = {x.name for x in fields(command) if getattr(command, x.name) != x.default}
-    if ignored := sorted(changed - {*names.split()}):
+    if ignored := sorted(changed - {*used.split()}):
         raise ValueError(f"{', '.join(ignored)}: of no use to {what}")
 
 
@@ -154,7 +154,7 @@ def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
     chosen = {name: options[name] for name in ("scenario", "vehicle", "control_period")}
     env_options = {name: value for name, value in chosen.items() if value is not None}
     more = parse_options(options["option"])
-    if twice := sorted({x for x in env_options if env_options[x] != 10} & more.keys()):  # no flag
+    if twice := sorted(env_options.keys() & more.keys()):
         raise ValueError(f"{twice[0]} is there twice, as a flag and as --option")
     return {
         **{name: options[name] for name in ("estimator", "agent", "env")},

@@ -18,7 +18,7 @@ from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.tables import print_suite
-from .common import check_used, print_written, write_output
+from .common import print_written, refuse_unused_options, write_output
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class _Replay:
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
             used = "log vehicle mapping html json parquet plot kml"
-            check_used(self, used, f"a receiver's log ({log})")
+            refuse_unused_options(self, used, f"a receiver's log ({log})")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log, self.vehicle, self.mapping)
             write_output(console, [make_receiver_suite(received)], vars(self))
@@ -224,7 +224,7 @@ class _Lane:
         if (source is None) == (self.calibrate is None):
             raise ValueError("expected a picture or a film, or --calibrate FOLDER")
         if source is None:
-            check_used(self, "calibrate json", "--calibrate")
+            refuse_unused_options(self, "calibrate json", "--calibrate")
             self._calibrate_camera()
             return
         if not 1.0 < self.lane_width < 10.0:

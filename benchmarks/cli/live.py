@@ -19,7 +19,7 @@ from rich.markup import escape
 from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.verdict import format_verdict
-from .common import check_used, make_driver, make_setup, print_written, show_episode
+from .common import make_driver, make_setup, print_written, refuse_unused_options, show_episode
 from .names import check_env
 from .options import File, Text, Texts, register, take, take_argument
 
@@ -42,7 +42,7 @@ class _Live:
     agent_option: Texts = take("NAME=VALUE; repeatable.")
     estimator_option: Texts = take("NAME=VALUE; repeatable.")
     seed: int = take("Of --simulate, and of drawn sensor phases.", 0)
-    control_period: int
+    control_period: int | None
     host: str = take("Where port and page are bound.", "127.0.0.1")
     port: int = take("UDP port of what comes in.", 47001)
     publish: Texts = take("HOST:PORT that gets every estimate; repeatable.")
@@ -66,17 +66,19 @@ class _Live:
         target = _parse_address(self.to) if self.to else (LOOPBACK, self.port)
         setup = make_setup(vars(self))
         if self.relay is not None:
-            check_used(self, "relay to port latency speed duration json", "--relay")
+            refuse_unused_options(self, "relay to port latency speed duration json", "--relay")
             self._relay(self.relay, target)
         elif self.replay is not None:
-            check_used(self, "replay estimator agent env json trust", "--replay")
+            refuse_unused_options(self, "replay estimator agent env json trust", "--replay")
             self._replay(self.replay, setup)
         elif self.estimator is not None:
-            check_used(self, " ".join({*vars(self)} - {"to"}), "an ESTIMATOR: see --publish")
+            refuse_unused_options(
+                self, " ".join({*vars(self)} - {"to"}), "an ESTIMATOR: see --publish"
+            )
             self._run_loop(setup, [_parse_address(text) for text in self.publish or []])
         elif self.simulate:
             used = "simulate env vehicle scenario option control_period seed to port step speed"
-            check_used(self, used, "--simulate without an ESTIMATOR")
+            refuse_unused_options(self, used, "--simulate without an ESTIMATOR")
             self._simulate(setup, target)
         else:
             raise ValueError("name an ESTIMATOR, or --simulate, --relay or --replay")

@@ -95,7 +95,7 @@ class _Run:
     agent_option: Texts = take("NAME=VALUE of the agent (grip=0.6); repeatable.")
     estimator_option: Texts = take("NAME=VALUE of the estimator (q_beta=1e-4); repeatable.")
     seed: int = take("Seed of the episode.", 0)
-    control_period: int
+    control_period: int | None
     plot: File = take("Write a PNG, PDF or SVG.", ends=".png .pdf .svg")
     parquet: File = take("Write every signal.", ends=".parquet")
     kml: File = take("Write the track for a map.", ends=".kml")

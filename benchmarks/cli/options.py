@@ -54,7 +54,7 @@ def take(
 take_argument = partial(take, declare=typer.Argument)
 _SHARED: dict[str, Callable[[], Any]] = {
     "address": partial(take, "HOST:PORT of the cluster; default: this machine's.", ""),
-    "control_period": partial(take, "Control period in ticks of 1 ms.", 10),
+    "control_period": partial(take, "Control period in ticks of 1 ms; default: 10."),
     "engine_name": partial(
         take, "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
     ),

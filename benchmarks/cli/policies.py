@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import partial
 from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,9 +43,9 @@ class _Export:
 
         target = self.out or self.zipped.with_suffix(".safetensors")
         check_writable(target)
-        export = partial(export_zip, self.zipped, target, self.env, parse_options(self.option))
-        options = partial(export, trust=self.trust, normalise=self.normalise)
-        policy = options(estimator=self.estimator, command=get_command_line())
+        policy = export_zip(self.zipped, target, self.env, parse_options(self.option),
+                            trust=self.trust, normalise=self.normalise,
+                            estimator=self.estimator, command=get_command_line())  # fmt: skip
         default = "the scales of its training" if (policy.network.scale != 1.0).any() else "nothing"
         scaled = find_normaliser(self.zipped, self.normalise) or default
         text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"

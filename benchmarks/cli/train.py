@@ -61,8 +61,7 @@ class _Train:
     varied: int = take("With a policy: each task so often, varied as in `distill`.", 0, min=0)
     trust: bool
     out: File = take("Folder; default: train-ENV-ALGO...-SEED here.")
-    log_folder: File = take("Instead of --out, as the zoo: FOLDER/ALGO/ENV_N.", None,
-                            "--log-folder", "-f")  # fmt: skip
+    log_folder: File = take("Not --out, but FOLDER/ALGO/ENV_N.", None, "--log-folder", "-f")
     resume: bool = take("Go on with the training in the folder.", False, "--resume")
 
     def run(self) -> None:

@@ -23,7 +23,7 @@ from .update import FIRST_VARIANCE, compute_excess, correct_fast
 
 
 class StepRecord(NamedTuple):
-    """What a filter gets in a call, as an env's newest step; of N cars, (N, ...) each."""
+    """What a filter gets in a call, such as an env's newest step; of N cars (N, ...) each."""
 
     fast: Matrix  # fast rows, shape (k, FAST_WIDTH)
     rows: Scalar  # number of fast rows that are there (an env's `rows` are the rows themselves)
@@ -249,11 +249,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
 
 @noinline
 def advance(
-    layers: FilterRecords,
-    gains: GainTables,
-    record: StepRecord,
-    start: int,
-    outputs: FilterOutputs,
+    layers: FilterRecords, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
 ) -> int:
     """Process the fast rows of a record from `start` on, and its packets.
 

@@ -13,13 +13,7 @@ from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import as_python, jit, noinline
 from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum, minimum
 from ...envs.task import ObservationEntry
-from ..core.filter import (
-    FilterOutputs,
-    StepRecord,
-    advance,
-    compute_deviation,
-    read_covariance,
-)
+from ..core.filter import FilterOutputs, StepRecord, advance, compute_deviation, read_covariance
 from ..core.record import FILTER, FilterRecord, GainTables
 from ..core.update import compute_excess, is_healthy
 from ..estimator import compile_call
