@@ -76,9 +76,6 @@ def make_agent(
         trust: Whether a zip may be read, which can run code of its author.
         options: Arguments of the controller, or of `agents.training.export.policy_from_zip`.
 
-    Returns:
-        The agent.
-
     Raises:
         ValueError: The name is unknown, or the observation lacks what the controller needs.
         TypeError: An option is unknown or stands beside an `Agent`, or there is no `predict`.

@@ -155,9 +155,6 @@ def make_oracle(
             sensors of the id, `make_noise_options` of the scenario, a grip limit.
         env_kwargs: Arguments of the env (scenario, vehicle, ...).
 
-    Returns:
-        The env and the agent.
-
     Raises:
         ValueError: The name is unknown.
         TypeError: The options have another key.
@@ -250,9 +247,6 @@ def get_tuned_options(task_class: str, name: str) -> Options:
     Args:
         task_class: Class of tasks.
         name: Name of the entry.
-
-    Returns:
-        Options by part.
     """
     options = read_tuned().get(task_class, {}).get(name, {})
     return {part: dict(options.get(part, {})) for part in PARTS}

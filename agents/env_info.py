@@ -91,9 +91,6 @@ class EnvView:
 
         Args:
             env: Vector env with its wrappers.
-
-        Returns:
-            View of the outermost layer.
         """
         spaces = env.single_observation_space, env.single_action_space
         return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
@@ -131,9 +128,6 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
         env_id: Id of a registered env.
         options: Arguments of `gym.make`.
 
-    Returns:
-        Env with its wrappers.
-
     Raises:
         TypeError: An argument is missing or unknown.
     """
@@ -151,9 +145,6 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
     Args:
         env: Env of this package, wrapped or bare.
-
-    Returns:
-        Facts that hold for all rows.
 
     Raises:
         TypeError: `env` is no env of this package.
@@ -216,9 +207,6 @@ def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
 
     Args:
         env: Env, vector env or `VecEnv`.
-
-    Returns:
-        The configurations.
     """
     base: Any = env.unwrapped
     if hasattr(base, "row_configs"):

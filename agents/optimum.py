@@ -77,9 +77,6 @@ class Optimum:
 
         Args:
             gains: L_j, shape (steps, n), or (n,) for all steps.
-
-        Returns:
-            Cost of an episode.
         """
         model, W = self.plant.model, self.plant.W
         L = np.broadcast_to(gains, self.gains.shape)
@@ -258,9 +255,6 @@ def wrap_optimal_estimate(env: Any) -> Any:
 
     Args:
         env: Env of a linear scenario.
-
-    Returns:
-        Wrapped env.
     """
     wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=_make_true_options(env))

@@ -242,9 +242,6 @@ def scale_layout(layout: Sequence[ObservationEntry]) -> tuple[ObservationEntry, 
 
     Args:
         layout: Entries in their units.
-
-    Returns:
-        Entries without units.
     """
     rows = zip(layout, get_scales(layout).tolist(), strict=True)
     return tuple(ObservationEntry(name, "-", a / s, b / s) for (name, _, a, b), s in rows)

@@ -202,9 +202,6 @@ def format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
     Args:
         lines: Cells.
         heads: Heads of the other columns.
-
-    Returns:
-        Markdown.
     """
     body = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([f"| | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|", *body])
@@ -244,9 +241,6 @@ def replace_table(text: str, new_table: str) -> str:
     Args:
         text: Page.
         new_table: Markdown.
-
-    Returns:
-        Page with the new table.
 
     Raises:
         ValueError: The page has no such table, or several.

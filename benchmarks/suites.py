@@ -36,9 +36,6 @@ def run_suites(
         names: Names in `SUITES`.
         request: Options of the run.
         comparison: A user's entries, which drive instead of the matrix.
-
-    Returns:
-        Results.
     """
     with use_shared_bar(request.console, f"bench {' '.join(names)}"):
         if comparison is not None:

@@ -103,9 +103,6 @@ def is_document(source: object) -> bool:
 
     Args:
         source: Any value.
-
-    Returns:
-        True for a path.
     """
     return isinstance(source, os.PathLike) or (isinstance(source, str) and "." in source[-8:])
 
@@ -119,9 +116,6 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
     Args:
         source: Path of the file.
         what: Kind of content, for messages.
-
-    Returns:
-        Names and values of the file.
     """
     path = Path(source)
     values = _parse_file(path, what)
@@ -192,9 +186,6 @@ def to_toml(value: object) -> str:
 
     Args:
         value: Number, text, list or mapping.
-
-    Returns:
-        The text.
     """
     if isinstance(value, Mapping):
         pairs = (f"{_format_key(name)} = {to_toml(item)}" for name, item in value.items())
@@ -217,9 +208,6 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
         kind: Dataclass of the instance.
         entry: The parsed JSON value.
         where: Place of the value, for messages.
-
-    Returns:
-        The instance.
 
     Raises:
         ValueError: For an unknown or missing field and a value of another type.

@@ -94,9 +94,6 @@ def concatenate(records: list[Record]) -> Record:
     Args:
         records: Records in the order of time; each begins a tick after the one before it.
 
-    Returns:
-        One record of all their rows and packets.
-
     Raises:
         ValueError: If ticks do not follow.
     """

@@ -46,9 +46,6 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 
     Args:
         nominal: The nominal vehicle.
-
-    Returns:
-        The coefficients.
     """
     l, M = nominal.wheelbase, nominal.mass  # noqa: E741
     C_f, C_r = nominal.front_stiffness, nominal.rear_stiffness
@@ -156,9 +153,6 @@ def compute_failure_cost(duration: Scalar, tick: Scalar) -> Scalar:
     Args:
         duration: Length of the episode (ticks).
         tick: Tick at which it failed.
-
-    Returns:
-        The cost.
     """
     return COST_CAP * (duration - tick) * TICK
 
@@ -217,9 +211,6 @@ def make_info(report: list[float]) -> Infos:
 
     Args:
         report: Report of the step, a number for each column of `StepReport`.
-
-    Returns:
-        The info.
     """
     info = _RUNNING.copy()  # a copy's keys need no sorting in
     (
@@ -304,9 +295,6 @@ def make_observation_layout(
         n: Ticks of a control period.
         fast: "summary" (last sample and mean over the step) or "all" (every sample of the step).
         with_map: Whether the road's curvature is an entry.
-
-    Returns:
-        The entries in their order.
     """
     entries = []
     for column in range(N_SAMPLED):

@@ -15,9 +15,6 @@ def round_to_ticks(seconds: Scalar) -> Scalar:
 
     Args:
         seconds: The time (s).
-
-    Returns:
-        The number of ticks.
     """
     return floor(seconds / TICK + 0.5)
 
@@ -30,8 +27,5 @@ def count_ticks(seconds: float) -> float:
 
     Args:
         seconds: The time (s).
-
-    Returns:
-        The number of ticks.
     """
     return float(_round_to_ticks(seconds))

@@ -32,9 +32,6 @@ def short_repr(value: object) -> str:
 
     Args:
         value: Any value.
-
-    Returns:
-        The text.
     """
     try:
         return _REPR.repr(value)
@@ -47,9 +44,6 @@ def join_names(names: Iterable[str]) -> str:
 
     Args:
         names: Names in the order of the text.
-
-    Returns:
-        The text.
     """
     return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
 
@@ -59,9 +53,6 @@ def is_finite(value: Any) -> TypeGuard[float]:
 
     Args:
         value: Any value.
-
-    Returns:
-        True for a number.
     """
     is_number = isinstance(value, int | float | np.integer | np.floating)
     return is_number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
@@ -73,9 +64,6 @@ def check_number(name: str, value: object) -> float:
     Args:
         name: Name of the number, for messages.
         value: Value that should be a finite number.
-
-    Returns:
-        The number.
     """
     if not is_finite(value):
         raise ValueError(f"{name} {short_repr(value)} is no finite number")
@@ -88,9 +76,6 @@ def check_mapping(name: str, value: object) -> Mapping[str, Any]:
     Args:
         name: Name of the mapping, for messages.
         value: Value that should be a mapping.
-
-    Returns:
-        The mapping.
     """
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
@@ -104,9 +89,6 @@ def describe_unknown(what: str, values: Iterable[object], known: Iterable[str]) 
         what: What the names name.
         values: The unknown names, one at least.
         known: Known names.
-
-    Returns:
-        The text.
     """
     got, names = list(values), list(known)
     close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
@@ -153,9 +135,6 @@ def check_int(
         what: What is counted.
         minimum: Smallest number.
         maximum: Largest number; None for no limit.
-
-    Returns:
-        The number.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
@@ -170,9 +149,6 @@ def format_rows(rows: npt.ArrayLike) -> str:
 
     Args:
         rows: Numbers of rows, shape (M,).
-
-    Returns:
-        The text.
     """
     numbers = np.asarray(rows).tolist()
     if len(numbers) == 1:
@@ -293,9 +269,6 @@ def quantity(
         text: Meaning of the field, for tables.
         default: Default value, if there is one.
         per: Names of fields by which the range is multiplied.
-
-    Returns:
-        The field.
     """
     metadata = {"unit": unit, "text": text, "plausible": (low, high), "per": per}
     return dataclasses.field(default=default, metadata=metadata)

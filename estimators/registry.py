@@ -157,9 +157,6 @@ class Registry:
         Args:
             name: Registered name, "package.module:Name" or "FILE.py:Name".
             others: Further names that may have been meant, for messages.
-
-        Returns:
-            The factory.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):

@@ -113,9 +113,6 @@ def apply_wires(log: Log, wires: SignalCalibration) -> Log:
     Args:
         log: Recorded drive.
         wires: Its calibration.
-
-    Returns:
-        The calibrated log.
     """
     record, slow = log.record, dict(log.slow)
     fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)

@@ -176,9 +176,6 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
 
     Args:
         fixed: Parameters of the episode.
-
-    Returns:
-        Functions of the episode.
     """
     names = _list_active_states(fixed)
     scale, size = np.array(_get_state_scales(fixed, names)), len(names)

@@ -170,9 +170,6 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
         name: Name of the option, for the message.
         value: Number to check.
         allow_zero: Whether it may be zero too.
-
-    Returns:
-        The number as a float.
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} is a number, got {value!r}")
@@ -193,9 +190,6 @@ def integrate_antiwindup(
         step: Increment of the integral.
         unlimited: Output before its limits.
         limited: Output within its limits.
-
-    Returns:
-        Integral after the step.
     """
     if unlimited == limited or (unlimited > limited) != (step > 0.0):
         return integral + step

@@ -193,9 +193,6 @@ class Lqr(Controller):
 
         Args:
             speed: Speed (m/s).
-
-        Returns:
-            Weight of an action's error.
         """
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
         KS = self._interpolate(speed, car.front_stiffness, car.rear_stiffness)

@@ -136,9 +136,6 @@ def make_prediction(
         spec: Parameters of the design.
         target: Parameters of the reference.
         authority: Added steering at an action of 1 (rad).
-
-    Returns:
-        Numbers that all predictions share.
     """
     law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
     law = FIALA if law == MAGIC_FORMULA else law  # plans know no relaxation: see `fit_fiala`

@@ -94,9 +94,6 @@ class Card:
             estimator: Estimator around the env, "" for none.
             estimator_options: Other arguments of `EstimateObservation`.
             rest: Other fields of the card.
-
-        Returns:
-            Card of the env.
         """
         rest["env_options"], further = dict(env_options or {}), dict(estimator_options or {})
         env = make_env(env_id, rest["env_options"])
@@ -114,9 +111,6 @@ class Card:
         Args:
             env: Env, single or vector.
             rest: Other fields of the card.
-
-        Returns:
-            Card of the env.
         """
         facts = get_env_facts(env)
         rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
@@ -176,9 +170,6 @@ def is_policy(name: str) -> bool:
 
     Args:
         name: Name or path.
-
-    Returns:
-        True for either of them.
     """
     return name.endswith(SUFFIX) or name in list_shipped()
 
@@ -231,9 +222,6 @@ def load_policy(path: str | Path) -> Policy:
 
     Args:
         path: Path or shipped name.
-
-    Returns:
-        Policy with its network and card.
 
     Raises:
         FileNotFoundError: There is no such file.

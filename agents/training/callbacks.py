@@ -277,9 +277,6 @@ def read_state(path: Path) -> Checkpoint:
 
     Args:
         path: Checkpoint.
-
-    Returns:
-        State in JSON types.
     """
     try:
         with safe_open(path, "pt") as file:

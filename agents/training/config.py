@@ -69,9 +69,6 @@ def get_algorithm(name: str) -> Algorithm:
 
     Args:
         name: Name in `ALGORITHMS`.
-
-    Returns:
-        Algorithm of that name.
     """
     check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
@@ -84,9 +81,6 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         algo: Name of the algorithm.
         env_id: Id of the env.
         file: YAML file; None: the package's own.
-
-    Returns:
-        Values by name.
 
     Raises:
         ValueError: The file is no such YAML, or has neither entry.
@@ -224,9 +218,6 @@ class TrainingTask:
 
         Args:
             num_envs: Number of rows.
-
-        Returns:
-            Options by name.
         """
         turns = list(itertools.islice(itertools.cycle(self.scenarios), num_envs))
         return self.env_options | ({"scenario": turns} if turns else {})
@@ -236,9 +227,6 @@ class TrainingTask:
 
         Args:
             num_envs: Number of rows.
-
-        Returns:
-            New vector env.
         """
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, self.options(num_envs))
 
@@ -247,9 +235,6 @@ class TrainingTask:
 
         Args:
             seconds: Control period (s).
-
-        Returns:
-            Arguments by name.
         """
         options = {k: value for k, value in self.settings.items() if k not in _TRAINING_SETTINGS}
         if "gamma" in options:  # which discounts as much in a second as in the file
@@ -272,9 +257,6 @@ class TrainingTask:
             seconds: Control period (s).
             scaling: Scaling of `Standardised`.
             **rest: Further arguments of the class, such as its seed.
-
-        Returns:
-            Model on the environments.
         """
         options = self.make_model_options(seconds)
         options |= {key: _make_schedule(key, options[key]) for key in _SCHEDULED if key in options}

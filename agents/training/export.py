@@ -47,9 +47,6 @@ def convert_sb3_policy(
         model: Model or policy of a class of `_POLICIES`, `Standardised` its extractor at most.
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
-
-    Returns:
-        Network of the actor.
     """
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -190,9 +187,6 @@ def policy_from_zip(
         normalise: Pickle of VecNormalize; None: NAME.pkl or vecnormalize.pkl beside the zip.
         about: Fields of the policy's `Card`.
 
-    Returns:
-        Policy of the actor.
-
     Raises:
         FileNotFoundError: There is no such file.
         PermissionError: `trust` is False.
@@ -225,9 +219,6 @@ def export_zip(
         trust: Whether code in the zip may run.
         normalise: Pickle of VecNormalize, as for `policy_from_zip`.
         **about: Other fields of the policy's `Card`, such as the estimator of the training.
-
-    Returns:
-        Policy as it is in the file.
 
     Raises:
         ValueError: The target has another ending.
@@ -352,9 +343,6 @@ def load_normaliser(
         path: Path of the zip.
         trust: Whether the pickle may be read.
         normalise: Path of the pickle, as for `find_normaliser`.
-
-    Returns:
-        VecNormalize of the training.
 
     Raises:
         FileNotFoundError: There is no such file.

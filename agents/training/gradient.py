@@ -68,9 +68,6 @@ class GruPolicy(BasePolicy):
         Args:
             observations: Observations, shape (N, k).
             state: State, shape (N, cells).
-
-        Returns:
-            Actions and next state.
         """
         _, after = self.cell(self.features_extractor(observations)[None], state[None])
         return self.layers(after[0]), after[0]
@@ -170,9 +167,6 @@ class AnalyticPolicyGradient(BaseAlgorithm):
             tb_log_name: Name of the run in TensorBoard.
             reset_num_timesteps: Whether the steps count from 0.
             progress_bar: Whether to show a bar.
-
-        Returns:
-            The model itself.
 
         Raises:
             ValueError: There is no source.

@@ -282,9 +282,6 @@ class Student(nn.Module):
         Args:
             z: Inputs, shape (B, T, k).
             state: State from the last call; None at the start.
-
-        Returns:
-            Outputs and next state.
         """
         memory = self.cell or self.traces
         if memory is not None:
@@ -307,9 +304,6 @@ class Student(nn.Module):
             drives: Demonstrations.
             layout: Entries of the observation.
             needs: Entries that the teacher reads.
-
-        Returns:
-            Scaling of the inputs.
         """
         scaling = _compute_scaling(drives, layout, needs)
         if self.traces is not None:

@@ -93,9 +93,6 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         folder: Folder of the training.
         **arguments: Fields of the task that must agree with it.
 
-    Returns:
-        The training.
-
     Raises:
         FileNotFoundError: There is no checkpoint.
         ValueError: A field differs, or the checkpoint is of another version.

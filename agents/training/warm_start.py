@@ -51,9 +51,6 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
         policy: Policy to train further.
         fields: Fields of `TrainingTask` that replace the card's. `env_options` add to the card's, a
             scenario there replaces its mixture, and another estimator drops the card's options.
-
-    Returns:
-        Task with the policy's observation and form.
     """
     card, algo = policy.card, fields.get("algo", "ppo")
     changes = fields.pop("env_options", {})
@@ -78,9 +75,6 @@ def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: obj
         algo: Name of the algorithm.
         env_id: Id of the env.
         start: Policy to train further, or anything else for a new training.
-
-    Returns:
-        Values by name.
     """
     if not isinstance(start, Policy):
         return read_settings(algo, env_id, file)
@@ -226,9 +220,6 @@ class WarmStart:
 
         Args:
             network: Network of the model.
-
-        Returns:
-            Network of plain observations.
         """
         if self.policy is None or self._whitening is None:
             return network

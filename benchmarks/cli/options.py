@@ -133,9 +133,6 @@ def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
 
     Args:
         texts: Texts such as NAME=VALUE, None for none; a value is JSON or a word.
-
-    Returns:
-        Values by name.
     """
     options: dict[str, Any] = {}
     for text in texts or ():

@@ -153,9 +153,6 @@ class Calibration:
             jobs: Processes, None for all processors.
             console: Where progress is shown.
 
-        Returns:
-            Record of each task.
-
         Raises:
             ModuleNotFoundError: CasADi or OSQP is not installed.
         """
@@ -223,9 +220,6 @@ def read_current(
     Args:
         path: File; None: the package's, if there is one.
         tasks: Tasks.
-
-    Returns:
-        Records by task.
     """
     if path is None and not FILE.is_file():
         return {}

@@ -102,9 +102,6 @@ class Entry:
         Args:
             task: Task to drive.
             n: Rows of a vector env; None: a single env.
-
-        Returns:
-            Env and agent.
         """
         case, env_id = ControlCase(task, self), task.env_id
         if self.is_oracle:
@@ -265,9 +262,6 @@ def select_quick_tasks(tasks: Sequence[ControlTask], count: int = 2) -> list[Con
     Args:
         tasks: Tasks of all tiers, a tier's together.
         count: Number of tasks of a tier.
-
-    Returns:
-        Selected tasks.
     """
     selected = []
     for tier in dict.fromkeys(task.tier for task in tasks):

@@ -345,9 +345,6 @@ def make_time_explorer(
         series: Time and SIGNALS, shape (k, 1 + SIGNALS), by key.
         best: Name of the entry beside `none`.
         bodies: Length and width of the car (m) by the key without the entry's name.
-
-    Returns:
-        Figure with menus.
     """
     cells = {}
     for key, values in series.items():

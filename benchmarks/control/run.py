@@ -235,9 +235,6 @@ def measure(
         keep: Folder (no `Chunk.keep`) in which finished cases stay, so that a stopped run goes on.
         runner: Function that drives a chunk instead of `run_chunk`, and keeps nothing.
         title: Title of the progress bar.
-
-    Returns:
-        Episodes of all cases.
     """
     seeds_by_case: dict[ControlCase, Sequence[int]] = {}
     for case in (ControlCase(task, entry) for task, entry in cases):

@@ -112,9 +112,6 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
 
     Args:
         matrix: Measurements.
-
-    Returns:
-        Tables.
     """
     main, detail = [], []
     for tier, ranked in matrix.by_tier.items():
@@ -154,9 +151,6 @@ def make_task_table(
         title: Title of the table.
         ranked: Standings, the best first.
         tasks: Tasks, a column each.
-
-    Returns:
-        Table.
     """
     columns = (_LABEL, *(Column(task.name, form="{:.2f} ({:.0f})") for task in tasks))
     lines: list[Line] = [

@@ -194,9 +194,6 @@ def find_oracle(task: ControlTask, name: str = STATE) -> str:
     Args:
         task: Task of the candidates.
         name: Name of the oracle, in `ORACLES`.
-
-    Returns:
-        Name of the candidate.
     """
     measurement = _index_measurements().get(task)
     if measurement is None:
@@ -236,9 +233,6 @@ def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
         salt: Hexadecimal digits; ValueError for another text.
         n: Number of seeds.
         more: Text that makes them others.
-
-    Returns:
-        Seeds.
     """
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
@@ -256,9 +250,6 @@ def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
     Args:
         salt: Hexadecimal digits.
         n: Number of seeds.
-
-    Returns:
-        Function from a task to its seeds.
     """
     return lambda task: make_salted_seeds(salt, n, task.seed_text)
 
@@ -268,8 +259,5 @@ def make_tuning_seeds(n: int) -> list[int]:
 
     Args:
         n: Number of seeds.
-
-    Returns:
-        Seeds.
     """
     return list(range(_TUNING, _TUNING + n))

@@ -43,9 +43,6 @@ def make_user_entry(agent: object, estimator: object, trust: bool = False) -> En
         agent: Name, file's class or path of `make_agent`, or an object or factory.
         estimator: The same of `make_estimator`, or a name in `SETUPS`, "" for none.
         trust: Whether a zip may be read.
-
-    Returns:
-        Entry.
     """
     parts = {"agent": agent, "estimator": estimator}
     objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
@@ -87,9 +84,6 @@ def make_user_entries(
         agents: Names, files' classes or paths.
         estimators: The same of estimators; empty: each agent's usual one.
         trust: Whether a zip may be read.
-
-    Returns:
-        Entries without repetition.
     """
     pairs = [(agent, one) for agent in agents for one in estimators or [choose_estimator(agent)]]
     entries = [make_user_entry(*pair, trust) for pair in pairs]

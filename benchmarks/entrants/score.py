@@ -294,9 +294,6 @@ def run(request: ComparisonRequest, options: Request) -> Suite:
     Args:
         request: Entries and tasks.
         options: Processes, progress, and the folder of the baselines' finished cases.
-
-    Returns:
-        Suite.
     """
     comparison = _compare(request, options)
     suite = Suite("control", "Your own beside the package's", _TEXT)

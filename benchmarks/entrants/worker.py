@@ -248,9 +248,6 @@ def run_user_chunk(chunk: Chunk) -> DriveResult:
 
     Args:
         chunk: Seeds of an entry.
-
-    Returns:
-        Episodes.
     """
     result, wrong = run_chunk(chunk), "every action is NaN, or infinite, before an episode is over"
     failed = not result.error and result.mark_failures("bad-action").all()

@@ -73,9 +73,6 @@ def make_unchecked_filter(
         log: Log, of which it takes all slow sensors.
         vehicle: Car that it assumes.
         options: Options over its defaults.
-
-    Returns:
-        The filter.
     """
     known: dict[str, object] = {"slow": list(log.slow) or None}
     known |= {} if "accel_y" in log.record.present else {"fast": ("gyro",)}
@@ -114,9 +111,6 @@ def call_quietly(make: Callable[..., T], *args: object, **options: object) -> T:
         make: Function to call.
         args: Its positional arguments.
         options: Its other arguments.
-
-    Returns:
-        What it returns.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnobservableWarning)

@@ -104,9 +104,6 @@ def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
     Args:
         seeds: Number of seeds.
         size: Maximum of seeds in a run.
-
-    Returns:
-        Seeds of each run.
     """
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
@@ -133,9 +130,6 @@ class Bar(progress.Progress):
         Args:
             args: Description, and what rich takes.
             options: Options of rich's, and the `unit` of the count.
-
-        Returns:
-            Id of the task.
         """
         made = super().add_task(*args, **options)
         self._say()

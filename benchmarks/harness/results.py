@@ -228,9 +228,6 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
     Args:
         path: File.
-
-    Returns:
-        Rows.
     """
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
@@ -244,9 +241,6 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
     Args:
         path: File.
-
-    Returns:
-        Objects.
     """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -33,9 +33,6 @@ class Estimate(NamedTuple):
 
         Args:
             factor: Factor.
-
-        Returns:
-            Product.
         """
         return Estimate(*(factor * number for number in self))
 
@@ -45,9 +42,6 @@ class Estimate(NamedTuple):
         Args:
             scale: Factor of the numbers.
             digits: Format of the numbers.
-
-        Returns:
-            Text.
         """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
@@ -59,9 +53,6 @@ def root_mean(squares: Array, axis: int = -1) -> Array:
     Args:
         squares: Squared errors.
         axis: Axis of the seeds.
-
-    Returns:
-        Roots.
     """
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
@@ -141,9 +132,6 @@ def mean_share(values: Array) -> Estimate:
 
     Args:
         values: Fractions of the seeds, shape (n,).
-
-    Returns:
-        Mean and interval.
     """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
@@ -186,9 +174,6 @@ def geometric_mean(*strata: Array) -> Estimate:
 
     Args:
         strata: Logarithms of each stratum, shape (n_i,).
-
-    Returns:
-        Mean and interval.
     """
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
@@ -220,9 +205,6 @@ def compute_win_rate(costs: Array, others: Array) -> Estimate:
     Args:
         costs: Costs, shape (n,).
         others: Costs of the other on the same seeds, shape (n,).
-
-    Returns:
-        Fraction and interval.
     """
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
@@ -290,9 +272,6 @@ def holm(chances: Sequence[float]) -> list[bool]:
 
     Args:
         chances: Values of p.
-
-    Returns:
-        Whether each is significant.
     """
     significant = [False] * len(chances)
     for rank, i in enumerate(np.argsort(chances)):

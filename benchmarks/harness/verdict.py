@@ -54,9 +54,6 @@ def format_verdict(*lines: str) -> str:
 
     Args:
         lines: Lines, of which empty ones are left out.
-
-    Returns:
-        Verdict.
     """
     filled = [line for line in lines if line]
     if len(filled) > LINES:
@@ -73,9 +70,6 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
         name: Name of the first.
         ratios: Its number over each rival's, the closest rival first.
         verb: Verb for what is better done little, such as "err".
-
-    Returns:
-        Clause without a full stop.
 
     >>> describe_leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
     'lqr costs least, 71 % [65, 77] as much as esc'
@@ -95,9 +89,6 @@ def format_percent(ratio: Estimate) -> str:
     Args:
         ratio: Ratio and bounds of its interval.
 
-    Returns:
-        Text.
-
     >>> format_percent(Estimate(0.71, 0.65, 0.77)), format_percent(Estimate(0.5))
     ('71 % [65, 77]', '50 %')
     """
@@ -111,9 +102,6 @@ def summarise_names(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
     Args:
         names: Names in the order of the sentence.
         limit: Number of names up to which none is counted.
-
-    Returns:
-        Names in words.
 
     >>> summarise_names(["a"]), summarise_names(["a", "b"]), summarise_names(["a", "b", "c", "d"])
     ('a', 'a and b', 'a, b and 2 more')

@@ -113,9 +113,6 @@ def compare(
         other: Subject whose number is larger.
         max_ratio: Threshold of the ratio, None for none.
         quantity: Name of the number.
-
-    Returns:
-        Part.
     """
     threshold = None if max_ratio is None else Bound("<=", max_ratio)
     return ClaimPart(label, scenario, one, quantity, Bound("<", 1.0), threshold, rivals=(other,))
@@ -171,9 +168,6 @@ class Claim:
 
         Args:
             results: Results of all simulations that the parts name.
-
-        Returns:
-            Claim with the numbers of its parts.
         """
         parts = (MeasuredPart(part, part._measure(results)) for part in self.parts)
         return MeasuredClaim(self, tuple(parts))
@@ -277,9 +271,6 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
     Args:
         filters: Filters of a simulation.
         base: Env without wrappers, in an episode.
-
-    Returns:
-        Estimators by label.
     """
     cars, facts = {"nominal": base.nominal, "true": base.vehicle}, make_filter_arguments(base)
     by_label = {}

@@ -247,9 +247,6 @@ class Curves:
 
         Args:
             example: Signals of a seed.
-
-        Returns:
-            Figure.
         """
         from ..report.figures import draw_time_series
 

@@ -114,9 +114,6 @@ class ProcedureEntry:
         Args:
             car: One of `CARS`, or an outside model, which is taken for the passenger car.
             env: Env of the agent.
-
-        Returns:
-            Agent.
         """
         agent, estimator, _ = self.get_configuration(car)
         vehicle = car if car in CARS else "passenger-car"
@@ -129,9 +126,6 @@ class ProcedureEntry:
         Args:
             car: One of `CARS`.
             seed: Seed of what errs in car and sensors; None: nothing errs.
-
-        Returns:
-            The function that drives.
         """
         _, estimator, estimate = self.get_configuration(car)
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}

@@ -152,9 +152,6 @@ def run(drive: DriveFunction, car: TestCar) -> Transient:
     Args:
         drive: Function that drives the car through a scenario.
         car: Car under test, with speed and steering ratio.
-
-    Returns:
-        The responses.
     """
     vehicle, speed = car.vehicle, car.speed
     per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m

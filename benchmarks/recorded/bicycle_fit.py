@@ -84,9 +84,6 @@ def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]])
     Args:
         logs: Recorded drives, at least one.
         left_out: Mask of each drive's rows that are not used, shape (rows,).
-
-    Returns:
-        The windows.
     """
     dt, first = logs[0].record.dt, 0
     every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
@@ -303,9 +300,6 @@ def fit(
         start: Parameters where the search starts.
         free: Names of those that are fitted.
         scale: Standard deviations of the channels' residuals; None: estimated.
-
-    Returns:
-        The fit.
     """
     at = [Theta._fields.index(name) for name in free]
     low, high, centre, sd = _LOW[at], _HIGH[at], np.array(w.centre)[at], np.array(w.spread)[at]

@@ -51,9 +51,6 @@ class Emulation:
             log: Recorded drive, with the truth if it gets a GPS.
             seed: Seed of the course's noise, None: its slow sensors stay as they are.
 
-        Returns:
-            The changed log.
-
         Raises:
             ValueError: The log is slower than the course.
         """

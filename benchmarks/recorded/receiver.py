@@ -246,9 +246,6 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
 
     Args:
         replay: Results of a log.
-
-    Returns:
-        The suite.
     """
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))

@@ -125,9 +125,6 @@ def replay_file(
         until: End of the part that identifies the car (s).
         settings: Fields of `Settings`.
 
-    Returns:
-        Suite of all parts and corners.
-
     Raises:
         ValueError: `until` or `nominal` without "identify", or the readers or `replay` refuse it.
     """

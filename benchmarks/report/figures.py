@@ -75,9 +75,6 @@ def draw_time_series(
         x_label: Quantity and unit of `t`.
         dots: Names that are drawn as dots, for packets with NaN between them.
         zero_line: Whether a line is drawn at zero, for errors.
-
-    Returns:
-        Figure.
     """
     t = np.asarray(t, float)
     figure = go.Figure()
@@ -108,9 +105,6 @@ def draw_curves(
         series: Values by name, shape (n,), or (value, low, high) for whiskers.
         x_label: Quantity and unit of `x`.
         y_label: Quantity and unit of the values.
-
-    Returns:
-        Figure.
     """
     figure = go.Figure()
     for name, pen in _choose_line_styles(series).items():
@@ -132,9 +126,6 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
 
     Args:
         paths: Paths (x, y) (m) by name.
-
-    Returns:
-        Figure.
     """
     figure = go.Figure()
     for name, colour_and_dash in _choose_line_styles(paths).items():
@@ -157,9 +148,6 @@ def draw_groups(
         groups: Numbers by name, by the group's title.
         unit: Quantity and unit.
         lines: Meanings of certain values, which are drawn as lines.
-
-    Returns:
-        Figure.
     """
     figure, ticks, row = go.Figure(), dict[int, str](), 0
     for title, numbers in groups.items():
@@ -248,9 +236,6 @@ def draw_heat_map(
         values: Numbers, shape (names, columns).
         unit: Unit of the numbers.
         good: Which values are the good ones (blue), "high" or "low".
-
-    Returns:
-        Figure.
     """
     flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
     scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]

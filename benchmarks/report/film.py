@@ -157,9 +157,6 @@ def make_track_kml(
         tracks: Tracks, X east and Y north (m), by name.
         colours: Colours, "#RRGGBB", by name.
         origin: Place of X = Y = 0 (deg north and east).
-
-    Returns:
-        Document.
     """
     if not tracks:
         raise ValueError("a KML document needs at least one track")

@@ -44,9 +44,6 @@ class Request:
         Args:
             usual: Choice of a usual run.
             quick: Choice of a quick run.
-
-        Returns:
-            One of them.
         """
         return quick if self.quick else usual
 
@@ -59,9 +56,6 @@ class Request:
             function: Function of a case, importable by workers.
             cases: Arguments of the function, one for each call.
             title: Title of the progress bar.
-
-        Returns:
-            Results in the order of the cases.
         """
         return run_cases(function, cases, title, self.jobs, self.console)
 
@@ -81,9 +75,6 @@ class Request:
             seeds: Number of seeds.
             chunk: Maximum of seeds in a call.
             title: Title of the progress bar.
-
-        Returns:
-            Results of the seeds in each condition.
         """
         chunks = split_seeds(seeds, chunk)
         cases = list(product(conditions, chunks))

@@ -39,9 +39,6 @@ def format_columns(table: ResultTable) -> list[TextColumn]:
 
     Args:
         table: Table.
-
-    Returns:
-        Texts and numbers of each column.
     """
     columns = []
     for column, cells in table.split():

@@ -56,9 +56,6 @@ class Taken(list[float]):
             suite: Suite that gets the row.
             name: Name of the workload.
             metric: Metric of the row.
-
-        Returns:
-            Itself.
         """
         columns = {"salt": "", "env_version": "", "scenario": name}
         suite.add_rows([{metric: self.range}], n=len(self), **columns)
@@ -187,9 +184,6 @@ def format_three_digits(value: float) -> str:
 
     Args:
         value: Number to format.
-
-    Returns:
-        Text.
 
     >>> format_three_digits(0.04431), format_three_digits(7.2), format_three_digits(1004.0)
     ('0.0443', '7.2', '1000')

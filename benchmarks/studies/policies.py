@@ -129,9 +129,6 @@ def evaluate_policy(
         scenario: Name instead of the env's own.
         seed: Seed of the first episode, the next ones count up; None: made from the weights.
 
-    Returns:
-        Episodes of all entries.
-
     Raises:
         ValueError: The policy cannot drive the env.
     """
@@ -164,9 +161,6 @@ def record_evaluation(path: Path, episodes: int = 256, kind: str = "") -> JsonMa
         path: File of the policy.
         episodes: Episodes of each entry, in the policy's own env and in each task.
         kind: Class of tasks that it drives too, beside their baselines; "" for none.
-
-    Returns:
-        The card's evaluation.
     """
     evaluation = evaluate_policy(str(path), episodes)
     policy, costs = evaluation.policy, dict[str, JsonMap]()
@@ -258,9 +252,6 @@ class Lessons:
 
         Args:
             **rest: Other fields of the card.
-
-        Returns:
-            Card.
         """
         first = _list_tasks(self.kind)[0]
         options = _ESTIMATE_OPTIONS if self.estimator else {}

@@ -133,9 +133,6 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
         name: Name of the controller.
         kind: Class of tasks.
         seeds: Tuning seeds.
-
-    Returns:
-        Search.
     """
     check_choice("controller", name, SPACES)
     check_choice("class", kind, KINDS)
@@ -198,9 +195,6 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
     Args:
         task: Search.
         search: Options of the search, but for its sampler.
-
-    Returns:
-        The study's log as JSON types.
     """
     options = task._make_options(task.start)
     for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once
@@ -261,9 +255,6 @@ def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
     Args:
         task: Search.
         log: Log of `tune`.
-
-    Returns:
-        Suite with a table.
     """
     best, start = log["best"], log["start"]
     before = "it cannot be driven" if start is None else f"{-start:.3f}"

@@ -103,9 +103,6 @@ def make_estimator_tuning(
             every state that `options` does not hold.
         noises: Measurement noises, searched as well.
         seeds: Number of training drives in each scenario.
-
-    Returns:
-        Tuning.
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")

@@ -105,9 +105,6 @@ def create_study(
         storage: RDB URL or SQLite file.
         sampler: Name in `SAMPLERS`.
         seed: Seed of the sampler; machines that share a storage take different ones.
-
-    Returns:
-        Study.
     """
     url = storage if "://" in storage else f"sqlite:///{storage}"
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
@@ -251,9 +248,6 @@ def run(
         task: Tuning.
         search: Options of the search.
         test_seeds: Number of test seeds, from 0 on.
-
-    Returns:
-        Suite and the numbers.
     """
     if not 1 <= test_seeds <= task.seeds[0]:
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
@@ -307,9 +301,6 @@ def make_result_table(
     Args:
         numbers: Value by name.
         search: Range (low, high) by name.
-
-    Returns:
-        Table.
     """
     cells = []
     for name, (low, high) in search.items():
@@ -330,9 +321,6 @@ def make_entry(
         numbers: Value by option.
         command: Command that found them.
         note: Remark, "" for none.
-
-    Returns:
-        Entry.
     """
     used = task.options | numbers
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}

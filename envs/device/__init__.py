@@ -28,9 +28,6 @@ def make_device_env(
             one kernel a step.
         arguments: Arguments of that class, which replace those of the id.
 
-    Returns:
-        The environments.
-
     Raises:
         ValueError: For an unknown engine, an id without an environment on the device, and `compile`
             or `grad` of the engine "cuda".

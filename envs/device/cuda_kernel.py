@@ -103,9 +103,6 @@ def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstant
         config: Config of the environment.
         mode: Autoreset mode, of `MODES`.
         record: Whether records are written.
-
-    Returns:
-        The constants.
     """
     base = config.base
     return KernelConstants(

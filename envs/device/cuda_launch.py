@@ -44,9 +44,6 @@ def get_ptx(
         constants: Constants of the kernel.
         real: Type of floats.
         capability: Compute capability of the GPU.
-
-    Returns:
-        The PTX text.
     """
     folder = kernel_cache.find_kernel_folder("envs")
     versions = version("numba-cuda"), version("numba"), NVVM().get_version()

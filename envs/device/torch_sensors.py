@@ -169,9 +169,6 @@ def read_packed(states: Tensor, capacity: int) -> SlowState:
     Args:
         states: Packed states, shape (STATE_WIDTH, N).
         capacity: Largest number of packets under way.
-
-    Returns:
-        The state.
     """
     if bool((states[Z.under_way] > capacity).any()):
         raise ValueError(f"a state has more than {capacity} packets under way")

@@ -89,9 +89,6 @@ def make_car(vehicle: Vehicle) -> CarParams:
 
     Args:
         vehicle: Vehicle whose parameters are taken.
-
-    Returns:
-        The parameters.
     """
     return CarParams(
         m=vehicle.mass, I=vehicle.yaw_inertia, l_f=vehicle.front_arm, l_r=vehicle.rear_arm,
@@ -117,9 +114,6 @@ def make_task_params(
         yaw_first: Whether the yaw moment comes before acceleration.
         lead_in: Ticks before the manoeuvre.
         world: World with the cost of the yaw moment's rate.
-
-    Returns:
-        Length and limits.
     """
     return TaskParams(
         duration=lead_in + count_ticks(scenario.duration), half_width=scenario.half_width,
@@ -399,9 +393,6 @@ class EnvConfig:
 
         Args:
             options: Options by name, as `StabilityEnv` lists them.
-
-        Returns:
-            The episode.
 
         Raises:
             ValueError: For an unknown option or state.

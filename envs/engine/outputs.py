@@ -110,9 +110,6 @@ def make_measurement_context(
         small_angle: 1 for the small-angle plant.
         key: Lower and upper 32 bits of the episode's key.
         tick: Tick of the measurement.
-
-    Returns:
-        The inputs.
     """
     return MeasurementContext(
         motion, read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky),

@@ -61,9 +61,6 @@ def make_step_params(p: Vector) -> StepParams:
 
     Args:
         p: Packed parameters, shape (PARAMS_WIDTH,).
-
-    Returns:
-        The parameters.
     """
     return StepParams(
         car=read(p, P.car), road=read(p, P.road), motor=read(p, P.motor),
@@ -82,9 +79,6 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
     Args:
         p: Packed parameters, shape (PARAMS_WIDTH,).
         switches: `Switches` of the episode.
-
-    Returns:
-        Variant of the ticks.
     """
     flags = read(switches, FLAGS)
     n_lagging = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
@@ -101,9 +95,6 @@ def get_start_variant(start: EpisodeStart) -> StepVariant:
 
     Args:
         start: Packed start of the episode.
-
-    Returns:
-        The variant.
     """
     return StepVariant(*map(int, make_step_variant(start.params, start.switches)))
 

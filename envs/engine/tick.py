@@ -139,9 +139,6 @@ def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) ->
         car: Parameters of the car.
         change: Factors on stiffnesses and friction, and the tick of the change.
         is_changed: Whether they are changed.
-
-    Returns:
-        The car with its present tyres.
     """
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
@@ -159,9 +156,6 @@ def compute_static_load(drive: ActuatorState, car: CarParams, variant: StepVaria
         drive: State of the actuators.
         car: Parameters of the car.
         variant: Variant of the tick.
-
-    Returns:
-        The load.
     """
     inputs = TyreInputs(drive.delta_f, drive.T_l, drive.T_r)
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
@@ -182,9 +176,6 @@ def compute_lagged_load(
         rest: Fraction of the motors' deviation from their commands that is left.
         car: Parameters of the car.
         variant: Variant of the tick.
-
-    Returns:
-        The load.
     """
     inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
@@ -272,9 +263,6 @@ def compute_inputs(
         state: State at the start.
         tick: Tick at which it starts.
         variant: Variant of the tick.
-
-    Returns:
-        The inputs.
     """
     motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
     drive, driver, car, draws = state.drive, state.driver, state.car, inputs.draws
@@ -388,9 +376,6 @@ def integrate_tick(
         state: State at the start.
         tick: Tick at which it starts.
         variant: Variant of the tick.
-
-    Returns:
-        State and measurements at the end.
     """
     state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion
     if variant.has_errors:

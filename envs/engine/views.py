@@ -176,9 +176,6 @@ def split_workspace(workspace: Vector) -> EpisodeArrays:
 
     Args:
         workspace: Vector of a `Workspace`.
-
-    Returns:
-        The episode's arrays.
     """
     sizes = read(workspace, _SIZES)
     n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)

@@ -72,9 +72,6 @@ def count_columns(n: int) -> int:
 
     Args:
         n: Ticks of a step.
-
-    Returns:
-        The number of columns.
     """
     return -(-n // LANES) * LANES
 
@@ -183,9 +180,6 @@ def read_draws(window: Vector, j: int) -> NormalDraws:
     Args:
         window: Window of the step.
         j: Number of the tick in the step.
-
-    Returns:
-        The random numbers.
     """
     inertial, wheels = read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j)
     return NormalDraws(inertial, wheels, load_element(window, WINDOW.vibration, j))
@@ -206,9 +200,6 @@ def compute_tick_cost(
         task: Limits of the episode.
         path: The driver's path.
         variant: Variant of the tick.
-
-    Returns:
-        Cost and failures.
     """
     beta = compute_sideslip_angle(motion.v_x, motion.v_y, variant.small_angle)
     e_beta, e_gamma = beta - cost_inputs.beta_ref, motion.gamma - cost_inputs.gamma_ref

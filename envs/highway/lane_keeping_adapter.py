@@ -204,9 +204,6 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
 
         Args:
             observation: That of the `KeepingEnv`.
-
-        Returns:
-            The longer one.
         """
         base = self.env.unwrapped
         assert isinstance(base, KeepingEnv)

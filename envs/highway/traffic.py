@@ -136,9 +136,6 @@ def locate_on_lane(lane: AbstractLane, X: float, Y: float, psi: float) -> LanePo
         X: Coordinate along our first axis, which is highway-env's x (m).
         Y: Coordinate to the left (m); highway-env's y is -Y, to the right.
         psi: Heading in our axes (rad), to whose turn the lane's direction is unwrapped.
-
-    Returns:
-        Position of the point on the lane.
     """
     point = np.array([X, -Y])
     longitudinal, right = lane.local_coordinates(point)

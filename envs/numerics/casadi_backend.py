@@ -27,8 +27,5 @@ def to_casadi(function: F) -> F:
 
     Args:
         function: Compiled function, without `&` and `|`, which raise TypeError on expressions.
-
-    Returns:
-        The rebuilt function.
     """
     return as_python(function, SYMBOLS)

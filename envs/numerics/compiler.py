@@ -299,9 +299,6 @@ def make_kernel(
         apart: Whether callers call its machine code instead of taking its text in, as suits what is
             long and called by several kernels.
         options: Options of numba's compiler beside ours.
-
-    Returns:
-        The kernel.
     """
     all_options: dict[str, object] = {"nopython": True, "boundscheck": None}
     all_options |= {"error_model": "numpy", "fastmath": False, "forceinline": False} | options

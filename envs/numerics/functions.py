@@ -118,9 +118,6 @@ def compute_sine(x: Scalar) -> Scalar:
 
     Args:
         x: Angle (rad).
-
-    Returns:
-        Its sine.
     """
     k = floor(x * (0.5 * _TWO_OVER_PI) + 0.5)
     r = (x - k * (2.0 * _PI_2_HIGH)) - k * (2.0 * _PI_2_LOW)
@@ -189,9 +186,6 @@ def exp(x: Scalar) -> Scalar:
 
     Args:
         x: Exponent.
-
-    Returns:
-        The power.
     """
     z = x * (1.0 / 64.0)
     p = (1.0 / 362880.0 * z + 1.0 / 40320.0) * z + 1.0 / 5040.0
@@ -211,9 +205,6 @@ def clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
         value: Number to limit.
         low: Lower limit.
         high: Upper limit, at least low.
-
-    Returns:
-        The clipped value.
     """
     return minimum(maximum(value, low), high)
 
@@ -296,9 +287,6 @@ def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> _Four:
         key_high: Upper 32 bits.
         tick: The tick, or several.
         block: Block of `Channels`.
-
-    Returns:
-        The four numbers.
     """
     a, b, c, d = _philox(key_low, key_high, tick, block)
     n0, n1 = _draw_normal_pair(a, b)
@@ -316,9 +304,6 @@ def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int
         tick: The tick, or several.
         block: Block of `Channels`.
         index: Number of the draw, where a block is drawn from more than once at a tick.
-
-    Returns:
-        The four numbers.
     """
     a, b, c, d = _philox(key_low, key_high, tick, block, index)
     return _to_uniform(a), _to_uniform(b), _to_uniform(c), _to_uniform(d)

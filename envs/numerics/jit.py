@@ -86,9 +86,6 @@ def compile_call(function: F, *arguments: object) -> F:
     Args:
         function: Function compiled by `jit`.
         arguments: Arguments of the types that it will be called with.
-
-    Returns:
-        The function for these types.
     """
     if config.DISABLE_JIT:
         return function
@@ -123,9 +120,6 @@ def as_python(
         function: Function, compiled by `jit` or not.
         table: Primitives by name that replace ours: None for Python floats, `ARRAYS` for arrays.
         finish: Decorator of each rebuilt function, such as another compiler's.
-
-    Returns:
-        The rebuilt function.
     """
     rebuilt: F = _rebuild(function, dict(table or {}), finish, {})
     return rebuilt

@@ -89,9 +89,6 @@ def load_element(array: Vector, *index: int) -> Scalar:
     Args:
         array: Vector, or an array with further axes.
         index: Index of the element, by axis.
-
-    Returns:
-        The number.
     """
     return array[index].item()
 
@@ -115,9 +112,6 @@ def make_view(array: Vector, first: int, kind: type[np.generic], *shape: int) ->
         first: Index of the first number.
         kind: Type of the view's numbers; of np.float32 two lie in one number.
         shape: Shape of the view.
-
-    Returns:
-        The view.
     """
     count = math.prod(shape)
     end = first - (-count * np.dtype(kind).itemsize // array.itemsize)

@@ -24,9 +24,6 @@ def minimum(a: Scalar, b: Scalar) -> Scalar:
     Args:
         a: One number.
         b: The other one, which is the result where one of them is NaN.
-
-    Returns:
-        The smaller one.
     """
     return a if a < b else b
 
@@ -37,9 +34,6 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     Args:
         a: One number.
         b: The other one, which is the result where one of them is NaN.
-
-    Returns:
-        The larger one.
     """
     return a if a > b else b
 
@@ -49,9 +43,6 @@ def absolute(a: Scalar) -> Scalar:
 
     Args:
         a: A float.
-
-    Returns:
-        Its absolute value.
     """
     return math.fabs(a)
 
@@ -87,9 +78,6 @@ def select(condition: Scalar, a: Scalar, b: Scalar) -> Scalar:
         condition: Whether it is the first one.
         a: The number where the condition holds.
         b: The number elsewhere.
-
-    Returns:
-        The selected number.
     """
     return a if condition else b
 
@@ -99,9 +87,6 @@ def to_float(a: Scalar) -> Scalar:
 
     Args:
         a: The integer; a float stays.
-
-    Returns:
-        The float.
     """
     return a * 1.0
 
@@ -124,9 +109,6 @@ def to_int(a: Scalar) -> Scalar:
 
     Args:
         a: Float to convert.
-
-    Returns:
-        The integer.
     """
     return int(a)
 
@@ -148,9 +130,6 @@ def from_word(a: Scalar) -> Scalar:
 
     Args:
         a: Word to convert.
-
-    Returns:
-        The float that stands for it.
     """
     return a * 1.0
 
@@ -160,9 +139,6 @@ def any_lane(condition: Scalar) -> Scalar:
 
     Args:
         condition: Truth value of each lane.
-
-    Returns:
-        One condition for all lanes.
     """
     return condition
 

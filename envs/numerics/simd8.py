@@ -29,9 +29,6 @@ def load8(array: Matrix, *index: int) -> Scalar:
     Args:
         array: The matrix or vector.
         index: Index of the first of them.
-
-    Returns:
-        The eight numbers.
     """
     *row, first = index
     return array[(*row, slice(first, first + 8))].copy()
@@ -44,9 +41,6 @@ def load8_symmetric(matrix: Matrix, k: int, j: int) -> Scalar:
         matrix: Symmetric matrix.
         k: Index of the row.
         j: Index of the first column.
-
-    Returns:
-        The eight numbers.
     """
     return load8(matrix, k, j)
 
@@ -58,9 +52,6 @@ def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
         matrix: Symmetric matrix.
         rows: Number of its rows.
         j: First of the columns.
-
-    Returns:
-        The number of rows.
     """
     return rows
 
@@ -103,9 +94,6 @@ def pad_to_cache_line(fields: Sequence[tuple[object, ...]]) -> np.dtype[np.void]
 
     Args:
         fields: Its fields, as `numpy.dtype` takes them.
-
-    Returns:
-        The padded dtype.
     """
     rest = -np.dtype(list(fields)).itemsize % _LINE_BYTES
     return np.dtype([*fields, *([("to_line_end", np.int8, rest)] if rest else [])])
@@ -117,9 +105,6 @@ def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> Matrix
     Args:
         shape: Shape of the array.
         dtype: Structured dtype of its records.
-
-    Returns:
-        The array.
     """
     size = math.prod(shape) * dtype.itemsize
     buffer = np.zeros(size + _LINE_BYTES, np.int8)

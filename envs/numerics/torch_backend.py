@@ -90,9 +90,6 @@ def compile_method(function: Any) -> Any:
 
     Args:
         function: Bound method to compile.
-
-    Returns:
-        The compiled method.
     """
     source = function.__func__
     code, names = source.__code__.replace(), source.__globals__

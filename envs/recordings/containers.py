@@ -100,9 +100,6 @@ def read_table(
         source: Path of a file or of a ROS 2 bag's folder, or the table itself.
         is_wanted: Whether a column's name is looked for.
         mapping: Our column names to the file's; under `DBC` the description of CAN frames.
-
-    Returns:
-        The table.
     """
     if not isinstance(source, str | Path):
         return _make_table(source)

@@ -182,9 +182,6 @@ def find_samples(
         needed: The quantities without which there is no drive.
         kinds: Of `KINDS`, by slow quantity, as far as they are known; others are recognised.
         is_strict: Whether shuffled rows stay as they are.
-
-    Returns:
-        Sentences on what was done.
     """
     remarks = _sort_rows(values, needed, is_strict) + _keep_samples(values, kinds)
     return remarks + _align_clocks(values, needed)

@@ -215,9 +215,6 @@ class Decoder:
 
         Args:
             chunk: The next bytes of the stream.
-
-        Returns:
-            The epochs that they complete.
         """
         self.counts.received += len(chunk)
         outside, *pieces = (self._tail + chunk).split(b"$")

@@ -91,9 +91,6 @@ def is_nmea(path: str | Path) -> bool:
 
     Args:
         path: Path of the file.
-
-    Returns:
-        True if it is.
     """
     source = Path(path)
     if (is_named := source.suffix.lower() == ".nmea") or not source.is_file():

@@ -80,9 +80,6 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
     Args:
         texts: NAME=COLUMN, dbc=FILE that describes a CAN trace, and TOML files, a DBC beside them.
-
-    Returns:
-        Our column names to the log's.
     """
     mapping: dict[str, str] = {}
     for text in texts:

@@ -240,9 +240,6 @@ def draw_picture(
         shot: State of the car.
         name: Name of its driver.
         ghosts: Name and state of each ghost.
-
-    Returns:
-        The picture.
     """
     p, _, switches, _, config, trace, _, draw_world = shot
     now = trace.rows[-1]

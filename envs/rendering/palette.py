@@ -70,9 +70,6 @@ def find_base(name: str) -> str | None:
 
     Args:
         name: Label of a curve or of a car.
-
-    Returns:
-        The name.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
     return name if name in COLOURS else next((n for n in _LONGEST_FIRST if n in name), None)
@@ -83,9 +80,6 @@ def find_colour(name: str) -> str:
 
     Args:
         name: Label of a curve or of a car.
-
-    Returns:
-        "#RRGGBB".
     """
     other = OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
     return COLOURS.get(find_base(name) or "", other)

@@ -112,9 +112,6 @@ def make_car_scene(shot: RenderState) -> CarScene:
 
     Args:
         shot: State of the car.
-
-    Returns:
-        Scene of the car now.
     """
     p, z, switches, _, config, _, has_tyre_forces, _ = shot
     params, variant = _make_step_params(p), _make_step_variant(p, switches)

@@ -372,9 +372,6 @@ def make_scenario(source: ScenarioSource) -> Scenario:
 
     Args:
         source: Name in `SCENARIOS`, path, mapping of fields, or a `Scenario`, returned as it is.
-
-    Returns:
-        The scenario.
     """
     if isinstance(source, Scenario):
         return source

@@ -115,9 +115,6 @@ def make_sections(
         start: Place along the road where the first lane begins (m).
         scale: Factor on the lengths.
         side: 1, or -1 to mirror the track.
-
-    Returns:
-        The lanes.
     """
     if track not in PATHS:
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
@@ -136,9 +133,6 @@ def make_path(track: str, width: float) -> TrackPath:
     Args:
         track: Name of the track, of `PATHS`.
         width: Width of the vehicle (m).
-
-    Returns:
-        The path.
     """
     shifts = []
     for before, after in pairwise(make_sections(track, width)):
@@ -158,9 +152,6 @@ def transform_path(path: TrackPath, start: Scalar, scale: Scalar, side: Scalar) 
         start: Place along the road where it begins (m).
         scale: Factor on the lengths.
         side: 1, or -1 to mirror it.
-
-    Returns:
-        The `TrackPath`.
     """
     return TrackPath(
         side * path.shift_1, start + scale * path.start_1, scale * path.length_1,
@@ -181,9 +172,6 @@ def add_weave(path: TrackPath, start: Scalar, speed: Scalar, duration: Scalar) -
         start: Place along the road where it begins (m).
         speed: Speed of the car (m/s).
         duration: Time that it takes (s), positive.
-
-    Returns:
-        The `TrackPath`.
     """
     distance = maximum(speed, _MIN_SPEED) * duration
     rate = 2.0 * PI * maximum(floor(duration / _WEAVE_TIME + 0.5), 1.0) / distance

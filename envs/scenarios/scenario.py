@@ -294,9 +294,6 @@ class Scenario:
 
         Args:
             changes: New values by the names of fields.
-
-        Returns:
-            The copy.
         """
         return dataclasses.replace(self, **changes)
 

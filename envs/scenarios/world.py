@@ -106,9 +106,6 @@ class World:
         Args:
             group: Name in `GROUPS`.
             factor: Factor, not negative.
-
-        Returns:
-            The world.
         """
         check_choice("group of a world", group, GROUPS)
         changes: dict[str, object] = {}
@@ -149,9 +146,6 @@ def make_world(source: WorldSource) -> World:
 
     Args:
         source: Name in `WORLDS`; mapping of fields, over another world under `base`; or a `World`.
-
-    Returns:
-        The world.
     """
     if isinstance(source, World):
         return source

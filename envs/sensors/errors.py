@@ -64,9 +64,6 @@ def advance_errors(
         curvature: True curvature of the road (1/m).
         s: Distance along the road (m).
         normal: Standard normal number.
-
-    Returns:
-        The next `ErrorState`.
     """
     wave = compute_sine(errors.map_rate * s + errors.map_phase)
     return ErrorState(
@@ -91,9 +88,6 @@ def apply_sensor_errors(
         accel: True specific force (a_x, a_y) at the accelerometer (m/s2).
         state: `ErrorState` of the tick.
         errors: `SensorErrors`.
-
-    Returns:
-        FAST_WIDTH numbers.
     """
     scale, offset, excess = errors.steer_scale, errors.steer_offset, errors.accel_scale - 1.0
     return (

@@ -62,9 +62,6 @@ def compute_fast_row(
         d_f: Front track (m).
         noise: `Noise`.
         draws: `NormalDraws` of the tick.
-
-    Returns:
-        FAST_WIDTH numbers.
     """
     n, wheels = draws.inertial, draws.wheels
     half = 0.5 * d_f * motion.gamma

@@ -133,9 +133,6 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: S
         context: Truth, noise and random numbers of the tick.
         link: `Link` of the sensor.
         drift: Drift of the sample before.
-
-    Returns:
-        The sample.
     """
     blocks, tick = BLOCKS[sensor], to_int(context.tick)
     n = draw_normals(context.key_low, context.key_high, tick, blocks.noise)
@@ -194,9 +191,6 @@ def apply_changes(
     Args:
         sensors: Slow sensors by name.
         changes: By sensor, new values by the names of `SlowSensor`'s fields; None for no change.
-
-    Returns:
-        Slow sensors by name.
     """
     changed = dict(sensors)
     for name, fields in changes.items():

@@ -105,9 +105,6 @@ def limit_rate(value: Scalar, command: Scalar, max_change: Scalar) -> Scalar:
         value: Present value.
         command: Wanted value.
         max_change: Largest change, in the unit of both.
-
-    Returns:
-        The new value.
     """
     return value + minimum(maximum(command - value, 0.0 - max_change), max_change)
 

@@ -246,9 +246,6 @@ def derivative(
         car: `CarParams`.
         road: `RoadParams`.
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        The derivative as a `Motion`.
     """
     gravity = compute_gravity(motion, road, variant.small_angle, 0.0)
     rate = _compute_rates(motion, load, disturbance, car, gravity, variant)
@@ -375,9 +372,6 @@ def kutta3(
         road: `RoadParams`.
         h: Length of the step (s).
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        The `Motion` at the end.
     """
     if variant.law == MAGIC_FORMULA:  # apart: the code of other laws stays short, and as fast
         magic = PlantVariant(variant.small_angle, MAGIC_FORMULA, variant.roll)
@@ -418,9 +412,6 @@ def rk4(
         road: `RoadParams`.
         h: Length of the step (s).
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        The `Motion` at the end.
     """
     gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)

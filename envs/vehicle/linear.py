@@ -167,9 +167,6 @@ def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Args:
         vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
-
-    Returns:
-        The model.
     """
     A, B = _make_lateral(vehicle, speed, 2)
     C = np.array([[0.0, 1.0]])
@@ -186,9 +183,6 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Args:
         vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
-
-    Returns:
-        The model.
     """
     A, B = _make_lateral(vehicle, speed, 4, 3)
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -204,9 +198,6 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     Args:
         vehicle: Vehicle of the model.
         speed: Longitudinal speed (m/s), positive.
-
-    Returns:
-        The model.
     """
     A, B = _make_lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
@@ -220,9 +211,6 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
 
     Args:
         vehicle: Vehicle of the model.
-
-    Returns:
-        The model.
     """
     A, B, I_x = np.zeros((2, 2)), np.zeros((2, 1)), vehicle.roll_inertia
     ratios = vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x

@@ -99,9 +99,6 @@ class Vehicle:
 
         Args:
             changes: New values by the names of fields.
-
-        Returns:
-            The copy.
         """
         return dataclasses.replace(self, **changes)
 
@@ -111,9 +108,6 @@ class Vehicle:
         Args:
             front: Factor on the front stiffness.
             rear: Factor on the rear stiffness; None for `front`.
-
-        Returns:
-            The copy.
         """
         return self.replace(
             front_stiffness=self.front_stiffness * front,
@@ -208,9 +202,6 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     Args:
         source: Name in `VEHICLES`, path, mapping of parameters, or a `Vehicle`, returned as it is.
         strict: Whether implausible numbers of a file or a mapping are refused.
-
-    Returns:
-        The vehicle.
 
     Raises:
         TypeError: For an unknown parameter, one that is no number, or another kind of source;

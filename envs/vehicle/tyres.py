@@ -426,9 +426,6 @@ def fit_fiala(vehicle: Vehicle) -> Vehicle:
 
     Args:
         vehicle: Vehicle with the Magic Formula's stiffnesses and friction.
-
-    Returns:
-        The vehicle with Fiala's.
     """
     from scipy.optimize import curve_fit
 

@@ -28,9 +28,6 @@ def dot(row: Vector, v: Vector, n: int) -> Scalar:
         row: Row of C, shape (at least n,).
         v: Vector, shape (at least n,).
         n: Number of entries of each.
-
-    Returns:
-        The product.
     """
     total = 0.0
     for k in range(n):
@@ -182,9 +179,6 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
     Args:
         f: Memory of the filter.
         row: Row of C, shape (n,).
-
-    Returns:
-        C P C^T.
     """
     n, N, P, PC = f.n, f.total, f.P, f.PC
     for j in range(0, N, vector_width(P)):
@@ -211,9 +205,6 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
         s: Index of the slow sensor.
         i: Index of its row.
         first: Clone of its first row, negative where it measures the states.
-
-    Returns:
-        C P C^T.
     """
     if first < 0:
         return project(f, f.C[s, i])

@@ -201,9 +201,6 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
         f: Memory of the filter.
         s: Index of the slow sensor.
         packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        The factor.
     """
     if f.knots == 0 or f.hdop_column[s] == 0:
         return 1.0

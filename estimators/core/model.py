@@ -280,8 +280,5 @@ def is_finite(value: float) -> Scalar:
 
     Args:
         value: Any number.
-
-    Returns:
-        True for a usable number.
     """
     return absolute(value) < MAX_NUMBER

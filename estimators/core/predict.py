@@ -36,9 +36,6 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
         row: Fast row, shape (FAST_WIDTH,).
         column: Indices of the columns, shape (2,).
         factor: Their factors, shape (2,).
-
-    Returns:
-        The signal.
     """
     return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
         factor, 1
@@ -300,9 +297,6 @@ def compute_residual(f: FilterRecord, i: int) -> Scalar:
     Args:
         f: Memory of the filter, or a block of lanes.
         i: Index of the measurement.
-
-    Returns:
-        Measurement minus its prediction.
     """
     residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):

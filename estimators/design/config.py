@@ -129,9 +129,6 @@ def parse_config(
         row: Its definition.
         sensors: Available slow sensors by name.
         options: Options of `make_estimator`.
-
-    Returns:
-        The complete options.
     """
     reader = _Reader(name, options)
     used = _select_slow_sensors(row, sensors, reader)

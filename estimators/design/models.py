@@ -146,9 +146,6 @@ def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
 
     Args:
         sensors: Names of the slow sensors.
-
-    Returns:
-        Names of the states.
     """
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
     return _ORDER[: max([2, *(1 + _ORDER.index(state) for row in rows for state in row.states)])]

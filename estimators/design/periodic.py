@@ -360,9 +360,6 @@ def spectral_radius(M: Array) -> float:
 
     Args:
         M: Matrix, shape (n, n).
-
-    Returns:
-        The radius.
     """
     return float(np.abs(np.linalg.eigvals(M)).max())
 

@@ -122,9 +122,6 @@ class VectorObservation(
             seed: Seed of row 0, or a list (N,).
             options: Options of the env.
 
-        Returns:
-            Observations and infos.
-
         Raises:
             ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
         """

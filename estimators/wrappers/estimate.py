@@ -315,9 +315,6 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         Args:
             seed: Seed of the env, or None.
             options: Options of the env's reset, or None.
-
-        Returns:
-            Observation and info.
         """
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
@@ -399,9 +396,6 @@ def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
 
     Args:
         env: Environment, wrapped or not; TypeError if it has another wrapper or no record.
-
-    Returns:
-        The environment that has the record.
     """
     layer = env
     while isinstance(layer, gym.Wrapper):

@@ -95,9 +95,6 @@ class TruthEntries:
 
         Args:
             truth: What is told of the episode.
-
-        Returns:
-            Values and calibration.
         """
         sources = {name: truth if name in _MOTORS else truth.vehicle for name in self.parameters}
         values = [getattr(source, name) for name, source in sources.items()]
@@ -219,9 +216,6 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         Args:
             seed: Seed of the env, or None.
             options: Options of the env's reset, or None.
-
-        Returns:
-            Observation and info.
         """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped

@@ -131,9 +131,6 @@ def make_default_camera(size: tuple[int, int]) -> Pinhole:
 
     Args:
         size: Width and height of its pictures (px).
-
-    Returns:
-        The camera.
     """
     width, height = size
     K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
@@ -149,9 +146,6 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
         camera: The camera, whose tilt and height are not used.
         picture: Bytes, grey (height, width) or in colour (height, width, 3).
         lane_width: Distance from marking to marking (m).
-
-    Returns:
-        The camera with this tilt and height.
     """
     if (pair := _find_pair(*_find_ridges(camera, picture))) is None:
         raise ValueError("no lane: no pair of markings was found; pass the camera tilt and height")

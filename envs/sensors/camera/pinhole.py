@@ -64,9 +64,6 @@ class Pinhole:
 
         Args:
             path: Path of the file, which has at least K, dist and size.
-
-        Returns:
-            The camera.
         """
         values = read_document(path, "camera")
         if missing := {"K", "dist", "size"} - values.keys():
