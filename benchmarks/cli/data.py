@@ -65,8 +65,10 @@ class _Replay:
     has no gyro, filter the fixes with noise that follows HDOP or does not."""
 
     log: Path = take_argument("A recorded drive: a table, CAN trace, bag or NMEA.", ...)
-    vehicle: Text = take(
-        "A name, a TOML or JSON file, or `identify`: found in the log itself.", kinds="vehicles"
+    vehicle: str = take(
+        "A name, a TOML or JSON file, or `identify`: found in the log itself.",
+        "passenger-car",
+        kinds="vehicles",
     )
     nominal: str = take("The car whose mass and arms `--vehicle identify` takes.", "passenger-car")
     mapping: Texts
@@ -96,10 +98,10 @@ class _Replay:
         if is_nmea(log):
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
-            used = "log vehicle mapping html json parquet plot kml"
+            used = "log html json parquet plot kml"
             refuse_unused_options(self, used, f"a receiver's log ({log})")
             with use_shared_bar(console, f"replay {log}"):
-                received = replay_nmea(log, self.vehicle, self.mapping)
+                received = replay_nmea(log)
             write_output(console, [make_receiver_suite(received)], vars(self))
             for path, write in ((self.plot, draw), (self.kml, write_kml)):
                 if path is not None:
@@ -123,6 +125,7 @@ class _Replay:
                 delay=self.course_delay,
                 bias_deg=self.course_bias,
                 gyro_bias_degps=self.gyro_bias,
+                figures=self.html is not None,
             )
         write_output(console, [suite], vars(self))
 
@@ -157,7 +160,7 @@ class _Identify:
 
     def run(self) -> None:
         from ...estimators.wires import write_vehicle
-        from ..recorded.replay import identify_file
+        from ..recorded.identify import identify_file
 
         console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):

@@ -69,6 +69,14 @@ class Column:
     interval: bool = True  # whether intervals are shown
 
 
+HONESTY = (
+    Column("nees", "NEES", form=".2f", interval=False),
+    Column("coverage", "in 95 %", 100.0, ".0f", interval=False),
+    Column("log_score", "log score", form=".2f", interval=False),
+)
+"""What `compute_honesty` computes."""
+
+
 @dataclass
 class ResultTable:
     """A table for the screen, the report and pandas."""

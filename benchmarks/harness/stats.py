@@ -15,6 +15,7 @@ from ...envs.record import Array
 
 _LEVEL = 0.95  # of the intervals
 _TAIL = 0.5 * (1.0 - _LEVEL)  # probability beyond each bound
+_Z95 = 1.959964  # standard deviations to each side
 _BLOCK = 512  # rows of a jackknife at once
 _MIN_SEEDS = 4  # with fewer an interval spans orders of magnitude
 _WORST = 0.05  # fraction of the episodes whose mean `compute_tail_mean` takes
@@ -197,6 +198,23 @@ def share(hits: npt.ArrayLike) -> Estimate:
     middle = (value + z * z / (2.0 * n)) / (1.0 + z * z / n)
     reach = z * math.sqrt(value * (1.0 - value) / n + (0.5 * z / n) ** 2) / (1.0 + z * z / n)
     return Estimate(value, max(middle - reach, 0.0), min(middle + reach, 1.0))
+
+
+def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float]:
+    """Compute whether a filter's own deviation tells how far it is from the truth.
+
+    Args:
+        error: Errors of an estimate, shape (n,).
+        deviation: Its standard deviations in the same unit, shape (n,).
+
+    Returns:
+        NEES, the mean squared error in variances, 1 where it is honest; the fraction of errors in
+        the 95 % interval; the mean logarithm of the normal density at the truth, whose unit is the
+        error's: the larger, the better. It weighs error against honesty (Good 1952).
+    """
+    squares = (error / deviation) ** 2
+    score = -0.5 * squares - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
+    return float(np.mean(squares)), float(np.mean(squares < _Z95**2)), float(np.mean(score))
 
 
 def compute_win_rate(costs: Array, others: Array) -> Estimate:

@@ -12,6 +12,7 @@ from .stats import Estimate
 
 LINES, LETTERS = 5, 110  # lines of a verdict, letters of a line with the package's names
 _MAX_NAMES = 2  # names in a sentence; the others are counted
+MAX_NIS = 3.0  # mean squared innovation over its variance, beyond which a filter is lost
 _MIN_TIE = 0.995  # a ratio below it is a lead
 
 
@@ -81,6 +82,22 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
         return f"{summarise_names([name, *ties])} {verb} least, too close to tell apart"
     second = [f", {format_percent(ratio)} as much as {rival}" for rival, ratio in ratios.items()]
     return f"{name} {verb}s least{''.join(second[:1])}"
+
+
+def describe_innovations(nis: Mapping[str, float]) -> str:
+    """Describe whether slow samples surprise each filter as much as it expects.
+
+    Args:
+        nis: Mean squared innovation over its variance, of a value of a packet, by filter.
+
+    Returns:
+        A sentence; "" where no filter has innovations.
+    """
+    lost = [f"{name} ({mean:.1f})" for name, mean in nis.items() if mean > MAX_NIS]
+    if not nis:
+        return ""
+    judged = "nobody is lost" if not lost else f"do not believe {', '.join(lost)}"
+    return f"By squared innovations over their variance, which should be 1: {judged}."
 
 
 def format_percent(ratio: Estimate) -> str:

@@ -21,7 +21,7 @@ from ...envs.vehicle import dynamics
 from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, PlantVariant, TyreInputs, compute_tyre_load
-from .emulate import LoggedMotion
+from .motion import LoggedMotion
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 _BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late

@@ -21,8 +21,14 @@ from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
 from ...estimators.wires import SignalCalibration, apply_wires
-from .emulate import COURSE, MIN_SPEED, LoggedMotion, collect_fixes, find_latency
-from .identify import estimate_slips
+from .motion import (
+    COURSE,
+    MIN_SPEED,
+    LoggedMotion,
+    collect_fixes,
+    estimate_slips,
+    find_latency,
+)
 from .quality import (
     BLOCKER,
     FACTOR,

@@ -21,10 +21,9 @@ from ...estimators.make import make_estimator
 from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
-from ..harness.verdict import format_verdict
+from ..harness.verdict import MAX_NIS, describe_innovations, format_verdict
 from .checks import CHECKS, InspectedDrive
-from .emulate import LoggedMotion
-from .honesty import LOST, describe_innovations
+from .motion import LoggedMotion
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
 
 if TYPE_CHECKING:
@@ -43,7 +42,6 @@ _LABELS = {
     "front_tyres": "front tyre stiffness", "rear_tyres": "rear tyre stiffness", "bank": "bank",
     "accel_scale": "accel_y scale", "inverse_friction": "1 / friction",
 }  # fmt: skip
-_RELATIVE = ("front_tyres", "rear_tyres", "accel_scale", "inverse_friction")
 _LEARNT = 0.7  # of the deviation at the start, below which the log tells a number
 _USEFUL = math.radians(1.0)  # of deviation, below which a slip of 2 deg is surely one
 
@@ -101,8 +99,6 @@ def inspect_file(
     suite = Suite("inspect", f"Is it worth estimating from? {name_log(source)}", " ".join(remarks))
     suite.verdict = _compose_verdict(findings, prediction, car)
     suite.tables = [_make_channels(values), *_make_findings(findings)]
-    if prediction is not None:
-        suite.tables.append(_make_learnt(prediction))
     if figures and values:
         drawn = _draw_figures(values, prediction)
         suite.answers, suite.figures = drawn[:2], drawn[2:]
@@ -169,7 +165,7 @@ def _compose_verdict(
         slow = "The car is never fast enough for a sideslip angle: nothing is estimated."
         return format_verdict(slow, tally)
     deviation = prediction.usual * _DEGREES
-    is_lost = prediction.nis > LOST
+    is_lost = prediction.nis > MAX_NIS
     worth = "worth little" if is_lost or prediction.usual > _USEFUL else "worth it"
     also = [
         _LABELS[name] for name, (at_first, at_last) in prediction.learnt.items()
@@ -228,18 +224,6 @@ def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
     complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
     shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
     return [*([shown] if bad else []), complete]
-
-
-def _make_learnt(prediction: Prediction) -> ResultTable:
-    rows = []
-    for name, (first, last) in prediction.learnt.items():
-        scale = 1.0 if name in _RELATIVE or name == "accel_bias" else _DEGREES
-        unit = {"bias": "deg/s", "accel_bias": "m/s2"}.get(name, "-" if scale == 1.0 else "deg")
-        rows.append([_LABELS[name], unit, first * scale, last * scale])
-    columns = (
-        "deviation of", "unit", Column("before", form=".2g"), Column("after", form=".2g"),
-    )  # fmt: skip
-    return ResultTable("What else it tells", columns, rows, keyed=False)
 
 
 def _draw_figures(

@@ -14,8 +14,9 @@ from scipy.ndimage import label, median_filter, uniform_filter1d
 from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.recordings.log_file import WARNING_PREFIX
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from .emulate import LoggedMotion
+from .motion import LoggedMotion
 
 BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
 """Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
@@ -401,3 +402,21 @@ def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
         text = "the course shows no sideslip: is it the heading?"
         sentences += [] if sentences else [_make_finding("unrelated", "course", text)]
     return sentences
+
+
+def sort_remarks(
+    remarks: Sequence[str], logs: Sequence[Log], car: Vehicle
+) -> tuple[list[str], list[str]]:
+    """Sort a reader's remarks into warnings and all others, with those on the drives themselves.
+
+    Args:
+        remarks: Sentences of `read_parts`.
+        logs: Parts of the log.
+        car: The car that is assumed.
+    """
+    marked = [text for text in remarks if text.startswith(WARNING_PREFIX)]
+    urgent = [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in marked]
+    others = [text for text in remarks if text not in marked]
+    step = math.degrees(max(estimate_resolution(log.record.fast[:, FAST.gyro]) for log in logs))
+    others += [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
+    return urgent + [finding.text for finding in find_contradictions(logs, car)], others

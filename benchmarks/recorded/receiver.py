@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,6 @@ from ..harness.stats import Estimate, interval
 from ..harness.verdict import format_verdict
 from ..report.film import make_track_kml
 
-SAME = "constant, same information"
 _GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored
 _MIN_FIXES = 120  # scored fixes
@@ -120,15 +119,9 @@ def _make_signals(track: _Track) -> list[_Signal]:
 
 
 def _compare(signal: _Signal) -> dict[str, _NoiseLawResult]:
-    """Fit each law of the noise on the first half, and one noise as informative as `table`'s."""
-    half, hdop = signal.half, signal.track.hdop
-    sizes = {name: _compute_law_size(hdop, weight) for name, weight in HDOP_LAWS.items()}
-    results = {name: _fit_law(signal, size) for name, size in sizes.items()}
-    table = (sizes["table"] * signal.base_size)[:half]
-    base = signal.base_size[:half]
-    r = results["table"].r * math.sqrt(np.mean(base**-2.0) / np.mean(table**-2.0))
-    results[SAME] = _fit_law(signal, sizes["constant"], r)
-    return results
+    """Fit each law of the noise on the first half."""
+    hdop, laws = signal.track.hdop, HDOP_LAWS.items()
+    return {name: _fit_law(signal, _compute_law_size(hdop, weight)) for name, weight in laws}
 
 
 def _compute_law_size(hdop: Array, weight: float) -> Array:
@@ -144,7 +137,7 @@ def _compute_gain(result: _NoiseLawResult, other: _NoiseLawResult) -> Estimate:
     return interval(np.array([block.mean() for block in blocks]))
 
 
-def _fit_law(signal: _Signal, size: Array, r: float | None = None) -> _NoiseLawResult:
+def _fit_law(signal: _Signal, size: Array) -> _NoiseLawResult:
     """Filter at its maximum likelihood on the first half: the best of a grid, then refined."""
     half = signal.half
 
@@ -155,14 +148,13 @@ def _fit_law(signal: _Signal, size: Array, r: float | None = None) -> _NoiseLawR
         return error, -0.5 * signal.axes * (square + np.log(2.0 * math.pi * S)), square
 
     def compute_cost(p: Array) -> float:
-        p = np.clip(p, *_LIMITS) if r is None else np.array([*p[:1], math.log(r)])
-        return -float(np.mean(compute_scores(p, half)[1][signal.scored[:half]]))
+        scores = compute_scores(np.clip(p, *_LIMITS), half)
+        return -float(np.mean(scores[1][signal.scored[:half]]))
 
-    axes = [_GRID] * (2 if r is None else 1)
-    first = min(itertools.product(*axes), key=lambda p: compute_cost(np.array(p)))
-    simplex = np.array([first, *(first + _STEP * np.eye(len(first)))])
+    first = min(itertools.product(_GRID, _GRID), key=lambda p: compute_cost(np.array(p)))
+    simplex = np.array([first, *(first + _STEP * np.eye(2))])
     p = minimize(compute_cost, first, method="Nelder-Mead", options={"initial_simplex": simplex}).x
-    p = np.clip(p, *_LIMITS) if r is None else np.array([p[0], math.log(r)])
+    p = np.clip(p, *_LIMITS)
     error, likelihood, square = compute_scores(p, len(signal.z))
     late = signal.scored & (np.arange(len(signal.z)) >= half)
     q, noise = np.exp(p)
@@ -199,7 +191,6 @@ def _predict_fixes(signal: _Signal, R: Array, q: float) -> tuple[Array, Array]:
 
 _DEGREES = 180.0 / math.pi
 _TUNED, _FIXED = "table", "constant"
-_CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0, math.inf)}
 _NEGLIGIBLE = 0.01  # of log-likelihood a fix: nobody would notice
 _WEAK_CORRELATION = 0.3  # a rank correlation that explains little
 _ROWS = {"position": "prediction_error", "course": "course_prediction_error"}
@@ -214,12 +205,11 @@ class ReceiverReplay(NamedTuple):
     counts: Counts
 
 
-def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
+def replay_nmea(log: str | Path) -> ReceiverReplay:
     """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
 
     Args:
         log: Path of the log.
-        no_drive: What only a drive with a gyro has, a vehicle and a mapping: None or empty.
 
     Returns:
         The fixes, and the results of each law.
@@ -228,8 +218,6 @@ def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
         ValueError: For a log too short to compare, and for all that `read_nmea` refuses.
     """
     path = Path(log)
-    if any(no_drive):
-        raise ValueError(f"{path}: a receiver's log takes no vehicle and no mapping")
     epochs, counts = read_nmea(path)
     track = _make_track(epochs)
     try:
@@ -242,7 +230,7 @@ def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
 
 
 def make_receiver_suite(replay: ReceiverReplay) -> Suite:
-    """Make a suite of the verdict, the counts, the numbers of each law, and the track.
+    """Make a suite of the verdict, the counts and the numbers of each law.
 
     Args:
         replay: Results of a log.
@@ -266,7 +254,6 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     counts = [[what, str(n)] for what, n in replay.counts.rows()]
     title = "What came from the receiver"
     suite.tables.append(ResultTable(title, ("what", "count"), counts, keyed=False))
-    suite.figures = _draw_figures(replay)
     return suite
 
 
@@ -322,8 +309,7 @@ def _add_table(
     )
     note = (
         f"Errors in {unit} of {records[0]['n']} fixes. constant, half, table: how the noise "
-        f"follows HDOP; {SAME}: what `table` has on average, while `constant` "
-        "has its own. NIS is 1 for a filter that knows its errors; intervals by blocks of fixes."
+        "follows HDOP. NIS is 1 for a filter that knows its errors; intervals by blocks of fixes."
     )
     if signal.axes == 1:
         note += " The noise of course is that at 1 m/s, it falls with speed."
@@ -341,21 +327,6 @@ def write_kml(path: Path, replay: ReceiverReplay) -> None:
     track = replay.track
     fixes = {"fixes": (track.east, track.north)}
     write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
-
-
-def _draw_figures(replay: ReceiverReplay) -> list[tuple[str, Any, str]]:
-    """The track by classes of HDOP, and HDOP over time; nothing without plotly."""
-    try:
-        from ..report.figures import draw_time_series, draw_track
-    except ModuleNotFoundError:
-        return []
-    now, name, caption = replay.track, replay.name, "East and north of the first fix, by HDOP."
-    shown = {}
-    for label, (low, high) in _CLASSES.items():
-        within = (now.hdop >= low) & (now.hdop < high)
-        shown[label] = np.where(within, now.east, np.nan), now.north
-    over_time = draw_time_series(now.t - now.t[0], {"HDOP": now.hdop}, "HDOP")
-    return [(f"{name}: the track", draw_track(shown), caption), (f"{name}: HDOP", over_time, "")]
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:

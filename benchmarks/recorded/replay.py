@@ -1,10 +1,7 @@
-"""A file with a recorded drive, replayed or identified; whether the car found stays near the log.
-
-The identified car drives held-out parts of the log by steering and speed, beside what was measured.
-"""
+"""`sideslip replay`: a file with a recorded drive, its estimators scored, tabled and drawn."""
 
 import dataclasses
-import itertools
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,99 +9,57 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
+from ... import __version__
+from ...envs.record import Log
+from ...envs.recordings.log_file import read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED
-from ..harness.results import Column, ResultTable, Suite
-from ..harness.verdict import format_verdict
-from .bicycle_fit import compute_residual, make_windows, simulate_windows
-from .identify import Finding, IdentificationResult, identify
-from .quality import TRUTH, estimate_resolution, find_contradictions, find_saturated
-from .suite import Settings, corners, replay
+from ..harness.results import HONESTY, Column, ResultTable, Suite
+from ..harness.verdict import describe_innovations, describe_leader, format_verdict
+from .identify import identify_file
+from .motion import GYRO_ONLY, LoggedMotion
+from .quality import TRUTH, sort_remarks
+from .scoring import ESTIMATORS, ReplayResult, Settings, compute_range, make_drives, run_estimators
 
-_FITTED, _NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
-_FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
 TRUTH_WARNING = "The truth of this log is in doubt, and with it all errors: see the warnings."
-_FINDINGS_NOTE = (
-    "Intervals by a jackknife over 40 stretches of the log (20 for sensors), and by priors around "
-    "what is stated, to which numbers that this log does not tell are drawn. Latencies of steering "
-    "and acceleration are applied only where they lower the error on stretches that the fit has "
-    "not seen: the lag of tyres looks like one."
-)
-_BLOCK, _MOST_BLOCKS = 12.0, 16  # s, the shortest; of a part
-# ISO 19364 (steady-state circular driving) and ISO 22140 (lateral transient response) compare a
-# simulation with tolerances around what was measured. Their texts are not at hand: these numbers
-# are assumed. name: factor to the unit shown, unit, offset in it, share of the measured value
-_CORRIDORS = {
-    "yaw rate": (180.0 / np.pi, "deg/s", 1.0, 0.1),
-    "lateral acceleration": (1.0, "m/s2", 0.3, 0.1),
-    "sideslip angle": (180.0 / np.pi, "deg", 0.3, 0.15),
-}
-_MIN_SHARE, _MAX_GAIN_ERROR = 0.95, 0.1  # assumed as well
-_VALIDATION_NOTE = (
-    "Odd blocks identify, even ones are driven open loop: the model's first second forgets its "
-    "start, 4 s count. A sample is inside within offset + share x what was measured; a channel "
-    f"stays inside with {100.0 * _MIN_SHARE:.0f} % of its samples and a gain (simulated over "
-    f"measured, by least squares) within {100.0 * _MAX_GAIN_ERROR:.0f} % of 1. Form after "
-    "ISO 19364 and ISO 22140, whose text was not at hand: all tolerances are assumptions, and "
-    "this is no proof of conformity."
-)
+_HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
+DEGREES = 180.0 / math.pi
 
 
-def _sort_remarks(
-    remarks: Sequence[str], logs: Sequence[Log], car: Vehicle
-) -> tuple[list[str], list[str]]:
-    """Sort a reader's remarks into warnings and all others, with those on the drives themselves."""
-    marked = [text for text in remarks if text.startswith(WARNING_PREFIX)]
-    urgent = [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in marked]
-    others = [text for text in remarks if text not in marked]
-    step = math.degrees(max(estimate_resolution(log.record.fast[:, FAST.gyro]) for log in logs))
-    others += [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
-    return urgent + [finding.text for finding in find_contradictions(logs, car)], others
+def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
+    """Run the estimators over a recorded drive, designed from this vehicle, and score them.
 
-
-def identify_file(
-    log: str | Path,
-    vehicle: VehicleSource,
-    mapping: Sequence[str] = (),
-    wires: SignalCalibration | None = None,
-    tyres: str | None = None,
-    until: float | None = None,
-    validate: bool = False,
-) -> tuple[IdentificationResult, Suite]:
-    """Read a drive and identify its car.
+    A log with slow sensors is replayed with those; else a GPS course is emulated where the log
+    knows the true sideslip; else estimators that need one are left out. Without truth nothing is
+    scored, but drawn. Of rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick, value is
+    the median, low and high are the smallest and largest over the noises.
 
     Args:
-        log: File of the drive.
-        vehicle: Stated vehicle, as for `make_vehicle`.
-        mapping: Texts such as "steer_rad=Delta".
-        wires: Stated calibration of the signals.
-        tyres: Law of the tyres, as for `identify`.
-        until: End of the part that is used (s), None for all.
-        validate: Whether to say how well a car from half of the log drives the other half.
+        log: Recorded drive.
+        vehicle: Vehicle from which the estimators are designed.
+        settings: Fields of `Settings`; TypeError for an unknown, ValueError for a bad one.
 
     Returns:
-        Identified car and calibration, and their suite.
+        Suite with verdict, table and figures.
     """
-    logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
-    car = make_vehicle(vehicle)
-    result = identify(logs, car, wires, tyres)
-    warnings, remarks = _sort_remarks(remarks, logs, car)
-    result.remarks = remarks + result.remarks
-    suite = _make_suite(result, logs[0].name)
-    suite.warnings = warnings
-    if validate:
-        suite.tables.append(_make_validation_table(logs, car, wires, tyres))
-    return result, suite
+    how = Settings(**settings)
+    drives = make_drives(log, how)
+    result = run_estimators(drives, vehicle, how)
+    suite = Suite("replay", f"A recorded drive: {log.name}", _make_text(log, drives, vehicle, how))
+    records = _add_rows(suite, result, log.name, vehicle, how)
+    suite.tables = [_make_table(result, records, f"{log.name}, {vehicle.name}", len(drives))]
+    suite.verdict = _compose_verdict(result, "gps" in drives[0].slow and "gps" not in log.slow)
+    if how.figures:
+        _draw_figures(suite, result, log)
+    return suite
 
 
 def replay_file(
     log: str | Path,
-    vehicle: VehicleSource | None = None,
+    vehicle: VehicleSource = "passenger-car",
     *,
     mapping: Sequence[str] | None = None,
     wires: SignalCalibration | None = None,
@@ -112,13 +67,12 @@ def replay_file(
     until: float | None = None,
     **settings: Any,
 ) -> Suite:
-    """Read a drive and replay it, each part of a log with holes by itself; with truth, corners too.
+    """Read a drive and replay it, each part of a log with holes by itself.
 
     Args:
         log: File of the drive.
         vehicle: Vehicle as for `make_vehicle`. "identify": the log identifies the car, or its
-            first `until` s do and the rest is replayed. None: the Ferrari 250 LM of the Stanford
-            log, for estimates with fitted tyres x 0.7, for corners with nominal tyres.
+            first `until` s do and the rest is replayed.
         mapping: Texts such as "steer_rad=Delta".
         wires: Calibration of the signals; its latency and noise overrule identified ones.
         nominal: Vehicle whose mass and arms an identified car with linear tyres has.
@@ -133,26 +87,16 @@ def replay_file(
     if vehicle != "identify" and (until is not None or nominal != "passenger-car"):
         raise ValueError("--until and --nominal are for --vehicle identify")
     wires, tables, unknown = wires or SignalCalibration(), [], ""
-    factor = settings.get("stiffness_factor", 1.0)  # of corners, whose tyres are nominal
     if vehicle == "identify":
         result, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
         vehicle, tables, unknown = result.car, shown.tables, result.reason
         latency = {**result.wires.latency, **wires.latency}
         wires = result.wires._replace(latency=latency, noise={**result.wires.noise, **wires.noise})
+    car = make_vehicle(vehicle)
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
     logs = [apply_wires(part, wires) for part in logs]
-    if vehicle is None:
-        car, design = make_vehicle(_NOMINAL), make_vehicle(_FITTED)
-        settings = {"stiffness_factor": _FACTOR} | settings
-        remarks.append(
-            "No vehicle was named, so the estimators assume the Ferrari 250 LM of the Stanford "
-            f"log, fitted tyres x {_FACTOR}. For another car name its file: `--vehicle FILE`."
-        )
-    else:
-        car = design = make_vehicle(vehicle)
-    settings = {"noise": wires.noise} | settings
-    settings["emulated"] = not any(part.slow for part in logs)
     present = {name for part in logs for name in part.slow}
+    settings = {"noise": wires.noise} | settings | {"emulated": not present}
     is_emulated = not present and any("beta" in part.truth for part in logs)
     for name in () if is_emulated else ("course_rate", "delay", "bias_deg"):
         if settings.get(name, getattr(Settings, name)) != getattr(Settings, name):
@@ -161,17 +105,15 @@ def replay_file(
     for name in sorted({"camera", "gps"} & wires.latency.keys() - present):
         remarks.append(f"The latency of {name} is not used: the log has no such sensor.")
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
-    suites = [replay(part, design, **settings) for part in parts]
+    suites = [replay(part, car, **settings) for part in parts]
     times = [part.time[-1] - part.time[0] for part in parts]
     suite = suites.pop(longest := int(np.argmax(times)))  # whose verdict is the file's
-    settings["stiffness_factor"] = factor
-    others = suites + [corners(part, car, **settings) for part in parts if "beta" in part.truth]
-    for other in others:
+    for other in suites:
         suite.rows += other.rows
         suite.tables += other.tables
         suite.figures += other.figures
     suite.tables += tables
-    suite.warnings, remarks = _sort_remarks(remarks, logs, design)
+    suite.warnings, remarks = sort_remarks(remarks, logs, car)
     suite.text = "\n\n".join([suite.text, *remarks])
     if suites:
         text = f"the verdict is of the longest of {len(parts)} parts, "
@@ -183,100 +125,126 @@ def replay_file(
     return suite
 
 
-def _make_suite(result: IdentificationResult, name: str) -> Suite:
-    """Make a suite of what a log shows: a table with a verdict."""
-    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
-    missing = [finding.name for finding in result.findings if not finding.is_determined]
-    answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
-    answer += "It stays as stated."
-    if not result.reason:
-        text = "The stated car leaves {:.2f} deg/s of the yaw rate, the found one {:.2f} "
-        answer = (text + "({:.2f} held out).").format(*map(math.degrees, result.rates))
-    slip = ""
-    if not any(map(math.isnan, result.slips)):
-        text = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg."
-        slip = text.format(*map(math.degrees, result.slips))
-    untold = f"Not told by this log: {', '.join(missing) or 'nothing'}."
-    limits = "Not covered: the mass, which scales all; drives beside the part that was used."
-    suite.verdict = format_verdict(answer, slip, untold, limits)
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, result.findings))
-    suite.tables = [ResultTable("What the log shows", header, cells, _FINDINGS_NOTE, keyed=False)]
-    return suite
+def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
+    """Compose the verdict; emulated: whether the GPS course is made from the truth."""
+    if not result.scores:
+        return format_verdict(
+            f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
+            "drawn, not scored.",
+            describe_innovations(result.nis),
+            "Not covered: how far off they are. A log with a true sideslip angle would show it.",
+        )
+    best, share = next(iter(result.rank_by_score().items()))
+    rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
+    first, *rest = rmse
+    over = {name: result.compare(first, name) for name in rest}
+    gain = f"{GYRO_ONLY}, with the gyro alone, errs {rmse[GYRO_ONLY]:.2f} deg"
+    helps = "does not help" if first == GYRO_ONLY else "helps"
+    return format_verdict(
+        "An estimator infers the sideslip angle: between where the car points and where it goes.",
+        f"From the recorded angle {describe_leader(first, over, 'stray')}.",
+        f"Its error: {rmse[first]:.2f} deg. By the log score {best} is best; its 95 % interval "
+        f"holds {100.0 * share:.0f} %.",
+        f"Why: {gain}; a slow sensor {helps} here.",
+        "Not covered: other drives and cars"
+        + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
+    )
 
 
-def _format_cells(row: Finding) -> list[str]:
-    stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
-    ends = "-"
-    if math.isfinite(row.half):
-        ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
-    remark = ": ".join(filter(None, ["yes" if row.is_determined else "no", row.remark]))
-    return [row.name, stated, value, ends, row.unit or "-", remark]
+def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings) -> str:
+    duration, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
+    text = [
+        f"{duration:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r} "
+        f"and one process noise: {settings.q_beta:g} rad2/s on sideslip, {settings.q_gamma:g} "
+        f"(rad/s)2/s on yaw rate, {settings.q_psi:g} rad2/s on heading."
+    ]
+    if log.slow:
+        text.append(f"Slow sensors are the log's own: {', '.join(log.slow)}.")
+    elif "gps" in drives[0].slow:
+        gps = drives[0].slow["gps"]
+        text.append(
+            f"A GPS course is emulated every {gps.period:.4g} s from the sideslip truth and the "
+            f"integral of the logged yaw rate: noise {settings.course_noise_deg:g} deg, "
+            f"{gps.longest_delay:.4g} s late, bias {settings.bias_deg:g} deg."
+        )
+    elif settings.emulated:
+        text.append("The log has no slow sensor and no truth to emulate one from.")
+    if settings.gyro_bias_degps:
+        text.append(f"{settings.gyro_bias_degps:g} deg/s are added to the gyro.")
+    if "beta" in log.truth:
+        text.append(f"Errors count from {SETTLED:g} s on.")
+        if count := int(LoggedMotion(log).is_backward.sum()):
+            text.append(f"{count} rows are driven backward, and not scored.")
+    else:
+        text.append("The log has no sideslip truth, so nothing is scored.")
+    return " ".join(text)
 
 
-def _cut(log: Log, start: int, end: int) -> Log:
-    """Cut rows out of a log, with the packets that were captured and arrived in them."""
-    record, packets = log.record, log.record.packets
-    first, behind = record.first + start, record.first + end
-    within = (packets[:, PACKET.captured] >= first) & (packets[:, PACKET.arrived] < behind)
-    fast = record.fast[start:end]
-    record = dataclasses.replace(record, fast=fast, packets=packets[within], first=first)
-    truth = {name: values[start:end] for name, values in log.truth.items()}
-    return dataclasses.replace(log, record=record, truth=truth)
+def _add_rows(
+    suite: Suite, result: ReplayResult, scenario: str, car: Vehicle, how: Settings
+) -> Any:
+    """Add rows of every number of a result, and return the records, best first."""
+    plain = dataclasses.asdict(how) | {"estimators": list(how.estimators or ESTIMATORS)}
+    del plain["figures"], plain["emulated"]  # these move no number
+    spec = json.dumps({"vehicle": car.to_dict(), "settings": plain})
+    records = {}
+    for name, cost in result.cost.items():
+        record: dict[str, Any] = {"estimator": name, "n": 1}
+        if name in result.scores:
+            scores = result.scores[name]
+            errors = {"rmse": result.rmse[name], "ratio": result.compare(name)}
+            record |= errors | {"n": len(scores)}
+            for column, values in zip(HONESTY, scores.T[1:], strict=True):
+                record[column.key] = compute_range(values)
+        if name in result.nis:
+            record["nis"] = result.nis[name]
+        records[name] = record | {"us_per_tick": cost}
+    where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
+    suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
+    return [records[name] for name in result.rank_by_score() or records]
 
 
-def _split_blocks(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
-    """Split logs into odd blocks, to identify from, and even ones, which are held out."""
-    blocks = []
-    for log in logs:
-        count = int(np.clip(len(log.time) * log.record.dt / _BLOCK, 1, _MOST_BLOCKS))
-        ends = np.linspace(0, len(log.time), count + 1).astype(int).tolist()
-        blocks += [_cut(log, *pair) for pair in itertools.pairwise(ends)]
-    return blocks[::2], blocks[1::2]
-
-
-def _make_validation_table(
-    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration | None, tyres: str | None
+def _make_table(
+    result: ReplayResult, records: Sequence[Any], name: str, noises: int
 ) -> ResultTable:
-    """Compare a car from odd blocks of a log with the even ones; where none is found, why."""
-    moved = [apply_wires(log, SignalCalibration(at=wires.at if wires else {})) for log in logs]
-    odd, even = _split_blocks(moved)
-    wires = wires and wires._replace(at={})
-    result = identify(odd, car, wires, tyres)
-    w = make_windows(even, [find_saturated(log) for log in even]) if even else None
-    reason = result.reason
-    if w is None or not len(w.starts):
-        reason = reason or "no window of 5 s is held out"
-    title = "Does the found car stay within assumed corridors of ISO 19364 / 22140?"
-    columns = (
-        "channel", Column("rmse", "RMSE", form=".3g"), "unit", "corridor",
-        Column("inside", "inside / %", 100.0, ".0f"), Column("gain", "gain", form=".3f"), "stays",
-    )  # fmt: skip
-    if reason or result.theta is None or w is None:
-        return ResultTable(title, columns, [], f"Not validated: {reason}.", keyed=False)
-    w = dataclasses.replace(w, tyres=result.tyres)
-    places, residual = w.scored_rows, compute_residual(car, result.theta, w)
-    rows = zip([*_CORRIDORS][: 2 if w.accel else 1], w.rows, residual.swapaxes(0, 1), strict=False)
-    measured = {name: (row[places], row[places] - left) for name, row, left in rows}
-    if all("beta" in log.truth for log in even):
-        every = round(w.dt / even[0].record.dt)
-        truth = np.concatenate([log.truth["beta"][::every] for log in even])
-        # with the antenna at the centre of gravity its sideslip angle is the car's
-        slip = simulate_windows(car.replace(antenna_ahead=0.0), result.theta, w)[2]
-        if np.isfinite(truth[places]).any():
-            measured["sideslip angle"] = truth[places], slip[:, places[0] - w.starts[0] - 1]
-    cells = [_compare(name, *pair) for name, pair in measured.items()]
-    return ResultTable(title, columns, cells, _VALIDATION_NOTE, keyed=False)
+    note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
+    cost = Column("us_per_tick", "us per tick", form=".3f")
+    if not result.scores:
+        columns = "estimator", Column("nis", "NIS of a value", form=".2f"), cost
+        return ResultTable(f"{name}: no truth, no score", columns, records, note)
+    rmse = Column("rmse", "RMSE / deg [least, most]", DEGREES, ".3f")
+    ratio = Column("ratio", "of gyro only", form=".2f", interval=False)
+    title = f"{name}: error of the sideslip angle (median of {noises} noises)"
+    return ResultTable(title, ("estimator", rmse, ratio, *HONESTY, cost), records, note)
 
 
-def _compare(name: str, measured: Array, simulated: Array) -> list[object]:
-    """Cells of a channel: measured and simulated, shape (windows, rows)."""
-    factor, unit, offset, share = _CORRIDORS[name]
-    known = np.isfinite(measured)
-    x, y = factor * measured[known], factor * simulated[known]
-    inside = float(np.mean(np.abs(y - x) <= offset + share * np.abs(x)))
-    gain = float(x @ y / (x @ x))
-    stays = inside >= _MIN_SHARE and abs(gain - 1.0) <= _MAX_GAIN_ERROR
-    corridor = f"{offset:g} + {100.0 * share:.0f} %"
-    rmse = float(np.sqrt(np.mean((y - x) ** 2)))
-    return [name, rmse, unit, corridor, inside, gain, "yes" if stays else "no"]
+def _draw_figures(suite: Suite, result: ReplayResult, log: Log) -> None:
+    """Draw sideslip angles and, with truth, errors of the first noise, and a bar for each RMSE."""
+    from ..report.figures import draw_groups, draw_time_series
+
+    truth, label = log.truth.get("beta"), "sideslip angle / deg"
+    lines = result.traces if truth is None else {"truth": truth} | result.traces
+    angles = {name: DEGREES * beta for name, beta in lines.items()}
+    overview = _select_traces(draw_time_series(log.time, angles, label), result)
+    title = f"{log.name}: the sideslip angle and its estimates"
+    suite.figures = [(title, overview, _HIDDEN)]
+    if truth is None:
+        return
+    errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
+    over_time = draw_time_series(log.time, errors, f"error of the {label}", zero_line=True)
+    figure = _select_traces(over_time, result)
+    suite.figures.append((f"{log.name}: errors", figure, f"Estimate minus truth. {_HIDDEN}"))
+    groups = {log.name: {name: x.rescale(DEGREES) for name, x in result.rmse.items()}}
+    bars = draw_groups(groups, f"RMSE of the {label}", {})
+    text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
+    question = f"Which estimator is closest on a recorded drive? ({log.name})"
+    suite.answers = [(question, bars, f"{suite.verdict.splitlines()[1]} {text}")]
+
+
+def _select_traces(figure: Any, result: ReplayResult) -> Any:
+    """The figure with only truth, gyro-only and the best estimator in sight."""
+    best = next(iter(result.rmse), "exact-kf")
+    for trace in figure.data:
+        if trace.name in result.traces and trace.name not in (GYRO_ONLY, best):
+            trace.visible = "legendonly"
+    return figure

@@ -26,10 +26,9 @@ from ...estimators.make import make_estimator
 from ...estimators.protocol import Estimates
 from ...estimators.wrappers.truth import calibrate
 from ..harness.drives import SETTLED, draw_steering, make_unchecked_filter, record_drive
-from ..harness.results import Column, ResultTable, Suite
-from ..harness.stats import interval, mean_share, ratio_of_roots, root_mean
+from ..harness.results import HONESTY, Column, ResultTable, Suite
+from ..harness.stats import compute_honesty, interval, mean_share, ratio_of_roots, root_mean
 from ..harness.verdict import format_verdict, summarise_names
-from ..recorded.honesty import HONESTY, compute_honesty
 from ..report.study import Request, Study
 
 NAME, GYRO_ALONE = "joint", "bicycle-kf"

@@ -16,10 +16,10 @@ from ...estimators.analysis.smoother import smooth
 from ...estimators.make import make_estimator
 from ...estimators.wires import apply_wires, read_wires
 from ..harness.drives import SETTLED, call_quietly
-from ..harness.results import Column, ResultTable, Suite
+from ..harness.results import HONESTY, Column, ResultTable, Suite
+from ..harness.stats import compute_honesty
 from ..harness.verdict import format_verdict
-from ..recorded.emulate import LoggedMotion
-from ..recorded.honesty import HONESTY, compute_honesty
+from ..recorded.motion import LoggedMotion
 from ..report.study import Request, Study
 
 _FILE = Path(__file__).with_suffix(".toml")

@@ -17,8 +17,7 @@ from rich.console import Console
 
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
-from ..harness.stats import average
-from ..recorded.honesty import compute_honesty
+from ..harness.stats import average, compute_honesty
 from .levels import draw_drive, run_filter
 
 FIRST_SEED = 100_000  # no drive of the search

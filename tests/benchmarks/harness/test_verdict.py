@@ -21,8 +21,8 @@ from sideslip.benchmarks.procedures import iso3888
 from sideslip.benchmarks.procedures import suite as procedures
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
-from sideslip.benchmarks.recorded import suite as recorded
-from sideslip.benchmarks.recorded.suite import ReplayResult as Replayed
+from sideslip.benchmarks.recorded import replay as recorded
+from sideslip.benchmarks.recorded.scoring import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 from sideslip.benchmarks.speed.timing import Taken
@@ -115,9 +115,12 @@ def test_a_replay_without_truth_has_no_winner() -> None:
     traces = {"bicycle-kf": np.zeros(3), "exact-kf": np.zeros(3)}
     first, *_ = fits(recorded._compose_verdict(Replayed(traces=traces), False))
     assert first.startswith("Nobody wins")
-    squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
-    honesty = {name: np.array([[1.0, 0.94, 3.0 + i]]) for i, name in enumerate(squares)}
-    known = Replayed(squares=squares, traces=traces, honesty=honesty)
+    squares = {"bicycle-kf": [4e-4] * 3, "exact-kf": [0.9e-4, 1.0e-4, 1.1e-4]}
+    scores = {
+        name: np.array([[square, 1.0, 0.94, 3.0 + i] for square in row])
+        for i, (name, row) in enumerate(squares.items())
+    }
+    known = Replayed(scores=scores, traces=traces)
     lines = fits(recorded._compose_verdict(known, True))
     assert "By the log score exact-kf is best; its 95 % interval holds 94 %." in lines[2]
     lost = Replayed(traces=traces, nis={"joint": 7.0, "exact-kf": 1.0})

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.recorded.bicycle_fit import Theta, compute_residual, fit, make_windows
-from sideslip.benchmarks.recorded.emulate import jackknife
 from sideslip.benchmarks.recorded.identify import (
-    Finding,
     IdentificationResult,
-    _estimate_white_noise,
+    _make_suite,
+    _make_validation_table,
+    _split_blocks,
     identify,
 )
+from sideslip.benchmarks.recorded.motion import Finding, _estimate_white_noise, jackknife
 from sideslip.benchmarks.recorded.quality import find_contradictions, find_saturated, find_swapped
-from sideslip.benchmarks.recorded.replay import _make_suite, _make_validation_table, _split_blocks
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies.logs import STUDY
 from sideslip.envs.record import FAST, Array, Log

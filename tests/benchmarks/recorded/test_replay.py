@@ -10,10 +10,15 @@ import pytest
 from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
-from sideslip.benchmarks.recorded.emulate import Emulation, LoggedMotion
-from sideslip.benchmarks.recorded.replay import replay_file
-from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, _compute_path, corners, replay
-from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.benchmarks.recorded.motion import GYRO_ONLY, LoggedMotion
+from sideslip.benchmarks.recorded.replay import replay, replay_file
+from sideslip.benchmarks.recorded.scoring import (
+    ESTIMATORS,
+    Settings,
+    emulate_course,
+    make_drives,
+)
+from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators import make_estimator
 from tests.envs.recordings.drives import read_log
@@ -39,13 +44,12 @@ def values(suite: Suite, metric: str) -> dict[str, float]:
     [
         ({"course_rate": 0.0}, ValueError, "course_rate must be positive"),
         ({"course_rate": 250.0}, ValueError, SLOW),
-        ({"course_noise_deg": -1.0}, ValueError, "course_noise_deg must not be negative"),
-        ({"delay": -0.1}, ValueError, "delay must not be negative"),
+        ({"course_noise_deg": -1.0}, ValueError, "course_noise_deg must be finite and not negat"),
+        ({"delay": -0.1}, ValueError, "delay must be finite and not negative"),
         ({"bias_deg": math.nan}, ValueError, "bias_deg must be finite"),
         ({"seeds": 0}, ValueError, "expected seeds >= 1"),
         ({"q_gamma": -1.0}, ValueError, "q_gamma must be finite and not negative"),
         ({"estimators": ["kf"]}, ValueError, "unknown estimator kf; known here: bicycle-kf"),
-        ({"stiffness_factor": -1.0}, ValueError, "front_stiffness"),
         ({"course_rat": 5.0}, TypeError, "course_rat"),
     ],
 )
@@ -75,11 +79,11 @@ def test_told_the_true_car_the_drive_is_followed_exactly(log: Log) -> None:
 def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
     soft = PASSENGER_CAR.scale_stiffness(0.7)
     settings: dict[str, Any] = {"estimators": ["multirate-kf"], "seeds": 3, "seed": 5}
-    suite = replay(log, PASSENGER_CAR, stiffness_factor=0.7, figures=False, **settings)
+    suite = replay(log, soft, figures=False, **settings)
     options = {"q_beta": 1e-3, "q_gamma": 0.1, "q_psi": 0.0, "course_noise": 0.5 * DEG}
     errors = []
     for seed in (5, 6, 7):
-        seen = Emulation().apply(log, seed)
+        seen = emulate_course(log, Settings(), seed)
         facts: dict[str, Any] = {"vehicle": soft, "sensors": seen.slow, "dt": log.record.dt}
         estimator = make_estimator("multirate-kf", **facts, **options)
         error = estimator.run(seen)["beta"][200:] - log.truth["beta"][200:]
@@ -96,13 +100,11 @@ def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
 
 
 def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
-    suite = replay(log, PASSENGER_CAR, stiffness_factor=0.7, seeds=2)
+    suite = replay(log, PASSENGER_CAR.scale_stiffness(0.7), seeds=2)
     assert suite.name == "replay"
     served = set(ESTIMATORS)
     assert set(values(suite, "rmse")) == served == set(values(suite, "us_per_tick"))
-    table, found = suite.tables
-    joint = [line[1] for line in found.cells if line[0] == "joint"]
-    assert {"front_tyres", "rear_tyres", "bank", "bias"} <= {*joint}
+    (table,) = suite.tables
     assert {line["estimator"] for line in table.cells} == served
     assert {"nees", "coverage", "log_score"} <= table.cells[0].keys()
     scores = [line["log_score"].value for line in table.cells]
@@ -111,7 +113,7 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     ((question, bars, closest),) = suite.answers
     assert log.name in question and len(bars.data) > 0
     assert closest.startswith("From the recorded angle ")
-    assert len(suite.figures) == 5
+    assert len(suite.figures) == 2
     for title, figure, text in suite.figures:
         assert title.startswith(log.name)
         assert len(figure.data) > 0
@@ -126,9 +128,7 @@ def test_a_log_without_truth_or_slow_sensors_says_what_is_left_out(tmp_path: Pat
     assert "no sideslip truth, so nothing is scored" in suite.text
     assert "`course-kf` left out: needs gps" in suite.tables[0].note
     assert "`exact-kf` left out: needs gps or camera" in suite.tables[0].note
-    assert len(suite.figures) == 3 and suite.answers == []
-    with pytest.raises(ValueError, match="corners are scored against sideslip truth"):
-        corners(log, PASSENGER_CAR)
+    assert len(suite.figures) == 1 and suite.answers == []
 
 
 def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
@@ -156,20 +156,6 @@ def test_a_drive_that_ends_before_errors_count(tmp_path: Path) -> None:
         replay(log, PASSENGER_CAR)
 
 
-def test_corners_are_four(log: Log) -> None:
-    suite = corners(log, PASSENGER_CAR, estimators=[GYRO_ONLY], seeds=1)
-    rows = [row for row in suite.rows if row.metric == "rmse"]
-    name = f"{log.name}: passenger-car"
-    assert [row.scenario for row in rows] == [
-        f"{name}, front x {front}, rear x {rear}" for front in (0.7, 1.3) for rear in (0.7, 1.3)
-    ]
-    stiffness = [json.loads(row.spec)["vehicle"]["front_stiffness"] for row in rows]
-    nominal = PASSENGER_CAR.front_stiffness
-    assert stiffness == pytest.approx([0.7 * nominal, 0.7 * nominal, 1.3 * nominal, 1.3 * nominal])
-    assert all(row.value > 1e-4 for row in rows)
-    assert len(suite.tables[0].header) == 1 + 4
-
-
 def test_files_in_rows_out(tmp_path: Path) -> None:
     vehicle = tmp_path / "mine.toml"
     vehicle.write_text(VEHICLE)
@@ -177,23 +163,16 @@ def test_files_in_rows_out(tmp_path: Path) -> None:
     drive = saved(tmp_path, steer_rad=None, Delta=table["steer_rad"] / DEG)
     settings: dict[str, Any] = {"estimators": ["multirate-kf"], "seeds": 1, "figures": False}
     suite = replay_file(drive, vehicle, mapping=["steer_deg=Delta"], **settings)
-    assert len(suite.tables) == 2
-    assert len(suite.rows) == (1 + 4) * 2 * 5
+    assert len(suite.tables) == 1 and len(suite.rows) == 2 * 5
     write_json(tmp_path / "rows.json", suite.rows)
     assert len(read_json(tmp_path / "rows.json")) == len(suite.rows)
-    anyway = replay_file(drive, mapping=["steer_deg=Delta"], **settings)
-    assert "No vehicle was named" in anyway.text
-    corner = next(row for row in anyway.rows if row.scenario.endswith("front x 0.7, rear x 0.7"))
-    nominal = make_vehicle("ferrari-250lm-nominal").front_stiffness
-    found = json.loads(corner.spec)["vehicle"]["front_stiffness"]
-    assert found == pytest.approx(0.7 * nominal)  # and no factor of the fitted design on top
 
 
 @pytest.mark.skipif(not STANFORD.exists(), reason="the shared recordings are not here")
 def test_the_stanford_drive_reaches_its_numbers() -> None:
     """Told the fitted car x 0.7: gyro only 1.11 deg, multirate 0.50-0.53."""
-    settings: dict[str, Any] = {"stiffness_factor": 0.7, "seeds": 3, "figures": False}
-    car = make_vehicle("ferrari-250lm-fitted")
+    settings: dict[str, Any] = {"seeds": 3, "figures": False}
+    car = make_vehicle("ferrari-250lm-fitted").scale_stiffness(0.7)
     suite = replay(read_log(STANFORD), car, estimators=["multirate-kf"], **settings)
     rmse = values(suite, "rmse")
     assert rmse[GYRO_ONLY] == pytest.approx(1.11 * DEG, abs=0.02 * DEG)
@@ -249,7 +228,7 @@ def test_an_option_of_an_emulated_course_is_refused_beside_a_real_one(tmp_path: 
 
 
 def test_a_noiseless_course_is_truth_plus_the_integral_of_the_yaw_rate(log: Log) -> None:
-    seen = Emulation(course_noise_deg=0.0, bias_deg=1.0).apply(log, 0)
+    seen = emulate_course(log, Settings(course_noise_deg=0.0, bias_deg=1.0), 0)
     packets = seen.record.select_packets("gps")
     captured = packets[:, PACKET.captured].astype(int)
     np.testing.assert_array_equal(captured, np.arange(10_000, 11_001, 10))
@@ -263,8 +242,8 @@ def test_a_noiseless_course_is_truth_plus_the_integral_of_the_yaw_rate(log: Log)
 
 
 def test_a_late_course_arrives_so_many_rows_later(log: Log) -> None:
-    fresh = Emulation().apply(log, 3).record.packets
-    late = Emulation(delay=0.2).apply(log, 3)
+    fresh = emulate_course(log, Settings(), 3).record.packets
+    late = emulate_course(log, Settings(delay=0.2), 3)
     packets = late.record.packets
     np.testing.assert_array_equal(packets[:, PACKET.arrived], packets[:, PACKET.captured] + 20)
     np.testing.assert_array_equal(packets[:, PACKET.value], fresh[: len(packets), PACKET.value])
@@ -273,8 +252,8 @@ def test_a_late_course_arrives_so_many_rows_later(log: Log) -> None:
 
 
 def test_the_noise_has_its_seed_and_size(log: Log) -> None:
-    how = Emulation(course_rate=100.0, course_noise_deg=0.5)
-    one, same, other = (how.apply(log, seed).record.packets for seed in (1, 1, 2))
+    how = Settings(course_rate=100.0, course_noise_deg=0.5)
+    one, same, other = (emulate_course(log, how, seed).record.packets for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     noise = one[:, PACKET.value] - (log.truth["beta"] + LoggedMotion(log).heading)
     assert np.std(noise) == pytest.approx(0.5 * DEG, rel=0.1)
@@ -282,8 +261,7 @@ def test_the_noise_has_its_seed_and_size(log: Log) -> None:
 
 
 def test_a_gyro_bias_reaches_the_estimators_but_not_the_heading(log: Log) -> None:
-    plain, biased = Emulation(), Emulation(gyro_bias_degps=0.2)
-    one, two = plain.apply(log, 0).record, biased.apply(log, 0).record
+    one, two = (make_drives(log, Settings(gyro_bias_degps=x))[0].record for x in (0.0, 0.2))
     np.testing.assert_allclose(two.fast[:, FAST.gyro] - one.fast[:, FAST.gyro], 0.2 * DEG)
     np.testing.assert_array_equal(two.packets, one.packets)
 
@@ -293,17 +271,6 @@ def test_no_course_without_truth_and_none_to_use_at_a_standstill(tmp_path: Path)
     beta[95:105] = np.nan
     speed[:50] = 0.5
     log = read_log(saved(tmp_path, sideslip_rad=beta, speed_x_mps=speed))
-    packets = Emulation().apply(log, 0).record.packets
+    packets = emulate_course(log, Settings(), 0).record.packets
     assert 10_100 not in packets[:, PACKET.captured]
     np.testing.assert_array_equal(packets[:6, PACKET.quality], [0, 0, 0, 0, 0, 1])
-
-
-def test_a_path_of_a_circle() -> None:
-    """Constant speed, yaw rate and sideslip drive a circle of radius V / gamma."""
-    fast = np.zeros((20_001, len(FAST)))
-    fast[:, FAST.gyro] = 0.1
-    fast[:, [FAST.wheel_left, FAST.wheel_right]] = 10.0
-    drive = Log(Record(fast, np.zeros((0, PACKET_WIDTH))), {})
-    x, y = _compute_path(drive, np.zeros(20_001))
-    radius = np.hypot(x, y - 100.0)
-    np.testing.assert_allclose(radius, 100.0, atol=0.01)

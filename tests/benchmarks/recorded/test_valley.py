@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.recorded import replay
+from sideslip.benchmarks.recorded import identify as identification
 from sideslip.benchmarks.recorded.bicycle_fit import (
     BicycleFit,
     Theta,
@@ -23,7 +23,7 @@ from sideslip.benchmarks.recorded.bicycle_fit import (
 )
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, IdentificationResult, identify
 from sideslip.benchmarks.recorded.quality import find_saturated
-from sideslip.benchmarks.recorded.suite import Settings, _run_estimators
+from sideslip.benchmarks.recorded.scoring import Settings, run_estimators
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 from sideslip.estimators.wires import SignalCalibration, apply_wires
@@ -121,7 +121,7 @@ def test_a_car_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
         results.extend([] if results else [identify(*arguments)])
         return results[0]
 
-    monkeypatch.setattr(replay, "identify", identify_once)
+    monkeypatch.setattr(identification, "identify", identify_once)
     log = driven(PASSENGER_CAR.replace(yaw_inertia=0.35 * 2700.0))
     path, out = tmp_path / "drive.csv", tmp_path / "car.toml"
     as_table(log).to_csv(path, index=False)
@@ -149,8 +149,8 @@ def test_five_rows_identify_nothing(tmp_path: Path) -> None:
 
 def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
     how = Settings(estimators=ESTIMATORS, seeds=1, noise=wires.noise)
-    squares = _run_estimators([apply_wires(log, wires)], car, how).squares
-    return np.array([squares[name][0] for name in ESTIMATORS])
+    scores = run_estimators([apply_wires(log, wires)], car, how).scores
+    return np.array([scores[name][0, 0] for name in ESTIMATORS])
 
 
 @pytest.mark.parametrize(

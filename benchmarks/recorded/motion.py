@@ -1,84 +1,29 @@
-"""The motion in a recorded drive, a GPS course made of truth and gyro, a GPS's latency."""
+"""The motion in a recorded drive, and the noise and latency of its sensors.
 
-import dataclasses
+Intervals are jackknives over blocks of the log.
+"""
+
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.recordings.log_file import make_packet_rows
-from ...envs.sensors.link import SlowSensor
-from ...envs.sensors.slow import COURSE_SPEED
+from ...envs.vehicle.parameters import Vehicle
+from ...estimators.make import make_estimator
+from ...estimators.wires import NOISES, SignalCalibration, apply_wires
 from ..harness.stats import margin_of_error
 
+GYRO_ONLY = "bicycle-kf"
 BLOCKS = 20  # of a log, which the intervals take for independent
 COURSE, SPEED = range(2)  # places in a GPS's values
 MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
-_NOT_NEGATIVE = ("course_noise_deg", "delay")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Emulation:
-    """A GPS course and a gyro bias put on top of a recorded drive; ValueError for a bad value."""
-
-    course_rate: float = 10.0  # Hz; a sample every so many whole rows of the log
-    course_noise_deg: float = 0.5  # standard deviation of the course (deg)
-    delay: float = 0.0  # of the course (s)
-    bias_deg: float = 0.0  # constant error of the course (deg)
-    gyro_bias_degps: float = 0.0  # of the gyro that estimators see, not of the emulated heading
-
-    def __post_init__(self) -> None:
-        for entry in dataclasses.fields(Emulation):
-            value = getattr(self, entry.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{entry.name} must be finite, got {value}")
-            if value < 0.0 and entry.name in _NOT_NEGATIVE:
-                raise ValueError(f"{entry.name} must not be negative, got {value}")
-        if self.course_rate <= 0.0:
-            raise ValueError(f"course_rate must be positive, got {self.course_rate} Hz")
-
-    def apply(self, log: Log, seed: int | None) -> Log:
-        """Return the log with the gyro's bias, and with a GPS that measures the course alone.
-
-        course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
-        ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
-
-        Args:
-            log: Recorded drive, with the truth if it gets a GPS.
-            seed: Seed of the course's noise, None: its slow sensors stay as they are.
-
-        Raises:
-            ValueError: The log is slower than the course.
-        """
-        record, motion, fast = log.record, LoggedMotion(log), log.record.fast.copy()
-        fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
-        biased = dataclasses.replace(record, fast=fast)
-        if seed is None:
-            return dataclasses.replace(log, record=biased)
-        beta = log.truth["beta"]
-        if self.course_rate * record.dt > 1.0 + 1e-6:
-            raise ValueError(
-                f"a course at {self.course_rate:g} Hz needs a log at least as fast; "
-                f"this one has {1.0 / record.dt:.4g} rows a second"
-            )
-        rows, late = round(1.0 / (self.course_rate * record.dt)), round(self.delay / record.dt)
-        captured = np.arange(-record.first % rows, len(beta), rows)
-        noise = np.random.default_rng(seed).standard_normal(len(captured))
-        exact = (beta + motion.heading)[captured] + math.radians(self.bias_deg)
-        course = exact + math.radians(self.course_noise_deg) * noise
-        sent = np.isfinite(course) & (captured + late < len(beta))
-        ticks = (record.first + captured[sent]).astype(np.float64)
-        values = np.full((len(ticks), 4), np.nan)
-        values[:, 0] = np.arctan2(np.sin(course[sent]), np.cos(course[sent]))
-        quality = (motion.speed[captured][sent] >= COURSE_SPEED).astype(np.float64)
-        packets = make_packet_rows("gps", ticks, ticks + late, values, quality)
-        gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
-        biased = dataclasses.replace(biased, packets=packets)
-        return dataclasses.replace(log, record=biased, slow={"gps": gps})
+WIDE = "its interval is too wide"
+_LATE = (-0.2, 1.2)  # s, of the GPS
+LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
+_FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
 
 
 class LoggedMotion(NamedTuple):
@@ -110,6 +55,23 @@ class LoggedMotion(NamedTuple):
         beta = self.log.truth.get("beta", np.zeros(len(self.log.time)))
         turn = np.abs(np.nan_to_num(beta)) / math.pi
         return np.asarray((self.speed < 0.0) | ((turn > 0.75) & (turn < 1.01)))
+
+
+def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
+    """Estimate the sideslip angle of drives by the gyro alone.
+
+    Args:
+        logs: Recorded drives, at least one.
+        car: Car that is assumed.
+        wires: Calibration of the steering.
+
+    Returns:
+        Sideslip angle (rad) of each, shape (rows,).
+    """
+    dt = logs[0].record.dt
+    estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
+    steered = wires._replace(latency={})
+    return [estimator.run(apply_wires(log, steered))["beta"] for log in logs]
 
 
 def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
@@ -209,3 +171,76 @@ def _find_minimum(times: Array, sums: Array, share: float | None) -> float:
     bend = left - 2.0 * middle + right
     beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
     return float(times[i] + beside * (times[1] - times[0]))
+
+
+class Finding(NamedTuple):
+    """A number with half of its 95 % interval, and whether the log determines it."""
+
+    name: str
+    stated: float
+    value: float = math.nan
+    half: float = math.inf
+    unit: str = ""
+    is_determined: bool = False
+    remark: str = ""
+
+
+def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
+    """Estimate standard deviation and half interval of a channel's white noise.
+
+    From third differences of new samples: a slower sensor repeats its last one.
+    """
+    blocks = []
+    for values in parts:
+        new = np.concatenate([[True], np.diff(values) != 0.0])
+        third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
+        blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
+    # each block: sum of squares and count
+    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
+
+
+def make_sensor_findings(
+    logs: Sequence[Log], slips: Sequence[Array]
+) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
+    """Make findings of the sensors.
+
+    Args:
+        logs: Parts of the log.
+        slips: Sideslip angle (rad) of each, shape (rows,), by which the course is predicted.
+
+    Returns:
+        Findings, noise by the estimators' options, latency by sensor (s).
+    """
+    findings: list[Finding] = []
+    noise: dict[str, float] = {}
+    for channel, unit in _FAST.items():
+        if all(channel in log.record.present for log in logs):
+            column = getattr(FAST, channel)
+            sd, half = _estimate_white_noise([log.record.fast[:, column] for log in logs])
+            is_determined = half < 0.3 * sd
+            remark = "" if is_determined else WIDE if sd > 0.0 else "none is seen"
+            row = Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
+            findings.append(row)
+            noise |= {NOISES[channel]: sd} if is_determined else {}
+    times = np.arange(*_LATE, max(logs[0].record.dt, 0.01))
+    courses = collect_fixes(logs, COURSE, slips, times)
+    speeds = collect_fixes(logs, SPEED, None, times)
+    if not courses:
+        return findings, noise, {}
+    late, half = find_latency(courses, times)
+    with_slip, _ = find_latency(courses, times, 1.0)  # had the slip its size
+    half = math.hypot(half, late - with_slip)
+    is_determined = half < LATE_WITHIN
+    pays = is_determined and late > half
+    remark = ("applied" if pays else "within its interval of 0") if is_determined else WIDE
+    findings.append(Finding("latency of gps", 0.0, late, half, "s", is_determined, remark))
+    at = int(np.argmin(np.abs(times - late)))
+    for name, unit, scale, blocks in (
+        ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
+    ):  # fmt: skip
+        if blocks:  # a difference has twice the variance
+            left = np.array(blocks)
+            sd, half = jackknife(left, lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at]))
+            row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
+            findings, noise = [*findings, row], noise | {NOISES[name]: sd}
+    return findings, noise, {"gps": late} if pays else {}
