@@ -93,7 +93,6 @@ class CarScene(NamedTuple):
 
     motion: Motion
     vehicle: Vehicle
-    steer: float  # rad, front wheels
     torques: tuple[float, float]  # N m, left and right motor
     max_torque: float  # N m, of one motor
     wheels: tuple[_Wheel, ...]  # front left and right, rear left and right
@@ -141,7 +140,6 @@ def make_car_scene(shot: RenderState) -> CarScene:
     return CarScene(
         motion,
         config.vehicle,
-        float(drive.delta_f),
         (float(drive.T_l), float(drive.T_r)),
         float(_compute_torque_limit(motion.v_x, car)),
         tuple(wheels),
@@ -187,12 +185,12 @@ _LENGTH_RATIO = 1.62  # length of every car's body over its wheelbase
 
 
 class CarTrack(NamedTuple):
-    """A car to draw: its scene, its past, the colour of its body, and a name beside it."""
+    """A car to draw: its scene, its past, the colour of its body, and a name."""
 
     scene: CarScene
     truth: Array  # trace of the true motion, rows of `TracePoint`
     colour: str
-    name: str = ""
+    name: str = ""  # above the road, in its colour
 
 
 class Projection(NamedTuple):
@@ -302,32 +300,6 @@ class _RoadPicture(NamedTuple):
                     canvas.draw_disc(cone, 3.6, ORANGE)
                     canvas.draw_disc(cone, 1.4, PAINT)
 
-    def draw_names(self, cars: list[CarTrack], poses: list[Array]) -> None:
-        """Draw each name as near to its car as it covers neither a car nor another name.
-
-        A ghost's name is on the ghost's side of the last car, whose name is on the other side.
-        """
-        box, taken = self.box, []  # taken: middle, half width and half height
-        for car, (x, y) in zip(cars, poses, strict=True):
-            front, rear, half = self.project.scale * np.array(compute_body(car.scene.vehicle))
-            heading, shift = car.scene.motion.psi - self.scene.motion.theta, 0.5 * (front + rear)
-            cos, sin = np.cos(heading), np.sin(heading)
-            size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * (front - rear), half)
-            taken.append((x + shift * cos, y - shift * sin, *size))
-        for i, car in enumerate(cars):
-            x, y, _, tall = taken[i]
-            below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
-            side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
-            is_visible = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
-            tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
-            for row in tries if is_visible else ():
-                clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
-                if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
-                    shade = mix_colours(car.colour, INK, 0.6)
-                    self.canvas.draw_text((x, row), car.name, shade, 12, 0.5)
-                    taken.append((x, row, half, 7.0))
-                    break
-
 
 def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     """Draw the road around the last of the cars, in a box; the others are ghosts beside it.
@@ -357,13 +329,16 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
         trail = view(car.truth[-400:, [TRACE_POINT.X, TRACE_POINT.Y]])
         if len(trail) > 1:
             canvas.draw_line(trail, mix_colours(car.colour, ASPHALT, 0.55), 2.0)
-    poses = [view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0] for car in cars]
-    for car, pose in zip(cars, poses, strict=True):
+    for car in cars:
         heading = car.scene.motion.psi - motion.theta
-        turned = Projection((pose[0], pose[1]), scale, cos=np.cos(heading), sin=-np.sin(heading))
+        x, y = view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0]
+        turned = Projection((x, y), scale, cos=np.cos(heading), sin=-np.sin(heading))
         _draw_car(canvas, turned, car.scene, car.colour)
-    picture.draw_names(cars, poses)
     canvas.set_clip(None)
+    left = box[0] + 16.0
+    for car in reversed(cars):
+        place = left, box[1] + 12.0
+        left += canvas.draw_text(place, car.name, mix_colours(car.colour, INK, 0.6), 12) + 18.0
 
 
 def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str) -> None:
