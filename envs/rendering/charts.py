@@ -1,11 +1,11 @@
 """The picture of a car: the road, a close-up and strip charts over time.
 
-The close-up has its nose to the right: velocity, tyre forces in their friction circles, torques and
-wind. The charts show truth, references and estimates with their standard deviation.
+The close-up has its nose to the right: velocity, tyre forces in their friction circles and wind.
+The charts show truth, references and estimates with their standard deviation.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -160,7 +160,6 @@ def _draw_closeup(
     for wheel in scene.wheels:
         canvas.draw_polygon(to_pixels(wheel.outline(scene.vehicle.wheel_radius)), "#A9B0B7")
     _draw_forces(canvas, scene, to_pixels, per_newton)
-    _draw_motors(canvas, box, scene, to_pixels)
     _draw_directions(canvas, (x_0, y_0), beta, reference, estimates)
     if scene.wind:
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
@@ -188,20 +187,6 @@ def _draw_forces(
         if wheel.capacity:
             place = start[0], start[1] - math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
             canvas.draw_text(place, f"{100.0 * utilisation:.0f} %", colour, 12, 0.5)
-
-
-def _draw_motors(
-    canvas: Canvas, box: Box, scene: road.CarScene, to_pixels: road.Projection
-) -> None:
-    """Draw each rear motor's torque as a bar, to the right where it drives."""
-    x = box[0] + 44.0
-    for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
-        y = to_pixels(np.array([[wheel.x, wheel.y]]))[0, 1]
-        canvas.draw_box((x - 30.0, y + 4.0, 60.0, 7.0), "#E4E7EA", 3.5)
-        share = min(max(torque / scene.max_torque, -1.0), 1.0)
-        canvas.draw_box((x + min(30.0 * share, 0.0), y + 4.0, abs(30.0 * share), 7.0), PALETTE[0])
-        canvas.draw_line([(x, y + 2.0), (x, y + 13.0)], road.SOFT, 1.0)
-        canvas.draw_text((x, y - 6.0), f"{torque:+.0f} N m", INK, 12, 0.5)
 
 
 def _draw_directions(
@@ -241,12 +226,12 @@ def draw_picture(
         name: Name of its driver.
         ghosts: Name and state of each ghost.
     """
-    p, _, switches, _, config, trace, _, draw_world = shot
+    (p, _, switches, _, config, *_), trace, _, draw_world = shot
     now = trace.rows[-1]
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
     first = max(now[TRACE_POINT.t] - span, 0.0)
     truth, estimates = trace.select_since(first)
-    shades = _choose_shades(estimates)
+    shades = {label: find_colour(label) for label in estimates}
     scene = road.make_car_scene(shot)
     ghost_cars = [
         road.CarTrack(road.make_car_scene(ghost), ghost.trace.select_since(first)[0], GREY, label)
@@ -274,16 +259,6 @@ def draw_picture(
         motions = [item.scene.motion for item in ghost_cars]
         picture.blit(draw_world((int(_ROAD[2]), int(_ROAD[3])), motions), _ROAD[:2])
     return picture
-
-
-def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
-    """Choose a colour for each estimator: its own unless another has it."""
-    shades: dict[str, str] = {}
-    for label in labels:
-        colour = find_colour(label)
-        free = (choice for choice in (colour, *PALETTE) if choice not in shades.values())
-        shades[label] = next(free, colour)
-    return shades
 
 
 def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, str]) -> None:

@@ -63,7 +63,7 @@ class _RenderMixin:
 
         n, render_state = self.control_period, self.make_render_state(0)
         interval = n * max(-(-_TICKS_PER_FRAME // n), 1)
-        if int(render_state.state[Z.clock.tick]) % interval == 0:
+        if int(render_state.episode.state[Z.clock.tick]) % interval == 0:
             self._has_shown = True
             show_picture(draw_picture(render_state), 1.0 / (interval * TICK))
 
@@ -72,12 +72,11 @@ class _RenderMixin:
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(getattr(self, "num_envs", 1))]
         episode, trace = self._get_episode(row), self._traces[row]
-        render_state = RenderState(*episode[:5], trace, self._has_tyre_forces, self._draw_world)
-        if not render_state.params[P.car.m] > 0.0:
+        if not episode.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
         if not trace.rows:
-            trace.add(render_state.report, render_state.state)
-        return render_state
+            trace.add(episode.report, episode.state)
+        return RenderState(episode, trace, self._has_tyre_forces, self._draw_world)
 
     def _render_frames(self) -> tuple[Frame, ...] | None:
         """Draw a frame of each car; None in a window and without a render mode."""

@@ -19,7 +19,6 @@ from ..record import Array
 from ..scenarios import road as tracks
 from ..scenarios.driver import compute_wind
 from ..sensors.camera.analytic import compute_lane_quality
-from ..vehicle.actuators import compute_torque_limit
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import LINEAR, compute_lateral_forces, compute_tyres
@@ -31,8 +30,7 @@ _make_step_params, _make_step_variant = as_python(make_step_params), as_python(m
 _compute_static_load, _compute_tyres = as_python(compute_static_load), as_python(compute_tyres)
 _compute_lateral_forces = as_python(compute_lateral_forces)
 _apply_tyre_change, _compute_gravity = as_python(apply_tyre_change), as_python(compute_gravity)
-_compute_torque_limit, _compute_wind = as_python(compute_torque_limit), as_python(compute_wind)
-_compute_lane_quality = as_python(compute_lane_quality)
+_compute_lane_quality, _compute_wind = as_python(compute_lane_quality), as_python(compute_wind)
 _step_nominal_car = as_python(tracks.step_nominal_car)
 _compute_curvature = as_python(compute_curvature, ARRAYS)
 _compute_path_offset = as_python(tracks.compute_path_offset, ARRAYS)
@@ -50,15 +48,12 @@ class _Body(NamedTuple):
 
     @property
     def outline(self) -> Array:
-        """A box with elliptic corners, longer at the front: points in car axes (m), (n, 2)."""
+        """A box with bevelled corners, more at the front: points in car axes (m), (8, 2)."""
         front, rear, half = self
-        turn = np.linspace(0.0, 0.5 * np.pi, 6)
-        corners = []
-        for sign, x, a, b in ((1, front, 0.45, 0.4), (-1, rear, 0.2, 0.25)):
-            a, b = min(a, 0.3 * (front - rear)), min(b, 0.7 * half)
-            corner = x - sign * a * (1.0 - np.cos(turn)), half - b * (1.0 - np.sin(turn))
-            corners.append(np.stack(corner, 1)[::sign])
-        left = np.concatenate(corners)
+        left = np.array([
+            (front, 0.6 * half), (front - 0.1 * (front - rear), half), (rear + 0.2, half),
+            (rear, 0.8 * half),
+        ])  # fmt: skip
         return np.concatenate([left, left[::-1] * (1.0, -1.0)])
 
 
@@ -93,8 +88,6 @@ class CarScene(NamedTuple):
 
     motion: Motion
     vehicle: Vehicle
-    torques: tuple[float, float]  # N m, left and right motor
-    max_torque: float  # N m, of one motor
     wheels: tuple[_Wheel, ...]  # front left and right, rear left and right
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
@@ -112,7 +105,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
     Args:
         shot: State of the car.
     """
-    p, z, switches, _, config, _, has_tyre_forces, _ = shot
+    p, z, switches, _, config, *_ = shot.episode
     params, variant = _make_step_params(p), _make_step_variant(p, switches)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), float(z[Z.clock.tick])
     car = _apply_tyre_change(params.car, params.tyre_change, tick >= params.tyre_change.tick)
@@ -129,7 +122,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
     for place, F_wx, F_wy, tyre in zip(places, longitudinal, lateral, tyres, strict=True):
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if variant.law == LINEAR else math.hypot(tyre.limit, F_wx)
-        forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
+        forces = (F_wx, F_wy, capacity) if shot.has_tyre_forces else (0.0, 0.0, 0.0)
         wheels.append(_Wheel(*place, *forces))
     lanes, view, overlay = _find_lanes(params.path, config), read(p, P.field_of_view), None
     s = np.arange(motion.s - _KNOWN_LENGTH, motion.s + _KNOWN_LENGTH, 0.5) if lanes else np.empty(0)
@@ -140,8 +133,6 @@ def make_car_scene(shot: RenderState) -> CarScene:
     return CarScene(
         motion,
         config.vehicle,
-        (float(drive.T_l), float(drive.T_r)),
-        float(_compute_torque_limit(motion.v_x, car)),
         tuple(wheels),
         0.5 * float(car.mu + car.mu_r),
         float(_compute_wind(tick, params.wind)[0]),
@@ -343,15 +334,11 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
 
 def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str) -> None:
     """Draw a car by the projection of its axes."""
-    body = front, rear, half = compute_body(scene.vehicle)
+    body = compute_body(scene.vehicle)
     for wheel in scene.wheels:  # further out than they are, to be seen
-        shown = wheel._replace(y=np.sign(wheel.y) * half)
+        shown = wheel._replace(y=np.sign(wheel.y) * body.half)
         canvas.draw_polygon(project(shown.outline(scene.vehicle.wheel_radius)), _TYRE)
     canvas.draw_polygon(project(body.outline), colour)
-    shares = ((0.62, 0.86), (0.74, 0.72)), ((0.14, 0.74), (0.21, 0.86))  # of length and width
-    for corners in np.array(shares) * (front - rear, half) + (rear, 0.0):
-        window = np.concatenate([corners, corners[::-1] * (1.0, -1.0)])
-        canvas.draw_polygon(project(window), mix_colours(INK, colour, 0.55))
 
 
 def compute_body(vehicle: Vehicle) -> _Body:

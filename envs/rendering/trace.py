@@ -4,10 +4,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ..engine.config import EpisodeConfig
 from ..engine.layout import Z
+from ..engine.views import Episode
 from ..record import Array
 from ..task import REPORT
 from ..vehicle.dynamics import Motion
@@ -100,11 +99,7 @@ RoadPainter = Callable[[tuple[int, int], list[Motion]], "pygame.Surface"]
 class RenderState(NamedTuple):
     """State that a picture is drawn from: an episode's packed numbers and its recorded steps."""
 
-    params: Array  # of `engine.layout`
-    state: Array
-    switches: npt.NDArray[np.int64]
-    report: Array
-    config: EpisodeConfig
+    episode: Episode
     trace: EpisodeTrace
     has_tyre_forces: bool = True  # its tyres are those of our plant
     world: RoadPainter | None = None  # draws the road instead

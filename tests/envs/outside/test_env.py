@@ -46,7 +46,7 @@ def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
     assert frame is not None and frame.std() > 10.0
     scene = make_car_scene(env.make_render_state())
     assert [wheel[3:] for wheel in scene.wheels] == [(0.0, 0.0, 0.0)] * 4
-    assert scene.motion == env.motion and scene.torques[1] > 0.0
+    assert scene.motion == env.motion
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -75,13 +75,6 @@ def test_gymnasiums_wrappers(no_warnings: None, tmp_path: Path) -> None:
     assert len(films) >= 2 and min(films) > 5000
 
 
-def test_frames_are_collected(no_warnings: None) -> None:
-    env = gym.make("sideslip/YawVision-v0", **SHORT, render_mode="rgb_array_list")
-    env.reset(seed=0)
-    env.step(np.zeros(1, np.float32))
-    assert [frame.shape for frame in env.render()] == [FRAME] * 2  # type: ignore[union-attr]
-
-
 def test_stable_baselines_records_what_its_own_function_makes(
     no_warnings: None, tmp_path: Path
 ) -> None:
