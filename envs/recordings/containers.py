@@ -219,44 +219,29 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
         from cantools.database import DecodeError
 
     database = _load_database(dbc)
-    names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
-    short = [name.partition(".")[2] for name in names]
     messages: dict[tuple[int, bool], tuple[Any, dict[str, str]]] = {}
     channels, units = dict[str, _Channel](), dict[str, str]()
     absent: dict[str, set[Any]] = {}  # values that say there is none, by label
-    named = {name.partition(".")[2] for name in names if is_wanted(name)}  # MESSAGE.SIGNAL decides
-    for message in database.messages:
-        wanted = {}
-        for signal in message.signals:
-            label = f"{message.name}.{signal.name}"
-            if not is_wanted(label):
-                label = signal.name
-                if signal.name in named or not is_wanted(label):
-                    continue
-                if short.count(label) > 1:
-                    both = [x for x in names if x.endswith(f".{label}")]
-                    raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
-            wanted[signal.name], channels[label] = label, _Channel()
-            choices: Mapping[int, object] = signal.choices or {}
-            raws = [raw for raw, text in choices.items() if _NO_VALUE.search(str(text))]
-            scale = signal.conversion.raw_to_scaled
-            absent[label] = {scale(raw, decode_choices=False) for raw in raws}
-            units[label] = find_unit(signal.unit or "")
-        if wanted:
-            messages[message.frame_id, message.is_extended_frame] = message, wanted
-    seen_ids, n_short, n_absent, cut = set[int](), 0, 0, ""
-    buses: dict[tuple[int, bool], set[object]] = {}
+    for label, (message, signal) in _choose_signals(database, is_wanted).items():
+        key = message.frame_id, message.is_extended_frame
+        messages.setdefault(key, (message, {}))[1][signal.name] = label
+        choices, scale = signal.choices or {}, signal.conversion.raw_to_scaled
+        raws = [raw for raw, text in choices.items() if _NO_VALUE.search(str(text))]
+        absent[label] = {scale(raw, decode_choices=False) for raw in raws}
+        units[label], channels[label] = find_unit(signal.unit or ""), _Channel()
+    seen_ids, n_short, n_absent, damage = set[int](), 0, 0, ""
+    buses: dict[tuple[int, bool], set[str]] = {}
     try:
         frames = getattr(can, reader)(path)
         if getattr(frames, "file_size", 0) > path.stat().st_size:
-            cut = "it is shorter than it says"
+            damage = "it is shorter than it says"
         for frame in frames:
             seen_ids.add(frame.arbitration_id)
             key = frame.arbitration_id, frame.is_extended_id
             if key not in messages or frame.is_error_frame or frame.is_remote_frame:
                 continue
-            message, wanted = messages[key]
-            buses.setdefault(key, set()).add(frame.channel)
+            message, labels = messages[key]
+            buses.setdefault(key, set()).add(str(frame.channel))
             try:
                 decoded = message.decode(bytes(frame.data), decode_choices=False)
             except DecodeError:
@@ -264,32 +249,51 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
             if not decoded or len(frame.data) != frame.dlc:
                 n_short += 1
                 continue
-            for name, label in wanted.items():
-                if name in decoded and decoded[name] in absent[label]:
+            for name in labels.keys() & decoded.keys():  # a multiplexed one is not in every frame
+                label, value = labels[name], decoded[name]
+                if value in absent[label]:
                     n_absent += 1
-                elif name in decoded:  # a multiplexed one is not in every frame
+                else:
                     channels[label].stamps.append(frame.timestamp)
-                    channels[label].values.append(float(decoded[name]))
+                    channels[label].values.append(float(value))
     except Exception as error:  # of python-can anything, where a file is damaged
         if not any(channel.stamps for channel in channels.values()):
             raise
-        cut = str(error) or type(error).__name__
-    damage = f"the trace is cut or damaged, and read up to there: {cut}"
-    shortage = f"{n_short} frames are shorter than {dbc} says, and left out"
-    remarks = [f"WARNING: {text}." for text, is_so in ((damage, cut), (shortage, n_short)) if is_so]
-    if n_absent:
-        remarks.append(f"{n_absent} values that {dbc} calls not available are left out.")
+        damage = str(error) or type(error).__name__
     for (number, _), bus_names in buses.items():
         if len(bus_names) > 1:
-            text = join_names(sorted(map(str, bus_names)))
+            text = join_names(sorted(bus_names))
             raise ValueError(f"0x{number:x} is on several buses: {text}; write a trace of one")
     sent = [message for message in database.messages if message.frame_id in seen_ids]
     if seen_ids and not sent:
         ids = ", ".join(f"0x{x:x}" for x in sorted(seen_ids)[:4])
         raise ValueError(f"none of its {len(seen_ids)} ids ({ids}, ...) is in {dbc}")
+    remarks = {
+        f"WARNING: the trace is cut or damaged, and read up to there: {damage}.": damage,
+        f"WARNING: {n_short} frames are shorter than {dbc} says, and left out.": n_short,
+        f"{n_absent} values that {dbc} calls not available are left out.": n_absent,
+    }
     columns = {name: (x.stamps, x.values) for name, x in channels.items() if x.stamps}
     names = [f"{message.name}.{signal.name}" for message in sent for signal in message.signals]
-    return _join_channels(columns, units, names)._replace(remarks=remarks)
+    said = [text for text, is_so in remarks.items() if is_so]
+    return _join_channels(columns, units, names)._replace(remarks=said)
+
+
+def _choose_signals(
+    database: "Database", is_wanted: Callable[[str], bool]
+) -> dict[str, tuple[Any, Any]]:
+    """Choose the wanted (message, signal) by MESSAGE.SIGNAL, which decides, or by the name."""
+    signals = {f"{m.name}.{s.name}": (m, s) for m in database.messages for s in m.signals}
+    chosen = {label: pair for label, pair in signals.items() if is_wanted(label)}
+    decided = {signal.name for _, signal in chosen.values()}
+    for message, signal in signals.values():
+        if signal.name in decided or not is_wanted(signal.name):
+            continue
+        if signal.name in chosen:
+            both = [label for label in signals if label.endswith(f".{signal.name}")]
+            raise ValueError(f"signals share a name; --map one of {', '.join(both)}")
+        chosen[signal.name] = message, signal
+    return chosen
 
 
 def _load_database(dbc: str) -> "Database":
