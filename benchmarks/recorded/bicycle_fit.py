@@ -22,9 +22,11 @@ from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, PlantVariant, TyreInputs, compute_tyre_load
 from .motion import LoggedMotion
+from .quality import find_saturated
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 _BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
+_REACH = _BURN + _WINDOW + 2.0 * _MARGIN  # s, of the rows from a window's start on
 _MIN_SPEED = 4.0  # m/s, in a window
 _ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
 _STRETCHES = 40  # at most, of the log, which the intervals take for independent
@@ -55,77 +57,11 @@ PRIOR = Theta(0.4, 0.4, 0.2, 0.05, 0.01, 0.01, 0.5, 0.1, 0.1, 0.1, 0.3)
 inertia, one of I/(m l_f l_r), is narrow: with both stiffnesses it leaves the yaw rate as it is."""
 
 
-@dataclass(frozen=True)
-class Windows:
-    """Drives on the fit's grid and where windows start on it."""
-
-    # smoothed gyro, accel_y, speed, steering, left and right torque (these three acted until their
-    # row), the integral of the gyro, the GPS's course less that, NaN without a fix: shape (8, n)
-    rows: Array
-    starts: npt.NDArray[np.int64]  # first row of each window, shape (count,)
-    stretch: npt.NDArray[np.int64]  # stretch of the log of each window, shape (count,)
-    dt: float  # step (s)
-    accel: bool  # whether the acceleration was logged
-    course: bool  # whether a window has fixes
-    tyres: str = "linear"  # law in `TYRE_LAWS`; the body rolls where they are not linear
-    centre: Theta = _STATED  # means of the priors
-    spread: Theta = PRIOR  # standard deviations of the priors
-
-    @property
-    def scored_rows(self) -> npt.NDArray[np.int64]:
-        """Places of the rows that count, shape (count, rows)."""
-        first, count = round(_BURN / self.dt), round(_WINDOW / self.dt)
-        return self.starts[:, None] + np.arange(first + 1, first + count + 1)
-
-
-def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
-    """Make windows of drives of one dt.
-
-    Args:
-        logs: Recorded drives, at least one.
-        left_out: Mask of each drive's rows that are not used, shape (rows,).
-    """
-    dt, first = logs[0].record.dt, 0
-    every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
-    before, after = (round(s / (every * dt)) for s in (_MARGIN, _BURN + _WINDOW + 2.0 * _MARGIN))
-    pieces, starts = [], []
-    for log, out in zip(logs, left_out, strict=True):
-        fast, motion = log.record.fast.T, LoggedMotion(log)
-        rows = np.stack([
-            fast[FAST.gyro], fast[FAST.accel_y], motion.speed, fast[FAST.steer],
-            fast[FAST.torque_left], fast[FAST.torque_right], motion.heading,
-            np.zeros(len(log.time)),
-        ])  # fmt: skip
-        rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
-        if every > 1:  # an input acts for the whole step up to its row
-            rows[3:6] = uniform_filter1d(rows[3:6], every, axis=1, origin=(every - 1) // 2)
-        bad = np.maximum.reduceat(out, np.arange(0, len(out), every))
-        rows = rows[:, ::every]
-        rows[7] = _compute_courses(log, every, rows.shape[1])
-        for start in range(before, rows.shape[1] - after, round(_WINDOW / (every * dt))):
-            piece = slice(start, start + after)
-            if not bad[piece].any() and rows[2, piece].min() >= _MIN_SPEED:
-                starts.append(first + start)
-        first += rows.shape[1]
-        pieces.append(rows)
-    count = len(starts)
-    stretch = np.arange(count) * min(_STRETCHES, count) // max(count, 1)
-    accel = all("accel_y" in log.record.present for log in logs)
-    rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
-    windows = Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel, False)
-    return replace(windows, course=bool(np.isfinite(rows[7][windows.scored_rows]).any()))
-
-
-def _compute_courses(log: Log, every: int, count: int) -> Array:
-    """The GPS's course less the gyro's integral (rad), NaN in rows without a fix, (count,)."""
-    courses = np.full(count, np.nan)
-    packets = log.record.select_packets("gps")
-    fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
-    places = fixes[:, PACKET.captured] - log.record.first
-    turned = np.interp(places, np.arange(len(log.time)), LoggedMotion(log).heading)
-    near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
-    courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
-    return courses
+_FIXED = (  # fields of the car that the simulation reads, in this order
+    "mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness",
+    "front_track", "rear_track", "wheel_radius", "friction", "roll_moment_arm", "roll_inertia",
+    "roll_stiffness", "roll_damping", "gravity_height", "antenna_ahead",
+)  # fmt: skip
 
 
 @jit
@@ -174,67 +110,129 @@ def _simulate_windows(
             out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
 
-def simulate_windows(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """Drive the model through each window with the logged speed and steering.
-
-    Args:
-        car: Stated car.
-        theta: Parameters.
-        w: Windows.
-
-    Returns:
-        Yaw rate (rad/s), lateral specific force (m/s2) and sideslip angle of the antenna (rad) from
-        the row behind each start on, shape (3, windows, rows).
-    """
-    rows = sum(round(seconds / w.dt) for seconds in (_BURN, _WINDOW, _MARGIN))
-    out = np.empty((3, len(w.starts), rows))
-    fixed = np.array([
-        car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
-        car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
-        car.roll_moment_arm, car.roll_inertia, car.roll_stiffness, car.roll_damping,
-        car.gravity_height, car.antenna_ahead,
-    ])  # fmt: skip
-    law = TYRE_LAWS.index(w.tyres)
-    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, w.dt, out)
-    return out
+def _compute_courses(log: Log, every: int, count: int) -> Array:
+    """The GPS's course less the gyro's integral (rad), NaN in rows without a fix, (count,)."""
+    courses = np.full(count, np.nan)
+    packets = log.record.select_packets("gps")
+    fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
+    places = fixes[:, PACKET.captured] - log.record.first
+    turned = np.interp(places, np.arange(len(log.time)), LoggedMotion(log).heading)
+    near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
+    courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
+    return courses
 
 
-def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """Compute measured less predicted channels.
+@dataclass(frozen=True)
+class Windows:
+    """A stated car's drives on the fit's grid and where windows start on it."""
 
-    Args:
-        car: Stated car.
-        theta: Parameters.
-        w: Windows.
+    car: Vehicle
+    # smoothed gyro, accel_y, speed, steering, left and right torque (these three acted until their
+    # row), the integral of the gyro, the GPS's course less that, NaN without a fix: shape (8, n)
+    rows: Array
+    starts: npt.NDArray[np.int64]  # first row of each window, shape (count,)
+    stretch: npt.NDArray[np.int64]  # stretch of the log of each window, shape (count,)
+    dt: float  # step (s)
+    accel: bool  # whether the acceleration was logged
+    course: bool = False  # whether a window has fixes
+    tyres: str = "linear"  # law in `TYRE_LAWS`; the body rolls where they are not linear
+    centre: Theta = _STATED  # means of the priors
+    spread: Theta = PRIOR  # standard deviations of the priors
 
-    Returns:
-        Yaw rate (rad/s) and, if logged, acceleration (m/s2) and course (rad), which begins anew in
-        each window and is 0 in rows without a fix, shape (windows, channels, rows).
-    """
-    first, count = round(_BURN / w.dt), round(_WINDOW / w.dt)
-    out = simulate_windows(car, theta, w)
+    @classmethod
+    def from_logs(cls, logs: Sequence[Log], car: Vehicle) -> "Windows":
+        """Make windows of drives of one dt, without rows in which the gyro is at its limit.
 
-    def interpolate_late(values: Array, delay: float) -> Array:
-        places = np.arange(first, first + count) - delay / w.dt
-        below = np.clip(places.astype(np.int64), 0, out.shape[2] - 2)
-        step = values[:, below + 1] - values[:, below]
-        return np.asarray(values[:, below] + (places - below) * step)
+        Args:
+            logs: Recorded drives, at least one.
+            car: Stated car.
+        """
+        dt, first, pieces, starts = logs[0].record.dt, 0, [], []
+        every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
+        before, after = (round(seconds / (every * dt)) for seconds in (_MARGIN, _REACH))
+        for log in logs:
+            fast, motion = log.record.fast.T, LoggedMotion(log)
+            rows = np.stack([
+                fast[FAST.gyro], fast[FAST.accel_y], motion.speed, fast[FAST.steer],
+                fast[FAST.torque_left], fast[FAST.torque_right], motion.heading,
+                np.zeros(len(log.time)),
+            ])  # fmt: skip
+            rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
+            if every > 1:  # an input acts for the whole step up to its row
+                rows[3:6] = uniform_filter1d(rows[3:6], every, axis=1, origin=(every - 1) // 2)
+            bad = np.maximum.reduceat(find_saturated(log), np.arange(0, len(log.time), every))
+            rows = rows[:, ::every]
+            rows[7] = _compute_courses(log, every, rows.shape[1])
+            for start in range(before, rows.shape[1] - after, round(_WINDOW / (every * dt))):
+                piece = slice(start, start + after)
+                if not bad[piece].any() and rows[2, piece].min() >= _MIN_SPEED:
+                    starts.append(first + start)
+            first += rows.shape[1]
+            pieces.append(rows)
+        count = len(starts)
+        stretch = np.arange(count) * min(_STRETCHES, count) // max(count, 1)
+        accel = all("accel_y" in log.record.present for log in logs)
+        rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
+        windows = cls(car, rows, np.array(starts, np.int64), stretch, every * dt, accel)
+        return replace(windows, course=bool(np.isfinite(rows[7][windows.scored_rows]).any()))
 
-    rate = w.rows[0][w.scored_rows] - out[0, :, first : first + count] - theta.gyro_bias
-    channels = [rate]
-    if w.accel:
-        felt = theta.accel_gain * interpolate_late(out[1], theta.accel_delay) + theta.accel_bias
-        channels.append(w.rows[1][w.scored_rows] - felt)
-    if w.course:
-        turned = w.rows[6][w.starts[:, None] + np.arange(1, out.shape[2] + 1)]
-        moved = out[2] + turned - theta.gyro_bias * w.dt * np.arange(out.shape[2])
-        course = w.rows[7][w.scored_rows] + w.rows[6][w.scored_rows]
-        course = course - interpolate_late(moved, theta.gps_delay)
-        fixes = np.isfinite(course)
-        course = np.where(fixes, course, 0.0)
-        middle = course.sum(axis=1) / np.maximum(fixes.sum(axis=1), 1)
-        channels.append(np.where(fixes, course - middle[:, None], 0.0))
-    return np.stack(channels, axis=1)
+    @property
+    def scored_rows(self) -> npt.NDArray[np.int64]:
+        """Places of the rows that count, shape (count, rows)."""
+        first, count = round(_BURN / self.dt), round(_WINDOW / self.dt)
+        return self.starts[:, None] + np.arange(first + 1, first + count + 1)
+
+    def simulate(self, theta: Theta) -> Array:
+        """Drive the model through each window with the logged speed and steering.
+
+        Args:
+            theta: Parameters.
+
+        Returns:
+            Yaw rate (rad/s), lateral specific force (m/s2) and sideslip angle of the antenna (rad)
+            from the row behind each start on, shape (3, windows, rows).
+        """
+        rows = sum(round(seconds / self.dt) for seconds in (_BURN, _WINDOW, _MARGIN))
+        out = np.empty((3, len(self.starts), rows))
+        fixed = np.array([getattr(self.car, name) for name in _FIXED])
+        law = TYRE_LAWS.index(self.tyres)
+        _simulate_windows(self.rows, self.starts, np.array(theta), fixed, law, self.dt, out)
+        return out
+
+    def compute_residual(self, theta: Theta) -> Array:
+        """Compute measured less predicted channels.
+
+        Args:
+            theta: Parameters.
+
+        Returns:
+            Yaw rate (rad/s) and, if logged, acceleration (m/s2) and course (rad), which begins anew
+            in each window and is 0 in rows without a fix, shape (windows, channels, rows).
+        """
+        first, count = round(_BURN / self.dt), round(_WINDOW / self.dt)
+        out, places = self.simulate(theta), self.scored_rows
+
+        def interpolate_late(values: Array, delay: float) -> Array:
+            late = np.arange(first, first + count) - delay / self.dt
+            below = np.clip(late.astype(np.int64), 0, out.shape[2] - 2)
+            step = values[:, below + 1] - values[:, below]
+            return np.asarray(values[:, below] + (late - below) * step)
+
+        rate = self.rows[0][places] - out[0, :, first : first + count] - theta.gyro_bias
+        channels = [rate]
+        if self.accel:
+            felt = theta.accel_gain * interpolate_late(out[1], theta.accel_delay) + theta.accel_bias
+            channels.append(self.rows[1][places] - felt)
+        if self.course:
+            turned = self.rows[6][self.starts[:, None] + np.arange(1, out.shape[2] + 1)]
+            moved = out[2] + turned - theta.gyro_bias * self.dt * np.arange(out.shape[2])
+            course = self.rows[7][places] + self.rows[6][places]
+            course = course - interpolate_late(moved, theta.gps_delay)
+            fixes = np.isfinite(course)
+            course = np.where(fixes, course, 0.0)
+            middle = course.sum(axis=1) / np.maximum(fixes.sum(axis=1), 1)
+            channels.append(np.where(fixes, course - middle[:, None], 0.0))
+        return np.stack(channels, axis=1)
 
 
 @dataclass(frozen=True)
@@ -289,13 +287,10 @@ def _estimate_noise_levels(left: Array, dt: float) -> Array:
     return np.asarray(np.max(levels, axis=0))
 
 
-def fit(
-    car: Vehicle, w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None
-) -> BicycleFit:
+def fit(w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None) -> BicycleFit:
     """Fit parameters by least squares.
 
     Args:
-        car: Stated car.
         w: Windows.
         start: Parameters where the search starts.
         free: Names of those that are fitted.
@@ -309,7 +304,7 @@ def fit(
         return start._replace(**dict(zip(free, x.tolist(), strict=True)))
 
     def compute_weighted(x: Array, scale: Array) -> Array:
-        left = compute_residual(car, make_theta(x), w) / scale[:, None]
+        left = w.compute_residual(make_theta(x)) / scale[:, None]
         return np.concatenate([left.ravel(), (x - centre) / sd])
 
     def jacobian(x: Array, scale: Array) -> Array:
@@ -320,7 +315,7 @@ def fit(
     for max_evaluations in (60,) if scale is not None else (10, 10, 60):
         now = scale
         if now is None:
-            now = _estimate_noise_levels(compute_residual(car, make_theta(x), w), w.dt)
+            now = _estimate_noise_levels(w.compute_residual(make_theta(x)), w.dt)
         solution = least_squares(
             compute_weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,),
             max_nfev=max_evaluations, xtol=1e-6, ftol=1e-7,

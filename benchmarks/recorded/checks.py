@@ -21,26 +21,9 @@ from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
 from ...estimators.wires import SignalCalibration, apply_wires
-from .motion import (
-    COURSE,
-    MIN_SPEED,
-    LoggedMotion,
-    collect_fixes,
-    estimate_slips,
-    find_latency,
-)
-from .quality import (
-    BLOCKER,
-    FACTOR,
-    MIN_TURNING,
-    OK,
-    WARNING,
-    LogFinding,
-    compute_course_steps,
-    estimate_resolution,
-    find_contradictions,
-    smooth_columns,
-)
+from . import quality
+from .motion import COURSE, MIN_SPEED, FixDifferences, LoggedMotion, estimate_slips
+from .quality import BLOCKER, FACTOR, MIN_TURNING, OK, WARNING, LogFinding
 
 _ALLOWED = dict(FILTERS["joint"].options)  # standard deviations of what `joint` finds by itself
 _DEGREES = 180.0 / math.pi
@@ -69,9 +52,10 @@ class InspectedDrive:
     logs: Sequence[Log]  # calibrated parts
     car: Vehicle
     wires: SignalCalibration = field(default_factory=SignalCalibration)  # of the parts
-    contradictions: Sequence[LogFinding] = field(init=False)
 
-    def __post_init__(self) -> None:
+    @functools.cached_property
+    def contradictions(self) -> list[LogFinding]:
+        """Findings of columns that do not fit together."""
         ratio = _divide_speeds(self.logs)
         logs, of_speed = self.logs, list[LogFinding]()
         if not 1.0 / FACTOR < ratio < FACTOR and not math.isnan(ratio):
@@ -80,17 +64,17 @@ class InspectedDrive:
             logs = [copy.deepcopy(log) for log in logs]
             for log in logs:
                 log.record.fast[:, [FAST.wheel_left, FAST.wheel_right]] /= ratio
-        findings = find_contradictions(logs, self.car) if logs else []
+        findings = quality.find_contradictions(logs, self.car) if logs else []
         late = self._find_lateness(logs) if any(map(_is_course, findings)) else 0.0
         if late:  # a late course does not follow the gyro, but later it does
             shifted = [apply_wires(log, SignalCalibration(latency={"gps": late})) for log in logs]
-            aligned = find_contradictions(shifted, self.car)
+            aligned = quality.find_contradictions(shifted, self.car)
             findings = findings if any(map(_is_course, aligned)) else aligned
-        self.contradictions = of_speed + list(map(self._compose_cure, findings))
+        return of_speed + list(map(self._compose_cure, findings))
 
     def _compose_cure(self, finding: LogFinding) -> LogFinding:
         """Put what is stated already into a cure of the steering: an option replaces it."""
-        if finding.channel != "steering" or finding.check not in ("sign", "ratio"):
+        if finding.channel != "steer" or finding.check not in ("sign", "ratio"):
             return finding
         cure = f"--steering-sign {-self.wires.sign}"
         if finding.check == "ratio":
@@ -101,8 +85,8 @@ class InspectedDrive:
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
-        blocks = collect_fixes(logs, COURSE, None, _TIMES)
-        late = find_latency(blocks, _TIMES, 0.0)[0] if blocks else 0.0
+        fixes = FixDifferences.from_logs(logs, COURSE, None, _TIMES)
+        late = fixes.find_latency(0.0)[0] if fixes.blocks else 0.0
         return late if 0.0 < late < _TIMES[-2] else 0.0
 
     @functools.cached_property
@@ -232,8 +216,10 @@ def _check_stuck(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
     if not drive.judged:
         return
-    _, _, change, turned, slipped = compute_course_steps(drive.judged, 1.0)
-    turning, accel, slipping = smooth_columns(drive.judged, "turning", "accel_y", "slipping")
+    _, _, change, turned, slipped = quality.compute_course_steps(drive.judged, 1.0)
+    turning, accel, slipping = quality.smooth_columns(
+        drive.judged, "turning", "accel_y", "slipping"
+    )
     roll = drive.car.roll_moment_arm  # N m a m/s2, by which the body leans into gravity
     leaning = 1.0 + GRAVITY * roll / (drive.car.roll_stiffness - GRAVITY * roll)
     scales = {
@@ -263,7 +249,7 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
         bias = float(np.mean(gyro))
     else:
         lag, where = 4.0, "beside the course"
-        _, _, change, turned, slipped = compute_course_steps(drive.judged, lag)
+        _, _, change, turned, slipped = quality.compute_course_steps(drive.judged, lag)
         if len(change) >= 20:
             bias = float(np.median(turned + slipped - change)) / lag
     limit = 2.0 * _ALLOWED["bias_sd"]
@@ -272,7 +258,7 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     if not drive.judged:
         return
     names = ("turning", "accel_y", "slipping", "speed", "steer")
-    turning, accel, slipping, speed, steer = smooth_columns(drive.judged, *names)
+    turning, accel, slipping, speed, steer = quality.smooth_columns(drive.judged, *names)
     if len(turning) < 20:
         return
     if accel.any():
@@ -292,12 +278,13 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
     slips = [log.truth["beta"] for log in drive.judged]
-    blocks = collect_fixes(drive.judged, COURSE, slips, _TIMES)
-    if not blocks:
+    fixes = FixDifferences.from_logs(drive.judged, COURSE, slips, _TIMES)
+    if not fixes.blocks:
         return
-    half = len(blocks) // 2
-    late = find_latency(blocks, _TIMES, 1.0)
-    first, last = (find_latency(x, _TIMES, 1.0) for x in (blocks[:half], blocks[half:]))
+    half = len(fixes.blocks) // 2
+    late = fixes.find_latency(1.0)
+    halves = fixes.blocks[:half], fixes.blocks[half:]
+    first, last = (fixes._replace(blocks=blocks).find_latency(1.0) for blocks in halves)
     text = f"{late[0]:.2f} +- {late[1]:.2f} s later than the gyro"
     stated = drive.wires.latency.get("gps", 0.0)
     cure = f"--latency gps={stated + late[0]:.2f}" if stated + late[0] > 0.0 else "mend its stamps"
@@ -313,7 +300,7 @@ def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
         column = drive.values.get(name, np.zeros(0))
         column = column[np.isfinite(column)] * (abs(drive.wires.gain) if name == "steer" else 1.0)
         if len(column):
-            step, is_angle = estimate_resolution(column), name not in ("accel_y", "speed_x")
+            step, is_angle = quality.estimate_resolution(column), name not in ("accel_y", "speed_x")
             limit = math.sqrt(12.0) * noise
             shown = (x * (_DEGREES if is_angle else 1.0) for x in (step, limit))
             unit = {"yaw_rate": "deg/s", "accel_y": "m/s2", "speed_x": "m/s"}.get(name, "deg")

@@ -19,16 +19,7 @@ from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.verdict import format_verdict
 from . import quality
-from .bicycle_fit import (
-    PRIOR,
-    BicycleFit,
-    Theta,
-    Windows,
-    compute_residual,
-    fit,
-    make_windows,
-    simulate_windows,
-)
+from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, fit
 from .motion import (
     LATE_WITHIN,
     WIDE,
@@ -100,7 +91,7 @@ def identify(
     if "gps" in stated.at:
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
     result = IdentificationResult(car, stated)
-    w = make_windows(logs, [quality.find_saturated(log) for log in logs])
+    w = Windows.from_logs(logs, car)
     gain, related = quality.estimate_steering_gain(logs, car)
     if reason := _find_reason(w, related):
         result.reason = reason
@@ -157,15 +148,15 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     if len(laws) > 1 and peak_accel > _MAX_FRICTION_SHARE * car.friction * GRAVITY:
         laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
     by_law = [replace(w, tyres=law) for law in laws]
-    fits = [(windows, fit(car, windows, w.centre, free)) for windows in by_law]
+    fits = [(windows, fit(windows, w.centre, free)) for windows in by_law]
     scale = fits[0][1].scale  # one for all laws
-    w, base = min(fits, key=lambda pair: np.linalg.norm(_evaluate_folds(car, *pair) / scale))
-    rows, best, free_too = _fit_latencies(car, w, base)
+    w, base = min(fits, key=lambda pair: np.linalg.norm(_evaluate_folds(*pair) / scale))
+    rows, best, free_too = _fit_latencies(w, base)
     theta, gain = best.theta, best.theta.gain
     factors = {key: math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()}
     values = {key: getattr(car, key) * factor for key, factor in factors.items()}
     fitted = car.replace(**values, name=f"{car.name}-identified")
-    result.findings = _make_car_findings(car, stated, w, (best, free_too), held, peak_accel) + rows
+    result.findings = _make_car_findings(stated, w, (best, free_too), held, peak_accel) + rows
     share = fitted.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
     if not POSSIBLE[0] <= share <= POSSIBLE[1]:
         low, high = POSSIBLE
@@ -181,9 +172,9 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     steering = 1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset
     result.wires = SignalCalibration(*steering, late, at=stated.at)
     first = Theta(gain=stated.gain, offset=stated.offset)
-    residuals = [compute_residual(car, parameters, w) for parameters in (first, theta)]
+    residuals = [w.compute_residual(parameters) for parameters in (first, theta)]
     rates = [float(np.sqrt(np.mean(left**2, axis=(0, 2)))[0]) for left in residuals]
-    result.rates = (*rates, float(_evaluate_folds(car, w, best)[0]))
+    result.rates = (*rates, float(_evaluate_folds(w, best)[0]))
     result.remarks.append(
         f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than "
         f"{peak_accel:.1f} m/s2; "
@@ -194,29 +185,27 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     )  # fmt: skip
 
 
-def _fit_latencies(
-    car: Vehicle, w: Windows, base: BicycleFit
-) -> tuple[list[Finding], BicycleFit, BicycleFit]:
+def _fit_latencies(w: Windows, base: BicycleFit) -> tuple[list[Finding], BicycleFit, BicycleFit]:
     """Findings of both latencies, the fit with those that pay, and the one with all free."""
     names = tuple(_DELAYS)[: 2 if w.accel else 1]
-    usual, pays, rows = np.linalg.norm(_evaluate_folds(car, w, base) / base.scale), [], []
-    free = fit(car, w, base.theta, (*base.free, *names), base.scale)
+    usual, pays, rows = np.linalg.norm(_evaluate_folds(w, base) / base.scale), [], []
+    free = fit(w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.halves[name], float(getattr(free.theta, name))
         is_determined, remark = half < LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
-            single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
-            share = np.linalg.norm(_evaluate_folds(car, w, single_fit) / base.scale) / usual
+            single_fit = fit(w, base.theta, (*base.free, name), base.scale)
+            share = np.linalg.norm(_evaluate_folds(w, single_fit) / base.scale) / usual
             pays += [name] if share < _MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
         text = remark if is_determined else WIDE
         rows.append(Finding(label, 0.0, value, half, "s", is_determined, text))
-    best = fit(car, w, base.theta, (*base.free, *pays), base.scale) if pays else base
+    best = fit(w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
 
 
-def _evaluate_folds(car: Vehicle, w: Windows, best: BicycleFit) -> Array:
+def _evaluate_folds(w: Windows, best: BicycleFit) -> Array:
     """RMS of the residual of each channel, on each fold of stretches by the fit to the others."""
     squares, labels = [], np.unique(w.stretch)
     for fold in range(_FOLDS):
@@ -225,12 +214,11 @@ def _evaluate_folds(car: Vehicle, w: Windows, best: BicycleFit) -> Array:
         inside = w.stretch % _FOLDS == fold
         fold_windows = replace(w, starts=w.starts[inside], stretch=w.stretch[inside])
         theta = best.theta._replace(**moved)
-        squares.append(np.mean(compute_residual(car, theta, fold_windows) ** 2, axis=2))
+        squares.append(np.mean(fold_windows.compute_residual(theta) ** 2, axis=2))
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0)))
 
 
 def _make_car_findings(
-    car: Vehicle,
     stated: SignalCalibration,
     w: Windows,
     fits: tuple[BicycleFit, BicycleFit],
@@ -239,7 +227,7 @@ def _make_car_findings(
 ) -> list[Finding]:
     """Findings of `_list_parameters`; intervals with the shift by free latencies in fit 2."""
     findings, (best, free) = [], fits
-    for name, label, value, unit in _list_parameters(car, stated):
+    for name, label, value, unit in _list_parameters(w.car, stated):
         at = float(getattr(best.theta, name))
         half = math.hypot(best.halves.get(name, math.inf), float(getattr(free.theta, name)) - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
@@ -390,7 +378,7 @@ def _make_validation_table(
     odd, even = _split_blocks(moved)
     wires = wires and wires._replace(at={})
     result = identify(odd, car, wires, tyres)
-    w = make_windows(even, [quality.find_saturated(log) for log in even]) if even else None
+    w = Windows.from_logs(even, car) if even else None
     reason = result.reason
     if w is None or not len(w.starts):
         reason = reason or "no window of 5 s is held out"
@@ -402,14 +390,14 @@ def _make_validation_table(
     if reason or result.theta is None or w is None:
         return ResultTable(title, columns, [], f"Not validated: {reason}.", keyed=False)
     w = replace(w, tyres=result.tyres)
-    places, residual = w.scored_rows, compute_residual(car, result.theta, w)
+    places, residual = w.scored_rows, w.compute_residual(result.theta)
     rows = zip([*_CORRIDORS][: 2 if w.accel else 1], w.rows, residual.swapaxes(0, 1), strict=False)
     measured = {name: (row[places], row[places] - left) for name, row, left in rows}
     if all("beta" in log.truth for log in even):
         every = round(w.dt / even[0].record.dt)
         truth = np.concatenate([log.truth["beta"][::every] for log in even])
         # with the antenna at the centre of gravity its sideslip angle is the car's
-        slip = simulate_windows(car.replace(antenna_ahead=0.0), result.theta, w)[2]
+        slip = replace(w, car=car.replace(antenna_ahead=0.0)).simulate(result.theta)[2]
         if np.isfinite(truth[places]).any():
             measured["sideslip angle"] = truth[places], slip[:, places[0] - w.starts[0] - 1]
     cells = [_compare(name, *pair) for name, pair in measured.items()]

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from ...envs.recordings.containers import LogSource
 
 FILTER = "joint"
-_SCREEN_ROWS = 12  # findings on the screen; all are in the report
 _DEGREES = 180.0 / math.pi
 _PLOTTED = ("speed_x", "yaw_rate", "accel_y", "steer", "course")
 _SHOWN_UNITS = {"rad": ("deg", _DEGREES), "radps": ("deg/s", _DEGREES), "mps": ("m/s", 1.0),
@@ -54,9 +53,8 @@ class Prediction(NamedTuple):
     deviation: Array  # its standard deviation (rad), shape (n,)
     usual: float  # median of the deviation where the car moves (rad)
     nis: float  # mean squared innovation over its variance, NaN without slow samples
-    learnt: dict[str, tuple[float, float]]  # deviation of each constant, at start and end
+    learnt: list[str]  # labels of constants that the log tells
     unseen: tuple[str, ...]  # what its sensors cannot see
-    error: float  # RMS beside the log's own sideslip angle (rad), NaN without
 
 
 def inspect_file(
@@ -135,18 +133,13 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
     used = np.isfinite(estimates.nis)
     sensors = [SLOW_NAMES[int(i)] for i in log.record.packets[used, PACKET.sensor]]
-    learnt = {
-        name: (float(estimates.std[0, i]), float(estimates.std[-1, i]))
-        for i, name in enumerate(estimates.names)
-        if name in _LABELS
-    }
+    start, end = estimates.std[0], estimates.std[-1]
+    known = {_LABELS[x]: i for i, x in enumerate(estimates.names) if x in _LABELS}
+    learnt = [label for label, i in known.items() if end[i] < _LEARNT * start[i]]
     values = np.mean([len(MEASUREMENTS[sensor].rows) for sensor in sensors] or math.nan)
     nis = float(np.mean(estimates.nis[used]) / values) if sensors else math.nan
     beta = estimates.x[:, place]
-    wrong = (beta - log.truth.get("beta", np.full(len(beta), np.nan)))[moving]
-    known = wrong[np.isfinite(wrong)]
-    error = float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
-    return Prediction(log.time, beta, deviation, usual, nis, learnt, filter_.unobservable, error)
+    return Prediction(log.time, beta, deviation, usual, nis, learnt, filter_.unobservable)
 
 
 def _compose_verdict(
@@ -167,19 +160,13 @@ def _compose_verdict(
     deviation = prediction.usual * _DEGREES
     is_lost = prediction.nis > MAX_NIS
     worth = "worth little" if is_lost or prediction.usual > _USEFUL else "worth it"
-    also = [
-        _LABELS[name] for name, (at_first, at_last) in prediction.learnt.items()
-        if at_last < _LEARNT * at_first
-    ]  # fmt: skip
     unseen = f"; it cannot see {', '.join(prediction.unseen)}" if prediction.unseen else ""
-    beside = f" Beside the log's own angle it errs {prediction.error * _DEGREES:.2f} deg RMS."
-    beside = "" if math.isnan(prediction.error) else beside
     nis = {} if math.isnan(prediction.nis) else {FILTER: prediction.nis}
     return format_verdict(
         f"This log is {worth}: {FILTER} expects its sideslip angle within {deviation:.2f} deg "
         f"(one deviation, median), if the car is like {car.name}.",
-        f"It also tells: {', '.join(also) or 'nothing else'}{unseen}.",
-        f"{describe_innovations(nis)}{beside}".strip(),
+        f"It also tells: {', '.join(prediction.learnt) or 'nothing else'}{unseen}.",
+        describe_innovations(nis),
         tally,
     )
 
@@ -210,30 +197,25 @@ def _make_channels(values: dict[str, Array]) -> ResultTable:
 def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
     """Make the table of what is not OK, and one of all for the report."""
     columns = ("level", "channel", "what, and what mends it")
-    bad = [finding for finding in findings if finding.level != OK]
     cells = []
-    for finding in bad[:_SCREEN_ROWS]:
+    for finding in (finding for finding in findings if finding.level != OK):
         stop = "" if finding.text.endswith("?") else "."
         text = f"{finding.check}: {finding.text}{stop} -> {finding.cure}"
         cells.append([finding.level, finding.channel, text])
-    more = len(bad) - len(cells)
-    note = f"{more} more are in the report (--html). " if more > 0 else ""
-    note += f"{len(findings) - len(bad)} findings are OK."
+    note = f"{len(findings) - len(cells)} findings are OK."
     heads = ("check", "level", "channel", "what", "what mends it")
     rows = list(map(dataclasses.astuple, findings))
     complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
     shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
-    return [*([shown] if bad else []), complete]
+    return [*([shown] if cells else []), complete]
 
 
 def _draw_figures(
     values: dict[str, Array], prediction: Prediction | None
 ) -> list[tuple[str, "Figure", str]]:
-    """Each channel over time, and the sideslip angle with its deviation; none without plotly."""
-    try:
-        from ..report.figures import draw_time_series
-    except ModuleNotFoundError:
-        return []
+    """Each channel over time, and the sideslip angle with its deviation."""
+    from ..report.figures import draw_time_series
+
     shown = []
     if prediction is not None:
         beta, margin = prediction.beta * _DEGREES, 1.96 * prediction.deviation * _DEGREES

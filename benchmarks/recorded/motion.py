@@ -89,88 +89,83 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def collect_fixes(
-    logs: Sequence[Log], value: int, slips: Sequence[Array] | None, times: Array
-) -> list[Array]:
-    """Collect the differences of successive fixes, for a latency.
+class FixDifferences(NamedTuple):
+    """Differences of successive fixes, beside those of the logged motion so much earlier."""
 
-    Args:
-        logs: Recorded drives; those without a GPS have no fixes.
-        value: Place in a fix's values, `COURSE` or `SPEED`.
-        slips: Sideslip angle (rad), shape (rows,), of which the value has a share; None: of none.
-        times: Latencies (s), shape (times,).
+    times: Array  # latencies (s), shape (times,)
+    # sums of d^2, d p, p^2 and 1, (4, times) each: d of differences less the logged motion's, p of
+    # the slip's; none for too few fixes
+    blocks: list[Array]
 
-    Returns:
-        Blocks of each log with sums of d^2, d p, p^2 and 1, shape (4, times) each: d of differences
-        less the logged motion's so much earlier, p of the slip's; none for too few fixes.
-    """
-    blocks = []
-    for i, log in enumerate(logs):
-        if "gps" in log.slow:
-            part = np.zeros(len(log.time)) if slips is None else slips[i]
-            blocks += _collect_blocks(log, value, part, times)
-    return blocks
+    @classmethod
+    def from_logs(
+        cls, logs: Sequence[Log], value: int, slips: Sequence[Array] | None, times: Array
+    ) -> "FixDifferences":
+        """Collect the differences in blocks of each log.
+
+        Args:
+            logs: Recorded drives; those without a GPS have no fixes.
+            value: Place in a fix's values, `COURSE` or `SPEED`.
+            slips: Sideslip angle (rad), shape (rows,), which the value has a share of; None: none.
+            times: Latencies (s), shape (times,).
+        """
+        blocks = []
+        for i, log in enumerate(logs):
+            motion, packets = LoggedMotion(log), log.record.select_packets("gps")
+            signal = motion.heading if value == COURSE else motion.speed
+            part = np.zeros(len(signal)) if slips is None else slips[i]
+            packets = packets[packets[:, PACKET.quality] > 0.0]
+            if len(packets) <= BLOCKS:
+                continue
+            rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(1.0 * len(part))
+            earlier = rows[:, None] - times / log.record.dt
+            known = packets[:, PACKET.value + value, None]
+            d = np.diff(known - np.interp(earlier, place, signal), axis=0)
+            if value == COURSE:
+                d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
+            p = np.diff(np.interp(earlier, place, part), axis=0)
+            usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
+            inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
+            used = usual & inside & np.isfinite(d).all(axis=1)
+            if np.count_nonzero(used) >= BLOCKS:
+                d, p = d[used] - np.median(d[used], axis=0), p[used]  # less the gyro's bias
+                sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
+                blocks += [x.sum(axis=1) for x in np.array_split(sums, BLOCKS, axis=1)]
+        return cls(times, blocks)
+
+    def find_latency(self, share: float | None = None) -> tuple[float, float]:
+        """Find the latency that leaves least, and half of its 95 % interval (s).
+
+        Args:
+            share: Share of the slip in the values, None: the one that leaves least.
+        """
+
+        def find_minimum(sums: Array) -> float:  # between the samples by a parabola
+            lefts = _compute_remainder(sums, share)
+            i = int(np.clip(np.argmin(lefts), 1, len(lefts) - 2))
+            left, middle, right = lefts[i - 1 : i + 2]
+            bend = left - 2.0 * middle + right
+            beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+            return float(self.times[i] + beside * (self.times[1] - self.times[0]))
+
+        return jackknife(np.array(self.blocks), find_minimum)
+
+    def estimate_noise(self, late: float) -> tuple[float, float]:
+        """Estimate the fixes' standard deviation, and half of its 95 % interval.
+
+        Args:
+            late: Latency (s).
+        """
+        at = int(np.argmin(np.abs(self.times - late)))
+        blocks = np.array(self.blocks)  # a difference has twice the variance
+        return jackknife(blocks, lambda sums: math.sqrt(0.5 * _compute_remainder(sums, None)[at]))
 
 
-def _collect_blocks(log: Log, value: int, part: Array, times: Array) -> list[Array]:
-    signal = LoggedMotion(log).heading if value == COURSE else LoggedMotion(log).speed
-    packets = log.record.select_packets("gps")
-    packets = packets[packets[:, PACKET.quality] > 0.0]
-    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
-    earlier = rows[:, None] - times / log.record.dt
-    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
-    if value == COURSE:
-        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
-    p = np.diff(np.interp(earlier, place, part), axis=0)
-    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
-    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
-    used = usual & inside & np.isfinite(d).all(axis=1)
-    if np.count_nonzero(used) < BLOCKS:
-        return []
-    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
-    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
-    return [block.sum(axis=1) for block in np.array_split(sums, BLOCKS, axis=1)]
-
-
-def compute_remainder(sums: Array, share: float | None = None) -> Array:
-    """Compute the mean squares that are left of the differences of fixes.
-
-    Args:
-        sums: Sums of `collect_fixes`, shape (4, times).
-        share: Share of the part in the values, None: the best one.
-
-    Returns:
-        Mean squares, shape (times,).
-    """
+def _compute_remainder(sums: Array, share: float | None) -> Array:
+    """Compute the mean squares that are left of the differences of fixes, shape (times,)."""
     square, product, part_square, count = sums
     shares = product / np.maximum(part_square, 1e-12) if share is None else share
     return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
-
-
-def find_latency(
-    blocks: Sequence[Array], times: Array, share: float | None = None
-) -> tuple[float, float]:
-    """Find the latency that leaves least.
-
-    Args:
-        blocks: Blocks of `collect_fixes`.
-        times: Their latencies (s), shape (times,).
-        share: Share of the part in the values, None: the one that leaves least.
-
-    Returns:
-        Latency and half of its 95 % interval (s).
-    """
-    return jackknife(np.array(blocks), lambda sums: _find_minimum(times, sums, share))
-
-
-def _find_minimum(times: Array, sums: Array, share: float | None) -> float:
-    """Find the latency (s) of the smallest remainder, between the samples by a parabola."""
-    lefts = compute_remainder(sums, share)
-    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
-    left, middle, right = lefts[i - 1 : i + 2]
-    bend = left - 2.0 * middle + right
-    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(times[i] + beside * (times[1] - times[0]))
 
 
 class Finding(NamedTuple):
@@ -223,24 +218,22 @@ def make_sensor_findings(
             findings.append(row)
             noise |= {NOISES[channel]: sd} if is_determined else {}
     times = np.arange(*_LATE, max(logs[0].record.dt, 0.01))
-    courses = collect_fixes(logs, COURSE, slips, times)
-    speeds = collect_fixes(logs, SPEED, None, times)
-    if not courses:
+    courses = FixDifferences.from_logs(logs, COURSE, slips, times)
+    speeds = FixDifferences.from_logs(logs, SPEED, None, times)
+    if not courses.blocks:
         return findings, noise, {}
-    late, half = find_latency(courses, times)
-    with_slip, _ = find_latency(courses, times, 1.0)  # had the slip its size
+    late, half = courses.find_latency()
+    with_slip, _ = courses.find_latency(1.0)  # had the slip its size
     half = math.hypot(half, late - with_slip)
     is_determined = half < LATE_WITHIN
     pays = is_determined and late > half
     remark = ("applied" if pays else "within its interval of 0") if is_determined else WIDE
     findings.append(Finding("latency of gps", 0.0, late, half, "s", is_determined, remark))
-    at = int(np.argmin(np.abs(times - late)))
-    for name, unit, scale, blocks in (
+    for name, unit, scale, fixes in (
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
-        if blocks:  # a difference has twice the variance
-            left = np.array(blocks)
-            sd, half = jackknife(left, lambda sums: math.sqrt(0.5 * compute_remainder(sums)[at]))
-            row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
-            findings, noise = [*findings, row], noise | {NOISES[name]: sd}
+        if fixes.blocks:
+            noise[NOISES[name]], half = fixes.estimate_noise(late)
+            sd = scale * noise[NOISES[name]]
+            findings.append(Finding(f"noise of {name}", math.nan, sd, scale * half, unit, True))
     return findings, noise, {"gps": late} if pays else {}

@@ -20,7 +20,7 @@ from ...envs.io import atomic_file
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.recordings.dialect import to_metres
-from ...envs.recordings.nmea import HOUR, Counts, Epoch
+from ...envs.recordings.nmea import Counts, Epoch
 from ...envs.recordings.sources import read_nmea
 from ...envs.sensors.slow import COURSE_SPEED, HDOP_LAWS
 from ...envs.validation import Mask
@@ -49,7 +49,6 @@ class _Track(NamedTuple):
     course: Array
     speed: Array
     hdop: Array
-    satellites: Array
 
 
 def _make_track(epochs: Sequence[Epoch]) -> _Track:
@@ -67,8 +66,7 @@ def _make_track(epochs: Sequence[Epoch]) -> _Track:
     now = dict(zip(Epoch._fields, columns, strict=True))
     origin = (float(now["latitude"][0]), float(now["longitude"][0])) if shown else (0.0, 0.0)
     east, north = to_metres(now["latitude"], now["longitude"], origin)
-    course, *others = (now[name] for name in ("course", "speed", "hdop", "satellites"))
-    return _Track(origin, now["t"], east, north, course, *others)
+    return _Track(origin, now["t"], east, north, now["course"], now["speed"], now["hdop"])
 
 
 class _Signal(NamedTuple):
@@ -237,12 +235,8 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     """
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
-    step = np.diff(track.t)
-    set_anew = np.abs(step) >= HOUR  # a clock that was set, or a pause
-    parts = f" in {set_anew.sum() + 1} parts" if set_anew.any() else ""
     text = (
-        f"{step[~set_anew].sum():.0f} s with {len(track.t)} fixes{parts}; HDOP {middle:.1f}, from "
-        f"{low:.1f} to {high:.1f} in 90 % of them; {np.median(track.satellites):.0f} satellites. "
+        f"{len(track.t)} fixes; HDOP {middle:.1f}, from {low:.1f} to {high:.1f} in 90 % of them. "
         "A filter with a constant rate, disturbed by white noise, predicts each fix from those "
         "before, where the car moves. Its two noises are those of maximum likelihood on the first "
         "half of the log; all numbers are of the second."

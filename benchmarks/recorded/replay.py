@@ -34,8 +34,8 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
     A log with slow sensors is replayed with those; else a GPS course is emulated where the log
     knows the true sideslip; else estimators that need one are left out. Without truth nothing is
-    scored, but drawn. Of rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick, value is
-    the median, low and high are the smallest and largest over the noises.
+    scored, but drawn. Of rmse (rad, from 2 s on) and ratio (over gyro-only), value is the median,
+    low and high are the smallest and largest over the noises.
 
     Args:
         log: Recorded drive.
@@ -188,7 +188,7 @@ def _add_rows(
     del plain["figures"], plain["emulated"]  # these move no number
     spec = json.dumps({"vehicle": car.to_dict(), "settings": plain})
     records = {}
-    for name, cost in result.cost.items():
+    for name in result.traces:
         record: dict[str, Any] = {"estimator": name, "n": 1}
         if name in result.scores:
             scores = result.scores[name]
@@ -198,7 +198,7 @@ def _add_rows(
                 record[column.key] = compute_range(values)
         if name in result.nis:
             record["nis"] = result.nis[name]
-        records[name] = record | {"us_per_tick": cost}
+        records[name] = record
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
     return [records[name] for name in result.rank_by_score() or records]
@@ -208,14 +208,13 @@ def _make_table(
     result: ReplayResult, records: Sequence[Any], name: str, noises: int
 ) -> ResultTable:
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
-    cost = Column("us_per_tick", "us per tick", form=".3f")
     if not result.scores:
-        columns = "estimator", Column("nis", "NIS of a value", form=".2f"), cost
+        columns = "estimator", Column("nis", "NIS of a value", form=".2f")
         return ResultTable(f"{name}: no truth, no score", columns, records, note)
     rmse = Column("rmse", "RMSE / deg [least, most]", DEGREES, ".3f")
     ratio = Column("ratio", "of gyro only", form=".2f", interval=False)
     title = f"{name}: error of the sideslip angle (median of {noises} noises)"
-    return ResultTable(title, ("estimator", rmse, ratio, *HONESTY, cost), records, note)
+    return ResultTable(title, ("estimator", rmse, ratio, *HONESTY), records, note)
 
 
 def _draw_figures(suite: Suite, result: ReplayResult, log: Log) -> None:

@@ -5,7 +5,6 @@ A drive with truth and without a slow sensor gets a GPS course made of the truth
 
 import dataclasses
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -73,16 +72,11 @@ class Settings:
             raise ValueError(f"course_rate must be positive, got {self.course_rate} Hz")
 
 
-def emulate_course(log: Log, settings: Settings, seed: int) -> Log:
-    """Return the log with a GPS that measures the course alone.
+def _emulate_course(log: Log, settings: Settings, seed: int) -> Log:
+    """Add a GPS that measures the course alone to a log with truth.
 
     course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
     ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
-
-    Args:
-        log: Recorded drive with the truth; ValueError for one that is slower than the course.
-        settings: Settings of the course.
-        seed: Seed of its noise.
     """
     record, motion, beta = log.record, LoggedMotion(log), log.truth["beta"]
     if settings.course_rate * record.dt > 1.0 + 1e-6:
@@ -119,7 +113,7 @@ def make_drives(log: Log, settings: Settings) -> list[Log]:
         raise ValueError(f"{log.name}: {text}")
     drives, fast = [log], log.record.fast.copy()
     if settings.emulated and "beta" in log.truth and not log.slow:
-        drives = [emulate_course(log, settings, settings.seed + i) for i in range(settings.seeds)]
+        drives = [_emulate_course(log, settings, settings.seed + i) for i in range(settings.seeds)]
     fast[:, FAST.gyro] += math.radians(settings.gyro_bias_degps)
     records = [dataclasses.replace(drive.record, fast=fast) for drive in drives]
     pairs = zip(drives, records, strict=True)
@@ -134,7 +128,6 @@ class ReplayResult:
     # score, shape (seeds, 4); empty without truth
     scores: dict[str, Array] = field(default_factory=dict)
     nis: dict[str, float] = field(default_factory=dict)  # mean, a value of a packet; first seed
-    cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
     traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
     remarks: dict[str, str] = field(default_factory=dict)  # why it is left out, or what it misses
 
@@ -205,11 +198,8 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) 
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
         numbers = []
-        for drive in (log, *drives):  # the first run designs the gains
-            start = time.process_time()
+        for drive in drives:
             estimates = estimator.run(drive)
-            spent = (time.process_time() - start) / len(counts) * 1e6
-            result.cost[name] = min(spent, result.cost.get(name, math.inf))
             place = estimates.names.index("beta")
             result.traces.setdefault(name, estimates.x[:, place])
             if slow is not None and np.isfinite(estimates.nis).any():
@@ -220,7 +210,7 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) 
                 honesty = compute_honesty(wrong, estimates.std[counts, place])
                 numbers.append((np.mean(wrong**2), *honesty))
         if truth is not None:
-            result.scores[name] = np.array(numbers[1:])
+            result.scores[name] = np.array(numbers)
     return result
 
 

@@ -10,6 +10,8 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Array, Log
 from sideslip.envs.vehicle.parameters import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
 
+from .simulated import decimated
+
 EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace
 NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0407}
 
@@ -47,36 +49,19 @@ def steering_trace(rng: np.random.Generator, duration: float, amplitude: float) 
 def scenario_of(car: Vehicle) -> dict[str, Any]:
     """Disturbed drives of this car after a steering trace, which is to be added."""
     return {
-        "base": "random-steering",
-        "steering": "trace",
-        "trace_step": STEP,
-        "surge_frequency": 0.05,
-        "half_width": 1e4,
-        "disturbance_force": 150.0,
-        "disturbance_moment": 150.0,
-        "front_stiffness": 1.0,
-        "rear_stiffness": 1.0,
+        "base": "random-steering", "steering": "trace", "trace_step": STEP, "half_width": 1e4,
+        "surge_frequency": 0.05, "disturbance_force": 150.0, "disturbance_moment": 150.0,
+        "front_stiffness": 1.0, "rear_stiffness": 1.0,
         "vehicle": {name: getattr(car, name) for name in (*LATERAL_FIELDS, "sprung_mass")},
-    }
+    }  # fmt: skip
 
 
 def simulate(scenario: dict[str, Any], seed: int) -> Log:
     """A drive at 100 Hz whose GPS packets bear the time of their arrival."""
     env: Any = gym.make("sideslip/YawGps-v0", scenario=scenario, vehicle="passenger-car")
-    log = rollout(env, seed=seed).log
-    whole = log.record.fast[1:]
-    fast = whole[EVERY - 1 :: EVERY].copy()
-    rows = len(fast)
-    fast[:, FAST.steer] = whole[: rows * EVERY, FAST.steer].reshape(-1, EVERY).mean(axis=1)
-    packets = log.record.select_packets("gps").copy()
-    arrived = np.ceil(packets[:, PACKET.arrived] / EVERY)
-    packets[:, PACKET.captured] = packets[:, PACKET.arrived] = arrived
-    packets = packets[(arrived >= 1) & (arrived <= rows)]
-    record = dataclasses.replace(
-        log.record, fast=fast, packets=packets, first=1, dt=EVERY * log.record.dt
-    )
-    truth = {"beta": log.truth["beta"][1:][EVERY - 1 :: EVERY][:rows]}
-    return dataclasses.replace(log, record=record, slow={"gps": log.slow["gps"]}, truth=truth)
+    log = decimated(rollout(env, seed=seed).log)
+    log.record.packets[:, PACKET.captured] = log.record.packets[:, PACKET.arrived]
+    return log
 
 
 def without(log: Log, accel: bool, course: bool) -> Log:
@@ -121,13 +106,10 @@ def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float
             break
     noisy = np.exp(rng.uniform(np.log(0.5), np.log(4.0)))
     scenario = scenario_of(car) | {
-        "speed": speed,
-        "surge": surge,
-        "friction": rng.uniform(0.8, 1.0),
-        "gyro_bias": rng.uniform(-0.005, 0.005),
-        "gps_latency": round(rng.uniform(0.1, 0.3), 2),
+        "speed": speed, "surge": surge, "friction": rng.uniform(0.8, 1.0),
+        "gyro_bias": rng.uniform(-0.005, 0.005), "gps_latency": round(rng.uniform(0.1, 0.3), 2),
         "noise": {name: noisy * size for name, size in NOISE.items()},
-    }
+    }  # fmt: skip
     kind = ("all", "no accel_y", "no course", "gyro alone")[seed % 4]
     logs = []
     for drive, lasts in enumerate((duration, held_out)):

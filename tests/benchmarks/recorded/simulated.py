@@ -63,13 +63,8 @@ def as_table(log: Log) -> pd.DataFrame:
     course = np.full(len(fast), np.nan)
     packets = log.record.packets
     course[(packets[:, PACKET.captured] - log.record.first).astype(int)] = packets[:, PACKET.value]
-    return pd.DataFrame(
-        {
-            "time_s": log.time,
-            "speed_x_mps": fast[:, FAST.wheel_left],
-            "yaw_rate_radps": fast[:, FAST.gyro],
-            "accel_y_mps2": fast[:, FAST.accel_y],
-            "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]),
-            "course_rad": course,
-        }
-    )
+    return pd.DataFrame({
+        "time_s": log.time, "speed_x_mps": fast[:, FAST.wheel_left],
+        "yaw_rate_radps": fast[:, FAST.gyro], "accel_y_mps2": fast[:, FAST.accel_y],
+        "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]), "course_rad": course,
+    })  # fmt: skip

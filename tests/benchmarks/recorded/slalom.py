@@ -1,10 +1,10 @@
 """A recorded slalom whose truth is known exactly."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR
@@ -30,14 +30,8 @@ def columns() -> dict[str, Array]:
 def saved(folder: Path, **changes: Array | None) -> Path:
     """The slalom as a CSV, with columns replaced, added, or (None) left out."""
     table = {name: c for name, c in (columns() | changes).items() if c is not None}
-    file = folder / "slalom.csv"
-    lines = [",".join("" if np.isnan(v) else repr(float(v)) for v in row) for row in _rows(table)]
-    file.write_text("\n".join([",".join(table), *lines]) + "\n")
-    return file
-
-
-def _rows(table: dict[str, Array]) -> Iterator[tuple[float, ...]]:
-    return zip(*table.values(), strict=True)
+    pd.DataFrame(table).to_csv(folder / "slalom.csv", index=False)
+    return folder / "slalom.csv"
 
 
 VEHICLE = """\

@@ -47,20 +47,13 @@ def drive(seed: int, duration: float = 12.0) -> tuple[Log, Vehicle]:
     small = seed % 3 == 2
     speed = rng.uniform(6.0, 10.0) if small else rng.uniform(12.0, 28.0)
     scenario: dict[str, Any] = {
-        "base": "random-steering",
-        "steering": MANOEUVRES[seed % len(MANOEUVRES)],
+        "base": "random-steering", "steering": MANOEUVRES[seed % len(MANOEUVRES)],
         "amplitude": rng.uniform(0.3, 1.0) * 0.03 * min(1.0, 14.0 / speed),
-        "frequency": rng.uniform(0.2, 0.6),
-        "duration": duration,
-        "speed": speed,
-        "surge": float(rng.choice([0.0, 0.7])),
-        "friction": (0.7, 1.0),
-        "front_stiffness": (0.7, 1.3),
-        "rear_stiffness": (0.8, 1.3),
-        "gyro_bias": (-0.005, 0.005),
+        "frequency": rng.uniform(0.2, 0.6), "duration": duration, "speed": speed,
+        "surge": float(rng.choice([0.0, 0.7])), "friction": (0.7, 1.0), "half_width": 1e4,
+        "front_stiffness": (0.7, 1.3), "rear_stiffness": (0.8, 1.3), "gyro_bias": (-0.005, 0.005),
         "gps_latency": float(rng.choice([0.0, 0.2])),
-        "half_width": 1e4,
-    }
+    }  # fmt: skip
     name = "coms" if small else "passenger-car"
     env: Any = gym.make(IDS[seed // 5 % 3], scenario=scenario, vehicle=name)
     return rollout(env, seed=seed).log, env.unwrapped.nominal

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.recorded.bicycle_fit import Theta, compute_residual, fit, make_windows
+from sideslip.benchmarks.recorded.bicycle_fit import Theta, Windows, fit
 from sideslip.benchmarks.recorded.identify import (
     IdentificationResult,
     _make_suite,
@@ -82,10 +82,10 @@ def test_the_start_does_not_matter_where_the_log_tells() -> None:
 def test_the_fit_is_exact_on_the_plant_itself() -> None:
     """What is left of the true car is the sensors' noise and the disturbances."""
     log, car = drive(2, disturbance_force=0.0, disturbance_moment=0.0)
-    w = dataclasses.replace(make_windows([log], [find_saturated(log)]), tyres="fiala")
-    found = fit(car, w, Theta(), ("front", "rear", "inertia"))
+    w = dataclasses.replace(Windows.from_logs([log], car), tyres="fiala")
+    found = fit(w, Theta(), ("front", "rear", "inertia"))
     assert np.abs(np.array(found.theta[:3])).max() < 0.02
-    rate, accel, *_ = np.sqrt(np.mean(compute_residual(car, Theta(), w) ** 2, axis=(0, 2)))
+    rate, accel, *_ = np.sqrt(np.mean(w.compute_residual(Theta()) ** 2, axis=(0, 2)))
     assert rate < 0.005 and accel < 0.11
 
 
@@ -164,9 +164,7 @@ def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
     assert (gyro[out] >= 0.9 * gyro.max() - 1e-12).sum() + (gyro[out] <= -0.3).sum() > 0
     assert not find_saturated(log).any()
     assert any(f"limit in {out.sum()} rows" in x.text for x in find_contradictions([clipped], car))
-    whole, less = (
-        len(make_windows([each], [find_saturated(each)]).starts) for each in (log, clipped)
-    )
+    whole, less = (len(Windows.from_logs([each], car).starts) for each in (log, clipped))
     assert less < whole
 
 

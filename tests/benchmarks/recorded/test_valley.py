@@ -17,12 +17,11 @@ from sideslip.benchmarks.recorded import identify as identification
 from sideslip.benchmarks.recorded.bicycle_fit import (
     BicycleFit,
     Theta,
+    Windows,
     _estimate_noise_levels,
     fit,
-    make_windows,
 )
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, IdentificationResult, identify
-from sideslip.benchmarks.recorded.quality import find_saturated
 from sideslip.benchmarks.recorded.scoring import Settings, run_estimators
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
@@ -47,15 +46,10 @@ def driven(car: Vehicle, quieter: float = 0.2) -> Log:
     """Mild random steering with sensors and disturbances that are quieter than usual."""
     trace = steering_trace(np.random.default_rng(3), 60.0, 0.02)
     changes = {
-        "speed": 20.0,
-        "surge": 0.7,
-        "duration": 60.0,
-        "trace": tuple(trace),
-        "gps_latency": 0.2,
+        "speed": 20.0, "surge": 0.7, "duration": 60.0, "trace": tuple(trace), "gps_latency": 0.2,
         "noise": {name: quieter * sd for name, sd in NOISE.items()},
-        "disturbance_force": 150.0 * quieter,
-        "disturbance_moment": 150.0 * quieter,
-    }
+        "disturbance_force": 150.0 * quieter, "disturbance_moment": 150.0 * quieter,
+    }  # fmt: skip
     return simulate(scenario_of(car) | changes, 5)
 
 
@@ -77,8 +71,8 @@ def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
 
 def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
     log = with_lagging_gyro(without(driven(NEUTRAL, 1.0), accel=True, course=True), 0.08)
-    w = dataclasses.replace(make_windows([log], [find_saturated(log)]), tyres="fiala")
-    found = fit(NEUTRAL, w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
+    w = dataclasses.replace(Windows.from_logs([log], NEUTRAL), tyres="fiala")
+    found = fit(w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
     for name, sd in (("front", 0.4), ("rear", 0.4), ("inertia", 0.2)):
         assert abs(getattr(found.theta, name)) < sd and found.halves[name] < 2.3 * sd, name
 
