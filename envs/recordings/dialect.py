@@ -161,37 +161,40 @@ KINDS = ("fresh", "held", "interpolated")
 """Values between a slow sensor's samples: samples too, the last one again, or a line."""
 LONGEST_GAP = 1.0  # s between values of a fast quantity that are joined by a line
 _COMPLETE = 0.75  # of the rows, above which a quantity is one of every row
+_SHUFFLED = 0.05  # of the rows, which step back in time
 _WRAP = 0.25  # s, by which a quantity's clock steps back where it began anew
 _MIN_INTERVALS = 5  # between samples, from which their period is found
 
 
 def find_samples(
-    values: dict[str, Array], needed: Collection[str], kinds: Mapping[str, str]
+    values: dict[str, Array], needed: Collection[str], kinds: Mapping[str, str], is_strict: bool
 ) -> list[str]:
     """Reduce a table to its samples, in the rows of the fastest needed quantity, in place.
 
-    Rows of which none has all needed quantities are sorted by time. A slow sensor's column that
-    repeats or interpolates its samples keeps these alone, where they have one period: the first of
-    each run of held ones, or the knots of the lines. A fast quantity that comes at regular gaps is
-    interpolated, up to `LONGEST_GAP`, but not at the ends. A slow sample between the rows moves to
-    the next: no estimator may have it before it was captured.
+    Rows that are shuffled, or of which none has all needed quantities, are sorted by time. A slow
+    sensor's column that repeats or interpolates its samples keeps these alone, where they have one
+    period: the first of each run of held ones, or the knots of the lines. A fast quantity that
+    comes at regular gaps is interpolated, up to `LONGEST_GAP`, but not at the ends. A slow sample
+    between the rows moves to the next: no estimator may have it before it was captured.
 
     Args:
         values: Quantities by name, (n,) each, angles in rad; NaN where unknown.
         needed: The quantities without which there is no drive.
         kinds: Of `KINDS`, by slow quantity, as far as they are known; others are recognised.
+        is_strict: Whether shuffled rows stay as they are.
     """
-    remarks = _sort_rows(values, needed) + _keep_samples(values, kinds)
+    remarks = _sort_rows(values, needed, is_strict) + _keep_samples(values, kinds)
     return remarks + _align_clocks(values, needed)
 
 
-def _sort_rows(values: dict[str, Array], needed: Collection[str]) -> list[str]:
-    """Sort rows of one sensor each; a row that has all needed quantities shows others."""
+def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
     time = values["time"]
     n_back = int((np.diff(time) < 0.0).sum())
-    if not n_back or np.isfinite([values[name] for name in needed]).all(0).any():
+    is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
+    is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
+    if not (is_merged or (is_shuffled and not is_strict)):
         return []
-    for name in (x for x in needed if x != "time"):
+    for name in [x for x in needed if x != "time"] if is_merged else ():
         rows = np.flatnonzero(np.isfinite(values[name]))
         steps = np.diff(time[rows])
         if 0 < np.count_nonzero(steps < -_WRAP) <= max(1.0, 0.001 * len(steps)):

@@ -206,7 +206,7 @@ def read_parts(
     truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only that is logged; 0 at
     0.5 m/s and below, NaN where unknown, left out where the log has neither.
 
-    Rows without a value in a column that must be complete, and rows whose
+    Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
     irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
     clock; longer ones, and a clock that is set back by more, divide the log, and parts under
@@ -279,8 +279,6 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     if dropped > len(time) / 2:
         text = f"stands still or steps back in {dropped} of {len(time)} rows"
         raise ValueError(f"time {text}: have its stamps lost digits?")
-    if typical > LONGEST_GAP:
-        raise ValueError(f"rows are {typical:.6g} s apart: --map time_ms=COLUMN or another unit?")
     if not pieces:
         text = f"lasts {_MIN_PART:g} s without a hole of {MAX_HOLE:g} s"
         raise ValueError(f"no part of the log {text}")

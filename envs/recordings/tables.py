@@ -134,7 +134,7 @@ def read_columns(
         raise ValueError(f"the log has {rows}; a drive needs two or more")
     values = {}
     for quantity, (place, name) in columns.items():
-        column = _convert_column(table, place, name)
+        column = _convert_column(table, place, name, remarks)
         if quantity in needed or not np.isnan(column).all():
             values[quantity] = column
     _check_complete(values, ["time"])
@@ -157,13 +157,13 @@ def read_quantities(
         source: Path of the table, or the table itself.
         mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
-        gaps: Quantities that may hold NaN; None: all but the time.
+        gaps: Quantities that may hold NaN; None: all but the time, and shuffled rows are sorted.
 
     Returns:
         Quantities by name, shape (n,) each, and sentences on how they were read.
     """
     values, kinds, remarks = read_columns(source, mapping, needed)
-    remarks += find_samples(values, needed, kinds)
+    remarks += find_samples(values, needed, kinds, gaps is not None)
     if gaps is not None:
         _check_complete(values, [name for name in values if name not in gaps])
     return values, remarks
@@ -240,8 +240,12 @@ def _find_columns(
     return columns
 
 
-def _convert_column(table: LogTable, place: int, name: str) -> Array:
-    """Convert a column to SI units; ValueError names the first value that is no finite number."""
+def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
+    """Convert a column to SI units; ValueError names the first value that is no finite number.
+
+    A time that is far off in its unit, but not in another since 1970, is read in that, which is
+    remarked.
+    """
     import pandas as pd
 
     column, label = table.frame.iloc[:, place], str(table.frame.columns[place])
@@ -255,7 +259,12 @@ def _convert_column(table: LogTable, place: int, name: str) -> Array:
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    _, factor, offset = parse_column_name(name)
+    quantity, factor, offset = parse_column_name(name)
+    if quantity == "time" and abs(values[0]) * factor > 1e11:
+        for unit, scale in COLUMNS["time"].items():
+            if 3e8 < values[0] * scale < 4e9:
+                factor = scale
+                remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
     values *= factor
     if offset:
         values += offset

@@ -70,6 +70,14 @@ def test_units_are_converted(tmp_path: Path) -> None:
     assert two.record.dt == pytest.approx(one.record.dt, rel=1e-9)
 
 
+@pytest.mark.parametrize("sep", [";", "\t"])
+def test_other_separators_and_parquet_give_the_same(tmp_path: Path, sep: str) -> None:
+    table = drive()
+    table.to_parquet(tmp_path / "drive.parquet")
+    here = read_log(saved(table, tmp_path, sep=sep)).record.fast
+    np.testing.assert_array_equal(here, read_log(tmp_path / "drive.parquet").record.fast)
+
+
 def test_a_mapping_renames_and_says_the_unit(tmp_path: Path) -> None:
     table = drive()
     table["GyroZ"] = table.pop("yaw_rate_radps") / DEG
@@ -168,6 +176,19 @@ def test_roll_rate_hdop_and_satellites_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(packets[:, PACKET.value + 4], table["gps_hdop_count"][5::20])
     np.testing.assert_array_equal(packets[:, PACKET.value + 5], [0, 2, 4, 6, 8])
     np.testing.assert_array_equal(packets[:, PACKET.quality], 1.0)  # few satellites or not
+
+
+def test_matlab_is_read_and_another_kind_named(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    table = drive()
+    path = tmp_path / "drive.mat"
+    savemat(path, {name: table[name].to_numpy() for name in table} | {"note": "x", "k": 3.0})
+    log, csv = read_log(path), read_log(saved(table, tmp_path))
+    np.testing.assert_array_equal(log.record.fast, csv.record.fast)
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(200))
+    with pytest.raises(ValueError, match=r"drive.mat: expected .*, but"):
+        read_log(path)
 
 
 @pytest.mark.parametrize(

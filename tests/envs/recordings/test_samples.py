@@ -188,6 +188,17 @@ def test_a_sample_never_stands_before_it_was_captured(tmp_path: Path) -> None:
         assert stands.min() > -1.01e-4 and stands.max() < 0.01
 
 
+def test_shuffled_rows_are_sorted_but_not_by_the_strict_reader(tmp_path: Path) -> None:
+    table = with_course()
+    path = saved(table.sample(frac=1.0, random_state=1), tmp_path)
+    (log,), remarks = read_parts(path)
+    np.testing.assert_array_equal(log.record.fast[:, FAST.gyro], table["yaw_rate_radps"])
+    np.testing.assert_array_equal(samples(log)[0], np.flatnonzero(table["course_deg"].notna()))
+    assert "they were sorted by it" in remarks[0] and len(remarks) == 1
+    with pytest.raises(ValueError, match="time runs backward"):
+        read_log(path)
+
+
 def test_columns_that_are_never_known_together(tmp_path: Path) -> None:
     table = drive(ROWS)
     table["speed_x_mps"] = table["speed_x_mps"].where((table.index % 10 == 0) & (table.index < 500))
