@@ -22,7 +22,7 @@ from .control.tasks import ControlTask
 from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 from .harness.stats import interval, ratio_of_roots
-from .papers import dakf_stability, double_layer, dual_rate, tie_vision_control, uneven_delay
+from .papers import dakf_stability, double_layer, dual_rate, tie_vision, uneven_delay
 from .papers.ledger import PaperFilter
 from .papers.manoeuvres import EstimationSimulation
 from .readme import check_driven, format_table, replace_table
@@ -100,7 +100,7 @@ SYSTEMS = (
         "tie-vision",
         Entry("two-dof", "multirate-residual-kf", {"filter": {}, "controller": {}}),  # untuned
         _RECOMMENDED_ENTRY,
-        _make_task("YawVision", tie_vision_control.FIG8, "zero-slip", control_period=1),
+        _make_task("YawVision", tie_vision.FIG8, "zero-slip", control_period=1),
         "rms_slip",
         "sideslip angle",
         common_entry=Entry("two-dof", REFERENCE_FILTER),

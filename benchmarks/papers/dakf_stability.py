@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from functools import partial
 
+from .dual_rate import compute_coms_ranks
 from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import Curves, EstimationSimulation, FollowingSimulation, PaperFigure
-from .theory import compute_coms_ranks
+from .manoeuvres import EstimationSimulation, FollowingSimulation
 
 PAPER = "dakf-stability"
 FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"
@@ -88,43 +88,4 @@ CLAIMS = (
         "sign, there is little slip to see, and no course while it is there."),
     claim("Fig. 9 (twin)", "with control the car tracks on the road too",
         *_make_tracking_parts(FIG9, None, None)),
-)
-
-_SLIP, _RATE = "sideslip angle / rad", "yaw rate / (rad/s)"
-figure = partial(PaperFigure, PAPER)
-FIGURES = (
-    *(
-        figure(f"{number} {panel}", name, draw, caption)
-        for name, number, caption in (
-            (FIG6, "Fig. 6", "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s."),
-            (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."))
-        for panel, draw in (
-            ("(a): sideslip angle", Curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
-            ("(b): course angle", Curves("course", "course angle / rad", ("truth", KF, DAKF))))
-    ),
-    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, Curves("beta", _SLIP),
-        "Straight on at 25 km/h: the direction that the DAKF cannot see fills up."),
-    *(
-        figure(f"Fig. 7 {panel}", FIG7, draw, caption)
-        for panel, draw, caption in (
-            ("(a): sideslip angle",
-                Curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
-                "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
-            ("(b): yaw rate", Curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
-                "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
-            ("(c): front steering angle",
-                Curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
-                "Behind the EPS motor's lag of 30 ms."),
-            ("(d): yaw moment",
-                Curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
-                "What the motors deliver."))
-    ),
-    *(
-        figure(f"Fig. 9 (twin) ({panel}): {text}: {agent}", FIG9,
-            Curves(signal, label, ("reference", agent)),
-            "Cornering by wire at 20 km/h, with everything that the plant has.")
-        for panel, agent, text, signal, label in (("a", WITHOUT, "sideslip angle", "beta", _SLIP),
-            ("b", WITHOUT, "yaw rate", "gamma", _RATE),
-            ("c", WITH, "sideslip angle", "beta", _SLIP), ("d", WITH, "yaw rate", "gamma", _RATE))
-    ),
 )

@@ -4,7 +4,7 @@ from functools import partial
 
 from ...estimators.filters import FILTERS
 from .ledger import Bound, Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import Curves, EstimationSimulation, PaperFigure
+from .manoeuvres import EstimationSimulation
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"
@@ -110,26 +110,4 @@ CLAIMS = (
         compare("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, quantity="phi"),
         compare("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_y"),
         compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")),
-)
-
-_SLIP, _SLIPS = "sideslip angle / rad", ("truth", LOB, THREE, PROPOSED)
-figure = partial(PaperFigure, PAPER)
-FIGURES = tuple(
-    figure(f"Fig. 9 ({panel}){twin}: {text}", name, draw, caption)
-    for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
-    for panel, text, draw, caption in (
-        ("a", "sideslip angle", Curves("beta", _SLIP, _SLIPS),
-            "Tyres: 7000 N/rad real, 10000 N/rad nominal."),
-        ("b", "sideslip angle between courses", Curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
-            "One second: five courses."),
-        ("c", "yaw angle", Curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
-            "At 1 kHz from 5 Hz."),
-        ("d", "roll angle", Curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
-            "The roll model is 30 % off."),
-        ("e", "longitudinal velocity",
-            Curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
-            "The front wheels are the kinematic filter's reference."),
-        ("f", "lateral velocity",
-            Curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
-            "Roll puts gravity into the accelerometer."))
 )

@@ -24,13 +24,11 @@ if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
 
 
-@dataclass
-class Example:
+class Example(NamedTuple):
     """Signals of the first seed, for figures."""
 
     time: Array  # s, (K,)
     curves: dict[str, dict[str, Array]]  # (K,) by subject (truth, reference, ...) and signal
-    packets: dict[str, Array] = field(default_factory=dict)  # (count, PACKET_WIDTH) by slow sensor
 
 
 @dataclass
@@ -152,9 +150,6 @@ class Claim:
         text: What is claimed.
         *parts: Numbers that show it.
         note: What was found, for the report.
-
-    Raises:
-        ValueError: There is no part.
     """
 
     def __init__(
@@ -209,7 +204,7 @@ SeedFunction = Callable[[int], tuple[Numbers, Example | None]]
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation with a unique name, whose seeds are split into cases."""
+    """A simulation with a unique name; `_prepare` makes the function that measures a seed."""
 
     size: ClassVar[int] = 5  # seeds of a case
     name: str
@@ -234,7 +229,6 @@ class Simulation:
         return SimulationResult(numbers, example)
 
     def _prepare(self) -> SeedFunction:
-        """Prepare a case: make the function that measures one of its seeds."""
         raise NotImplementedError
 
 
@@ -242,10 +236,10 @@ class Simulation:
 class Analysis(Simulation):
     """A computation without noise of sensors."""
 
-    function: SeedFunction
+    function: Callable[[int], Numbers]  # of a seed
 
     def _prepare(self) -> SeedFunction:
-        return self.function
+        return lambda seed: (self.function(seed), None)
 
 
 PAPER_TUNINGS: dict[str, dict[str, float]] = {

@@ -1,4 +1,4 @@
-"""Filters and controllers over the papers' manoeuvres, and the papers' figures."""
+"""Filters and controllers over the papers' manoeuvres."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,8 +19,6 @@ from . import ledger
 from .ledger import Example, Numbers, PaperFilter, SeedFunction, Simulation
 
 if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
-
     from ...estimators.estimator import Estimator
 
 
@@ -62,8 +60,7 @@ class EstimationSimulation(Simulation):
                 facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
                 std = compute_error_bound(record=log.record, **facts)
                 numbers["bound", "beta"] = _compute_settled_rms(std, log)
-            packets = {sensor: log.record.select_packets(sensor) for sensor in log.slow}
-            return numbers, Example(log.time, curves, packets)
+            return numbers, Example(log.time, curves)
 
         return measure_seed
 
@@ -95,7 +92,7 @@ def _compute_errors(
     return numbers
 
 
-SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
+SIGNALS = ("beta", "gamma", "yaw_moment")
 _ENTRIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "none": ("none", "", {}),
     "feedforward": ("feedforward", "", {}),
@@ -189,88 +186,3 @@ class FollowingSimulation(_AgentSimulation):
             "peak_beta": float(np.abs(drive["beta"]).max()),
             "saturated": float(np.mean(np.abs(drive["action_0"]) >= 1.0)),
         }
-
-
-def _compute_courses(example: Example, labels: Sequence[str]) -> dict[str, Array]:
-    """Compute the courses psi + beta, with the receiver's samples."""
-    curves = {name: example.curves[name] for name in labels}
-    series = {name: curve["psi"] + curve["beta"] for name, curve in curves.items()}
-    return series | {"measured": _extract_samples(example, "gps", 0)}
-
-
-def _select_offsets(example: Example, labels: Sequence[str]) -> dict[str, Array]:
-    """Select the lateral offsets, with the camera's held late samples."""
-    series = {name: example.curves[name]["y_l"] for name in labels}
-    return series | {"measured, held": _repeat_samples(_extract_samples(example, "camera", 1))}
-
-
-def _compute_delays(example: Example, _: Sequence[str]) -> dict[str, Array]:
-    """Compute the delay of the newest frame over the time of its capture."""
-    packets = example.packets["camera"]
-    late = np.full(len(example.time), np.nan)
-    ticks = packets[:, PACKET.captured].astype(int)
-    late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    return {"camera": _repeat_samples(late)}
-
-
-def _extract_samples(example: Example, sensor: str, row: int) -> Array:
-    """Extract a slow sensor's values at the ticks at which they arrive, NaN elsewhere."""
-    values = np.full(len(example.time), np.nan)
-    ticks = example.packets[sensor][:, PACKET.arrived].astype(int)
-    in_range = ticks < len(values)
-    values[ticks[in_range]] = example.packets[sensor][in_range, PACKET.value + row]
-    return values
-
-
-def _repeat_samples(values: Array) -> Array:
-    """Hold samples until the next one, as a controller without an estimator reads them."""
-    known = np.where(np.isnan(values), 0, np.arange(len(values)))
-    return values[np.maximum.accumulate(known)]
-
-
-_DERIVED = {"course": _compute_courses, "offset": _select_offsets, "delay": _compute_delays}
-_LOOPS = "magnitude"  # dB over Hz, on a logarithmic axis
-
-
-@dataclass(frozen=True)
-class Curves:
-    """What a figure shows over time: a signal of an example, or one of `_DERIVED`."""
-
-    signal: str
-    y_label: str
-    labels: Sequence[str] = ()  # subjects, none for all
-    window: tuple[float, float] | None = None  # s, None for all of the time
-    x_label: str = "time / s"
-
-    def draw(self, example: Example) -> "Figure":
-        """Draw the curves.
-
-        Args:
-            example: Signals of a seed.
-        """
-        from ..report.figures import draw_time_series
-
-        t, window = example.time, self.window
-        inside = (t >= window[0]) & (t <= window[1]) if window else np.ones(len(t), bool)
-        if self.signal in _DERIVED:
-            series = _DERIVED[self.signal](example, self.labels)
-        else:
-            curves = {name: example.curves.get(name, {}) for name in self.labels or example.curves}
-            series = {name: x[self.signal] for name, x in curves.items() if self.signal in x}
-        shown = {name: values[inside] for name, values in series.items()}
-        figure = draw_time_series(t[inside], shown, self.y_label, self.x_label, ("measured",))
-        if self.signal == _LOOPS:
-            ends = np.log10(t[[0, -1]])
-            figure.update_xaxes(type="log", range=[float(end) for end in ends])
-        return figure
-
-
-@dataclass(frozen=True)
-class PaperFigure:
-    """One figure of a paper, redrawn."""
-
-    paper: str
-    title: str
-    scenario: str  # name of the simulation
-    curves: Curves
-    caption: str  # what to see

@@ -1,6 +1,7 @@
-"""Which claims of the five papers hold? Each with what was measured, its verdict and figures."""
+"""Which claims of the five papers hold? Each with what was measured, and its verdict."""
 
 from collections import Counter
+from itertools import product
 from types import ModuleType
 from typing import NamedTuple
 
@@ -8,20 +9,22 @@ from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
-from . import dakf_stability, double_layer, dual_rate, theory, tie_vision_control, uneven_delay
-from . import tie_vision_estimation as tie_vision
-from . import tie_vision_theory as tie_vision_convergence
+from . import (
+    dakf_stability,
+    double_layer,
+    dual_rate,
+    tie_vision,
+    tie_vision_theory,
+    uneven_delay,
+)
 from .ledger import Claim, Example, MeasuredClaim, MeasuredPart, Simulation, SimulationResult
-from .manoeuvres import PaperFigure
 
 _MODULES = (
-    tie_vision, tie_vision_control, tie_vision_convergence, uneven_delay, double_layer, dual_rate,
-    theory, dakf_stability,
+    tie_vision, tie_vision_theory, uneven_delay, double_layer, dual_rate, dakf_stability,
 )  # fmt: skip
 
 SIMULATIONS: dict[str, Simulation] = {x.name: x for y in _MODULES for x in y.SIMULATIONS}
 CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
-FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
 
 NAME = "papers"
 
@@ -136,11 +139,17 @@ def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
     return missed if False in checked else "met" if checked else ""
 
 
-def _add_figures(suite: Suite, results: LedgerResults, _: ModuleType) -> None:
-    for figure in FIGURES:
-        if (example := results.examples[figure.scenario]) is not None:
-            title = f"{figure.paper} {figure.title}"
-            suite.figures.append((title, figure.curves.draw(example), figure.caption))
+_SIGNALS = {"beta": "sideslip angle / rad", "yaw_moment": "yaw moment / (N m)"}
+
+
+def _add_figures(suite: Suite, results: LedgerResults, draw: ModuleType) -> None:
+    """Draw the signals of the first seed of each simulation."""
+    examples = {name: x for name, x in results.examples.items() if x is not None}
+    for (name, example), (signal, label) in product(examples.items(), _SIGNALS.items()):
+        curves = example.curves.items()
+        if series := {subject: x[signal] for subject, x in curves if signal in x}:
+            figure = draw.draw_time_series(example.time, series, label)
+            suite.figures.append((f"{name}: {label.partition(' /')[0]}", figure, ""))
 
 
 STUDY = Study(

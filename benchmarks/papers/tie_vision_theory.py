@@ -19,9 +19,8 @@ from ...envs.vehicle.linear import make_vision_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design import kalman
 from ...estimators.make import make_estimator
-from . import theory
-from .ledger import Analysis, Bound, Claim, ClaimPart, Example, Numbers
-from .manoeuvres import Curves, PaperFigure
+from .dual_rate import compare_maps
+from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3
@@ -119,10 +118,10 @@ def _check_compensated(d: _RandomSystem) -> dict[str, float]:
     return sums
 
 
-def _compute_residuals(seed: int) -> tuple[Numbers, None]:
+def _compute_residuals(seed: int) -> Numbers:
     d = _draw_system(seed)
     by_case = _check_ideal(d) | _check_predicted(d) | _check_compensated(d)
-    return {(label, "residual"): value for label, value in by_case.items()}, None
+    return {(label, "residual"): value for label, value in by_case.items()}
 
 
 PAPER = "tie-vision"
@@ -168,7 +167,7 @@ def _compute_spectral_radius(K: Array) -> float:
     return float(np.abs(np.linalg.eigvals(total)).max())
 
 
-def _measure_tunings(seed: int) -> tuple[Numbers, None]:
+def _measure_tunings(seed: int) -> Numbers:
     """Measure the fraction of 20 random tunings with which the error grows."""
     # process noise of each state, up to 1 (unit)^2/s
     tunings = 10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, (20, 4))
@@ -178,23 +177,16 @@ def _measure_tunings(seed: int) -> tuple[Numbers, None]:
     literal = [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings]
     radii = {LITERAL: literal, SPREAD: shipped}
     shares = {name: float(np.mean(np.array(x) > 1.0 + 1e-9)) for name, x in radii.items()}
-    return {(name, "share"): value for name, value in shares.items()}, None
+    return {(name, "share"): value for name, value in shares.items()}
 
 
-def _measure_maps(seed: int) -> tuple[Numbers, Example]:
+def _measure_maps(seed: int) -> Numbers:
     """Compare the error dynamics with pseudo-residuals to those of a fast camera; all rows slow."""
     model = make_vision_model(COMS, SPEED)
     G, _ = model.discretise(1e-3)
     Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
     K = kalman.kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
-    rules = {"ideal": "fast", "none": "predicted", "pseudo-residuals": "pseudo"}
-    cases = {x: theory.make_maps(rule, G, model.C, K, PERIOD) for x, rule in rules.items()}
-    size = np.linalg.norm(np.eye(len(G)))
-    errors = {x: np.array([np.linalg.norm(y) / size for y in maps]) for x, maps in cases.items()}
-    curves = {name: {"error": error} for name, error in errors.items()}
-    difference = theory.compute_difference(cases["pseudo-residuals"], cases["ideal"])
-    example = Example(np.arange(float(PERIOD)), curves)
-    return {("pseudo-residuals", "difference"): difference}, example
+    return {("pseudo-residuals", "difference"): compare_maps(G, model.C, K, PERIOD)}
 
 
 _FUNCTIONS = {TUNINGS: _measure_tunings, MAPS: _measure_maps, APPENDIX: _compute_residuals}
@@ -226,12 +218,4 @@ CLAIMS = (
         ),
         note="Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the "
         "residual C G e nothing multiplies w; printed is (I - K C) w."),
-)
-
-figure = partial(PaperFigure, PAPER)
-FIGURES = (
-    figure("Appendix: what is left of an error between samples", MAPS,
-        Curves("error", "size of the error / its size before the sample", x_label="time / ms"),
-        "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
-        "correction in between (case 2); pseudo-residuals: case 3. Without noise."),
 )

@@ -2,9 +2,9 @@
 
 from functools import partial
 
+from .dual_rate import compute_coms_ranks
 from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import Curves, EstimationSimulation, PaperFigure
-from .theory import compute_coms_ranks
+from .manoeuvres import EstimationSimulation
 
 PAPER = "uneven-delay"
 FIG5, NOISY, FIG7 = "uneven-delay-fig5", "uneven-delay-fig5-noisy", "uneven-delay-fig7"
@@ -69,22 +69,4 @@ CLAIMS = (
     claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
         compare("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, quantity="y_l"),
         compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")),
-)
-
-_SHOWN, _OFFSET = ("truth", FRAME, PROPOSED), "lateral offset / m"
-_DELAY = Curves("delay", "delay / ms", window=(0.0, 1.0))
-figure = partial(PaperFigure, PAPER)
-FIGURES = (
-    figure("Fig. 4: delay of each frame", FIG5, _DELAY, "20, 15, 10, 25 ms, repeated."),
-    figure("Fig. 5: lateral offset at the preview point", FIG5,
-        Curves("offset", _OFFSET, _SHOWN, (4.0, 4.5)),
-        "Truth, the camera's held late samples, a constant delay and the proposed filter."),
-    figure("Fig. 5: body slip angle", FIG5,
-        Curves("beta", "body slip angle / rad", ("truth", FRAME, PROPOSED, VISION)),
-        "The same drive; the paper shows the offset alone."),
-    figure("Fig. 6 (twin): delay of each frame", FIG7, _DELAY,
-        "Processing takes 9 to 18 ms, as on the road."),
-    figure("Fig. 7 (twin): lateral offset at the preview point", FIG7,
-        Curves("offset", _OFFSET, _SHOWN, (20.0, 20.5)),
-        "The driver's sine at about 28 km/h, half a second."),
 )

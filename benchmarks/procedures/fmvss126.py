@@ -113,7 +113,6 @@ class SineDwellResult:
 
     A: float  # rad at the steering wheel, the mean of both sides'
     runs: tuple[SineDwellRun, ...]  # as they were driven
-    shown: Series | None = None  # one more, to look at
 
     @property
     def passed(self) -> bool:
@@ -145,11 +144,7 @@ def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
 
 
 def run(
-    drive: DriveFunction,
-    car: TestCar,
-    A: float,
-    multiples: Sequence[float] | None = None,
-    shown: float | None = None,
+    drive: DriveFunction, car: TestCar, A: float, multiples: Sequence[float] | None = None
 ) -> SineDwellResult:
     """Run the procedure.
 
@@ -158,7 +153,6 @@ def run(
         car: Car under test, with speed and steering ratio.
         A: Reference angle (rad at the steering wheel).
         multiples: Amplitudes (of A); None: the standard's series.
-        shown: Amplitude (of A) of one more run, which is not judged; None: there is none.
 
     Returns:
         The runs, both sides of each amplitude.
@@ -166,5 +160,4 @@ def run(
     angles = _list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
     runs = [_evaluate_run(drive(_make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
-    more = None if shown is None else drive(_make_sine_with_dwell(car, shown * A))
-    return SineDwellResult(A, tuple(runs), more)
+    return SineDwellResult(A, tuple(runs))

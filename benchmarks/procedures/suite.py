@@ -1,7 +1,7 @@
 """Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from itertools import product
 from types import ModuleType
@@ -16,12 +16,11 @@ from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, geometric_mean, interval
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
-from . import fmvss126, iso3888, iso4138, iso7401, outside
+from . import fmvss126, iso, outside
 from .drive import CARS, ENTRIES, CaseResults, ProcedureCase
 
 NAME = "procedures"
 RIVAL = "lqr"  # against whom costs on outside plants are paired
-SHOWN = 5.0  # of A: the sine with dwell in the figures
 _QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
 EPISODES, QUICK_EPISODES, OUTSIDE_EPISODES = 16, 2, 8
 
@@ -51,21 +50,21 @@ def _measure_case(case: ProcedureCase) -> Any:
         multiples, results = _QUICK_MULTIPLES if case.quick else None, []
         for seed in case.seeds:
             A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car, seed), car)
-            results.append(fmvss126.run(entry.drive(case.car, seed), car, A, multiples, SHOWN))
+            results.append(fmvss126.run(entry.drive(case.car, seed), car, A, multiples))
         return results
-    drive = entry.drive(case.car, 0 if case.procedure in iso3888.TRACKS else None)
-    if case.procedure in iso3888.TRACKS:
+    drive = entry.drive(case.car, 0 if case.procedure in iso.TRACKS else None)
+    if case.procedure in iso.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
         speeds = (car.speed * shares).tolist()
-        return [iso3888.run(drive, car, case.procedure, speed) for speed in speeds]
-    return (iso4138 if case.procedure == "iso-4138" else iso7401).run(drive, car)
+        return [iso.run_track(drive, car, case.procedure, speed) for speed in speeds]
+    return (iso.run_circle if case.procedure == "iso-4138" else iso.run_transient)(drive, car)
 
 
 def _make_cases(quick: bool) -> list[ProcedureCase]:
     """Make the list of what is driven; outside plants only where their extra is installed."""
     indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
-    driven = (("fmvss-126", seeds), *((track, ()) for track in iso3888.TRACKS))
+    driven = (("fmvss-126", seeds), *((track, ()) for track in iso.TRACKS))
     triples = product(driven, CARS, indices)
     cases = [ProcedureCase(name, car, k, some, quick) for (name, some), car, k in triples]
     cases += [ProcedureCase(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
@@ -94,7 +93,7 @@ def _make_verdict(done: CaseResults) -> str:
         failing = f"; {weakest} fails above {medians[weakest]:.3g} A in half of the cars"
         failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
-        runs = results[iso3888.TRACKS[0]]
+        runs = results[iso.TRACKS[0]]
         speeds = {c.agent: 3.6 * _find_highest_speed(item) for c, item in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
@@ -107,7 +106,7 @@ def _make_verdict(done: CaseResults) -> str:
     )
 
 
-def _find_highest_speed(runs: Sequence[iso3888.TrackRun]) -> float:
+def _find_highest_speed(runs: Sequence[iso.TrackRun]) -> float:
     """Find the highest speed (m/s) of a clean run; 0 where there is none."""
     return max((run.speed for run in runs if run.passed), default=0.0)
 
@@ -143,7 +142,7 @@ def _add_tables(suite: Suite, done: CaseResults) -> None:
             title, note = (text.format(**records[0]) for text in (table.title, table.note))
             suite.tables.append(ResultTable(title, table.columns, records, note, name != "check"))
         if name == "fmvss-126":
-            _add_tracks(suite, {track: results[track] for track in iso3888.TRACKS})
+            _add_tracks(suite, {track: results[track] for track in iso.TRACKS})
 
 
 def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
@@ -200,7 +199,7 @@ def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
 def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
     records = []
     for case, transient in done.items():
-        for name in iso7401.OUTPUTS:
+        for name in iso.OUTPUTS:
             one, other = vars(transient.step[name]), vars(transient.linear_step[name])
             pairs = {f"both {key}": (number, other[key]) for key, number in one.items()}
             numbers = {key: one[key] for key in ("response_time", "overshoot")}
@@ -286,10 +285,44 @@ _TABLES = {
 }  # fmt: skip
 
 
-def _add_figures(suite: Suite, done: CaseResults, _: ModuleType) -> None:
-    from .figures import draw_figures
+def _add_figures(suite: Suite, done: CaseResults, draw: ModuleType) -> None:
+    """Draw tracks with their cones, and frequency responses beside the linear model's."""
+    for case, result in _group_results(done)["iso-7401"].items():
+        for name, unit in zip(iso.OUTPUTS, ("yaw rate / (1/s)", "a_y / (m/s2/rad)"), strict=True):
+            measured, linear = result.sweep[name], result.linear_sweep[name]
+            lines = {"measured": np.abs(measured.H), "linear model": np.abs(linear)}
+            figure = draw.draw_curves(measured.frequency, lines, "frequency / Hz", unit)
+            title = f"ISO 7401, {case.car}: response to steering, {unit}"
+            suite.figures.append((title, figure, "Measured by a swept sine, no control."))
+    for track, car in product(iso.TRACKS, CARS):
+        runs = {
+            case.agent: max((x for x in result if x.passed), key=lambda x: x.speed,
+                            default=result[0])
+            for case, result in done.items() if (case.procedure, case.car) == (track, car)
+        }  # fmt: skip
+        speeds = ", ".join(f"{agent} {3.6 * run.speed:.0f} km/h" for agent, run in runs.items())
+        text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
+        suite.figures.append((f"{track}, {car}: way and cones", _draw_cones(runs, draw), text))
 
-    suite.figures = draw_figures(_group_results(done))
+
+def _draw_cones(runs: Mapping[str, iso.TrackRun], draw: ModuleType) -> Any:
+    """Draw the paths of the centre of gravity, from where the first lane begins, and the cones."""
+    starts = {agent: run.speed * iso.ONSET for agent, run in runs.items()}
+    figure = draw.draw_track(
+        {agent: (run.series.X - starts[agent], run.series.Y) for agent, run in runs.items()}
+    )
+    agent, run = list(runs.items())[-1]
+    places = [
+        (x - starts[agent], lane.offset + side * 0.5 * lane.width)
+        for lane in run.lanes
+        for x in np.linspace(lane.start, lane.start + lane.length, 5)
+        for side in (-1.0, 1.0)
+    ]
+    x, y = np.array(places).T
+    marker = {"color": "#D55E00", "symbol": "triangle-up", "size": 7}
+    figure.add_scatter(x=x, y=y, mode="markers", marker=marker, name="cones")
+    figure.update_xaxes(range=[float(x.min()) - iso.RUN_OUT, float(x.max()) + iso.RUN_OUT])
+    return figure
 
 
 STUDY = Study(

@@ -17,7 +17,7 @@ from sideslip.benchmarks.harness.verdict import (
 )
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredClaim, MeasuredPart
-from sideslip.benchmarks.procedures import iso3888
+from sideslip.benchmarks.procedures import iso
 from sideslip.benchmarks.procedures import suite as procedures
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
@@ -99,7 +99,7 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
         runs = (SineDwellRun(1.0, 3.0, 0.1, 0.1, 2.0), SineDwellRun(2.0, 6.0, ratio, 0.1, 2.0))
         return [SineDwellResult(0.3, runs)]
 
-    track = next(iter(iso3888.TRACKS))
+    track = next(iter(iso.TRACKS))
     monkeypatch.setattr(procedures, "_find_highest_speed", lambda runs: runs)
     done: dict[ProcedureCase, Any] = {}
     for car in CARS:

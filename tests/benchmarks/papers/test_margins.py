@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.tie_vision_control import _compute_gain_margin, _find_crossings
+from sideslip.benchmarks.papers.tie_vision import _compute_gain_margin, _find_crossings
 
 DT = 0.01
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.controllers.two_dof import PLACEMENTS, POLE, design_pi
-from sideslip.benchmarks.papers.tie_vision_control import (
+from sideslip.benchmarks.papers.tie_vision import (
     INTEGRALS,
     PRINTED,
     SENSORS,

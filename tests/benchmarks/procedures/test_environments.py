@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.procedures import fmvss126, iso3888, iso4138, iso7401
+from sideslip.benchmarks.procedures import fmvss126, iso
 from sideslip.benchmarks.procedures.drive import CALM, CARS, ENTRIES, DriveFunction
 from sideslip.benchmarks.procedures.outside import _make_steering_profile
 from sideslip.envs import Scenario
@@ -31,12 +31,12 @@ def slow(name: str) -> float:
 
 
 @EACH
-@pytest.mark.parametrize("output", iso7401.OUTPUTS)
+@pytest.mark.parametrize("output", iso.OUTPUTS)
 def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, output: str) -> None:
     """C (j w I - A)^-1 B, within the estimate's error."""
     car = CARS[name]
-    found = iso7401._run_sweep(linear(name), car, slow(name))[output]
-    theory = iso7401._compute_linear_response(car.vehicle, car.speed, found.frequency)[output]
+    found = iso._run_sweep(linear(name), car, slow(name))[output]
+    theory = iso._compute_linear_response(car.vehicle, car.speed, found.frequency)[output]
     assert (np.abs(found.H - theory) < 3.0 * found.sd).all()
     np.testing.assert_allclose(found.H, theory, rtol=0.03)
 
@@ -44,15 +44,15 @@ def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, outp
 @EACH
 def test_the_linear_plant_steps_as_the_linear_model_does(name: str) -> None:
     car = CARS[name]
-    driven = linear(name)(iso7401._make_step(car, slow(name)))
-    theory = iso7401._compute_linear_step(car.vehicle, car.speed, driven)["gamma"]
-    found = iso7401._compute_responses(driven)["gamma"]
+    driven = linear(name)(iso._make_step(car, slow(name)))
+    theory = iso._compute_linear_step(car.vehicle, car.speed, driven)["gamma"]
+    found = iso._compute_responses(driven)["gamma"]
     assert vars(found) == pytest.approx(vars(theory), rel=0.02, abs=1e-3)
 
 
 @EACH
 def test_a_slow_circle_of_the_linear_plant_has_its_gradient(name: str) -> None:
-    found = iso4138.run(linear(name), CARS[name], seconds=120.0)
+    found = iso.run_circle(linear(name), CARS[name], seconds=120.0)
     np.testing.assert_allclose(found.K, found.theory, rtol=0.02)
 
 
@@ -85,11 +85,11 @@ def test_uncontrolled_cars_pass_small_amplitudes_alone(name: str, large: float) 
 
 
 @EACH
-@pytest.mark.parametrize("track", iso3888.TRACKS)
+@pytest.mark.parametrize("track", iso.TRACKS)
 def test_a_slow_driver_touches_no_cone(name: str, track: str) -> None:
     car = CARS[name]
     drive = ENTRIES[0].drive(name)
-    runs = [iso3888.run(drive, car, track, share * car.speed) for share in (0.45, 1.1)]
+    runs = [iso.run_track(drive, car, track, share * car.speed) for share in (0.45, 1.1)]
     assert [run.passed for run in runs] == [True, False]
 
 
