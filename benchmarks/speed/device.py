@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -19,22 +19,11 @@ from ...envs.engine.layout import PARAMS_WIDTH
 from ...envs.numerics.torch_backend import torch
 from ..harness.parallel import report_user_errors
 from ..harness.results import check_writable, write_text
-from ..harness.stats import Estimate
 from .timing import Taken
 
 _COUNTS = (1024, 16384, 65536, 262144, 1048576)
 _ROUNDS, _STEPS = 5, 20  # rounds that count, each of so many steps
 _COPIED = 1 << 28  # bytes, beyond every cache
-
-
-class _DeviceTiming(NamedTuple):
-    """Speed of a batch of `size` rows."""
-
-    size: int
-    dtype: str
-    rate: Estimate  # env-steps a second of wall time: median, smallest and largest of the rounds
-    bytes_a_step: float  # of one row, each number moved once
-    bandwidth: float  # bytes a second of a copy on the same device, read and written
 
 
 def _measure_seconds(work: Callable[[], object], device: torch.device) -> float:
@@ -61,8 +50,8 @@ def _count_bytes(env: Any) -> float:
     return float((read + written) / env.num_envs)
 
 
-def _measure(env: Any, copied: float) -> _DeviceTiming:
-    """Measure a batch in rounds, after a first one; copied: a copy's bytes a second."""
+def _measure(env: Any, copied: float) -> list[str]:
+    """Measure a batch in rounds, after a first one: a line of the table; copied: as in the note."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
 
@@ -71,25 +60,23 @@ def _measure(env: Any, copied: float) -> _DeviceTiming:
             env.step(actions)
 
     taken = [_measure_seconds(run_steps, env.device) for _ in range(_ROUNDS + 1)][1:]
-    rates, dtype = Taken(env.num_envs * _STEPS / x for x in taken), str(env.dtype)
-    kind = dtype.removeprefix("torch.")
-    return _DeviceTiming(env.num_envs, kind, rates.range, _count_bytes(env), copied)
-
-
-def _format_table(timings: Sequence[_DeviceTiming]) -> str:
-    lines = [
-        "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
-        "| of a copy's bandwidth |",
-        "|---|---|---|---|---|---|---|",
+    rate, low, high = Taken(env.num_envs * _STEPS / x for x in taken).range
+    size, moved = env.num_envs, _count_bytes(env)
+    return [
+        f"{size}",
+        f"{env.dtype}".removeprefix("torch."),
+        f"{rate:.3g}",
+        f"{low:.3g} .. {high:.3g}",
+        f"{1e6 * size / rate:.4g}",
+        f"{moved:.0f}",
+        f"{100.0 * rate * moved / copied:.2g} %",
     ]
-    for timing in timings:
-        (rate, low, high), size = timing.rate, timing.size
-        share = rate * timing.bytes_a_step / timing.bandwidth
-        lines.append(
-            f"| {size} | {timing.dtype} | {rate:.3g} | {low:.3g} .. {high:.3g} "
-            f"| {1e6 * size / rate:.4g} | {timing.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
-        )
-    return "\n".join(lines)
+
+
+_HEADS = (
+    *("N", "floats", "env-steps/s", "range", "us a step of all", "bytes a row, at least"),
+    "of a copy's bandwidth",
+)
 
 
 def _main(
@@ -103,25 +90,27 @@ def _main(
 ) -> None:
     """Measure env-steps per second, resets included, against the size of the batch."""
     check_writable(out)
-    console, timings, copied = Console(), [], 0.0
+    console, copied = Console(), 0.0
+    lines: list[Sequence[str]] = [_HEADS, ["---"] * len(_HEADS)]
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
     options: dict[str, Any] = {"engine": engine, "on_bad_action": "fail"}
     options |= {"compile": True} if compiled else {}
     for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
         batch = make_device_env(env, size, device=device, dtype=kind, **options)
         copied = copied or _measure_bandwidth(batch.device)
-        timings.append(_measure(batch, copied))
-        console.print(f"{size}, {kind}: {timings[-1].rate.value:.3g} env-steps/s", highlight=False)
+        lines.append(_measure(batch, copied))
+        console.print(f"{size}, {kind}: {lines[-1][2]} env-steps/s", highlight=False)
         del batch
     hardware = f"CPU, {torch.get_num_threads()} threads of torch"
     if device.startswith("cuda"):
         hardware = torch.cuda.get_device_name(torch.device(device))
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     text = (
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
         f"{hardware}, torch {torch.__version__}; {env}, engine {engine}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {_ROUNDS} rounds of "
         f"{_STEPS} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
-        f"{_format_table(timings)}\n"
+        f"{table}\n"
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)
     if out is not None:

@@ -1,12 +1,14 @@
-"""CPU time of an env-step: ours with full sensors, single and in batches, beside other packages'.
+"""CPU time of an env-step, driven or learned: ours with full sensors, beside other packages'.
 
 Ours is 10 ms of driving: ten ticks of plant and sensors, infos included. Single ones are reset
-after at most 500 steps; batches run on, and reset their rows themselves.
+after at most 500 steps; batches run on, and reset their rows themselves. Learning is a rollout of
+PPO and the gradient steps on it, with the same settings for both environments.
 """
 
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import Array
+from ...envs.ticks import TICK
 from ...estimators.filters import FILTERS
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
@@ -115,7 +118,7 @@ def _make_lane_keeping() -> Workload:
 
 
 def make_workloads() -> WorkloadSet:
-    """Make all workloads but those of packages that are not installed."""
+    """Make all workloads of steps but those of packages that are not installed."""
     note = (
         "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
         f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
@@ -175,3 +178,44 @@ def _make_filtered(name: str) -> dict[str, Workload]:
             "one filtered": _make_episode(EstimateObservation(env, name, outputs)),
             "many filtered": _make_batch(EstimateObservations(many, name, outputs)),
         }
+
+
+PPO_YAW, PENDULUM = "PPO, YawFusion-v0", "PPO, Pendulum-v1"
+_LEARNERS = 256  # environments of a learner
+
+
+def _make_learner(env_id: str) -> Workload:
+    """Make calls of a rollout and its update, ours through the bridge."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common import env_util
+
+    from ...agents import vec_env
+
+    make = vec_env.make_vec_env if env_id == _FUSION_ID else env_util.make_vec_env
+    env = make(env_id, _LEARNERS, seed=0)
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", **_get_settings())
+    steps = _LEARNERS * model.n_steps
+    return Workload(lambda: model.learn(steps, reset_num_timesteps=False), steps)
+
+
+def _get_settings() -> dict[str, Any]:
+    """Get the settings of PPO that `sideslip train` uses."""
+    from ...agents.training.config import TrainingTask
+
+    options = TrainingTask(_FUSION_ID, num_envs=_LEARNERS).make_model_options(10 * TICK)
+    return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
+
+
+def make_learners() -> WorkloadSet:
+    """Make both learners, unless stable-baselines3 is not installed."""
+    field = WorkloadSet("Cost of a learned env-step", "step", "", is_slow=True)
+    for name, env_id in ((PPO_YAW, _FUSION_ID), (PENDULUM, "Pendulum-v1")):
+        field.add(name, partial(_make_learner, env_id), "stable-baselines3")
+    settings = _get_settings() if field.workloads else {}
+    field.note = (
+        "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "
+        f"{_LEARNERS}, YawFusion-v0 through the bridge; "
+        f"{', '.join(f'{name} = {value}' for name, value in settings.items())}, the rest is its "
+        "default."
+    )
+    return field

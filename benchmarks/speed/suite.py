@@ -1,13 +1,138 @@
-"""The suite `speed`: CPU time of steps, ticks, learning and first use, and the engine's targets."""
+"""The suite `speed`: CPU time of steps, ticks, learning and first use, and the engine's targets.
 
+The first use is measured in fresh processes. Kernels are compiled once and cached on disk; a cold
+one is compiled in a temporary folder.
+"""
+
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Mapping
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
-from . import env_steps, first_use, learning, plant
-from .timing import FULL, QUICK, Taken, format_absences, format_three_digits
+from ..report.tables import format_verdict, summarise_names
+from . import env_steps, plant
+from .timing import FULL, QUICK, AbsentError, Taken, format_absences, format_three_digits
+
+FIRST = "gym.make to the first step, kernels on disk"
+KERNEL = "cold compile of the dearest kernel"
+_RUNS, _QUICK_RUNS = 5, 2  # fresh processes
+LIMIT = 60.0  # s, on the wall, of a process that has nothing to compile
+
+_WARM = """
+import json, time
+marks = [("interpreter", time.process_time())]
+def done(name):
+    marks.append((name, time.process_time()))
+import gymnasium, numpy
+done("import gymnasium")
+import sideslip
+done("import sideslip")
+import numba
+done("import numba")
+env = gymnasium.make("sideslip/YawFusion-v0")
+done("gym.make")
+env.reset(seed=0)
+done("first reset")
+env.step(numpy.zeros(1, numpy.float32))
+done("first step")
+print(json.dumps(marks))
+"""
+
+_WATCH = """
+import json, logging
+
+taken = []
+
+class Watch(logging.Handler):
+    def emit(self, record):
+        if len(record.args) == 2:  # a kernel's name and its own CPU seconds
+            taken.append(record.args)
+
+logging.getLogger("sideslip.compiler").addHandler(Watch())
+logging.getLogger("sideslip.compiler").setLevel(logging.INFO)
+"""
+
+_COLD = """
+import gymnasium as gym, numpy as np
+from sideslip.estimators import EstimateObservation
+from sideslip.estimators.vector import EstimateObservation as EstimateObservations
+how = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
+def run(env, shape):
+    env.reset(seed=0)
+    env.step(np.zeros(shape, np.float32))
+id = "sideslip/YawFusion-v0"
+run(gym.make(id), 1)
+run(gym.make_vec(id, num_envs=8), (8, 1))
+run(EstimateObservation(gym.make(id), **how), 1)
+run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
+"""
+
+
+def _measure_first_step() -> dict[str, float]:
+    """Measure the CPU seconds of what a process does up to its first step; kernels are cached."""
+    try:
+        marks: list[tuple[str, float]] = json.loads(_run_python(_WARM, limit=LIMIT))
+    except subprocess.TimeoutExpired:
+        raise AbsentError("no kernels are cached on disk here") from None
+    before = [0.0, *(at for _, at in marks)]
+    return {name: at - before[i] for i, (name, at) in enumerate(marks)}
+
+
+def _measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
+    """Measure the CPU seconds of each kernel that code compiles with nothing on disk."""
+    with TemporaryDirectory() as folder:
+        environment = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
+        printed = _run_python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", environment)
+    return [(str(name), float(seconds)) for name, seconds in json.loads(printed)]
+
+
+def _run_python(
+    code: str, variables: dict[str, str] | None = None, limit: float | None = None
+) -> str:
+    """Run code in a fresh interpreter that finds the same packages; the last line it prints."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
+    command = [sys.executable, "-c", code]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
+    if run.returncode:
+        raise RuntimeError(f"a fresh process failed:\n{run.stderr}")
+    return run.stdout.splitlines()[-1]
+
+
+def _add_first_use(suite: Suite, quick: bool) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Add rows and a table; returns CPU seconds of the targets, and reasons of absence, by name.
+
+    In a quick run a few processes do, and nothing is compiled, which takes minutes.
+    """
+    columns, absent = dict[str, Taken](), dict[str, str]()
+    try:
+        taken = [_measure_first_step() for _ in range((_QUICK_RUNS if quick else _RUNS) + 1)][1:]
+        columns = {f"first use: {name}": Taken(run[name] for run in taken) for name in taken[0]}
+        counted = ("import numba", "gym.make", "first reset", "first step")
+        columns[FIRST] = Taken(sum(run[name] for name in counted) for run in taken)
+    except AbsentError as error:
+        absent[FIRST] = str(error)
+    if not quick:
+        kernels = _measure_compilation()
+        columns["cold compile of all kernels"] = Taken([sum(seconds for _, seconds in kernels)])
+        columns[KERNEL] = Taken([max(seconds for _, seconds in kernels)])
+    else:
+        absent[KERNEL] = "in the full form only"
+    cells = []
+    for name, values in columns.items():
+        middle, low, high = values.add_row(suite, name, "cpu_seconds").range
+        cells.append([name, f"{middle:.3f}", f"{low:.3f} .. {high:.3f}"])
+    note = (
+        "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "
+        "Cold: environment and exact-kf, single and batch, with nothing on disk."
+    )
+    header = ("", "CPU-s", "range")
+    suite.tables.append(ResultTable("Cost of the first use", header, cells, note, False))
+    return {name: columns[name] for name in (FIRST, KERNEL) if name in columns}, absent
 
 
 class _SpeedTarget(NamedTuple):
@@ -39,9 +164,10 @@ TARGETS = (
     _SpeedTarget("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, max_value=1.1),
     _SpeedTarget("full-covariance filter in the loop, 1024 at once, Pendulum over ours",
         env_steps.PENDULUMS, env_steps.FILTERED, 4.5),
-    _SpeedTarget("PPO, 256 at once, Pendulum over ours", learning.PENDULUM, learning.PPO_YAW, 1.7),
-    _SpeedTarget(first_use.FIRST, "", first_use.FIRST, max_value=0.5),
-    _SpeedTarget(first_use.KERNEL, "", first_use.KERNEL, max_value=5.0),
+    _SpeedTarget("PPO, 256 at once, Pendulum over ours",
+        env_steps.PENDULUM, env_steps.PPO_YAW, 1.7),
+    _SpeedTarget(FIRST, "", FIRST, max_value=0.5),
+    _SpeedTarget(KERNEL, "", KERNEL, max_value=5.0),
 )  # fmt: skip
 
 
@@ -83,13 +209,13 @@ def _measure(request: Request) -> _SpeedResults:
     """Measure in this process, where workloads take turns; a quick run compiles nothing."""
     measured, effort = Suite("speed", "", ""), request.choose(FULL, QUICK)
     taken, absent = dict[str, Taken](), dict[str, str]()
-    for part in (env_steps, plant, learning):
-        workloads = part.make_workloads()
+    for make in (env_steps.make_workloads, plant.make_workloads, env_steps.make_learners):
+        workloads = make()
         taken |= workloads.measure(measured, effort)
         absent |= workloads.absent
-        if part is env_steps:
+        if make is env_steps.make_workloads:
             env_steps.add_filters(measured, effort)
-    seconds, more_absent = first_use.add(measured, request.quick)
+    seconds, more_absent = _add_first_use(measured, request.quick)
     _add_targets(measured, taken | seconds, absent | more_absent)
     return _SpeedResults(taken, measured)
 

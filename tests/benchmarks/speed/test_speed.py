@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.report.study import Request
-from sideslip.benchmarks.speed import env_steps, first_use, learning, plant, suite, timing
+from sideslip.benchmarks.speed import env_steps, plant, suite, timing
 from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
 from sideslip.estimators.make import ESTIMATORS
@@ -28,9 +28,9 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plant, "CARS", 32)
 
 
-def measure(part: Any) -> tuple[Suite, dict[str, Any], dict[str, str]]:
-    """The suite, the times taken and the reasons of the absent ones of a part's workloads."""
-    measured, workloads = Suite("speed", "", ""), part.make_workloads()
+def measure(workloads: Any) -> tuple[Suite, dict[str, Any], dict[str, str]]:
+    """The suite, the times taken and the reasons of the absent ones of some workloads."""
+    measured = Suite("speed", "", "")
     return measured, workloads.measure(measured, SHORT), workloads.absent
 
 
@@ -42,7 +42,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the optional packages: the suite needs none of them."""
     without(monkeypatch, "highway_env", "envpool")
-    measured, taken, absent = measure(env_steps)
+    measured, taken, absent = measure(env_steps.make_workloads())
     assert {env_steps.FUSION_V1, env_steps.V1_AT_ONCE, env_steps.FILTERED} <= set(taken)
     assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
     assert absent == {
@@ -67,7 +67,7 @@ def test_every_filter_of_the_catalogue_has_its_line() -> None:
     assert sorted(rows) == sorted((f"{e} + {name}", "us_added") for e in envs for name in names)
     (table,) = measured.tables
     assert {cells[0] for cells in table.cells} == names
-    assert {len(cells) for cells in table.cells} == {len(table.header)}
+    assert {len(cells) for cells in table.cells} == {len(table.columns)}
 
 
 def test_the_lane_keeping_environment_runs() -> None:
@@ -123,7 +123,7 @@ def test_a_compiler_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
 def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
-    measured, taken, absent = measure(plant)
+    measured, taken, absent = measure(plant.make_workloads())
     assert set(taken) == {plant.PLANT}
     assert absent == {plant.C: "no C compiler"}
     assert "no C compiler" in measured.tables[0].note
@@ -132,9 +132,9 @@ def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) 
 def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "torch", "stable_baselines3")
     monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
-    measured, taken, absent = measure(learning)
+    measured, taken, absent = measure(env_steps.make_learners())
     assert taken == {} and measured.tables == []
-    assert absent[learning.PENDULUM] == "stable-baselines3 is not installed"
+    assert absent[env_steps.PENDULUM] == "stable-baselines3 is not installed"
 
 
 def test_compilation_is_counted_at_the_top_alone() -> None:
@@ -148,19 +148,19 @@ def outer(x):
     return inner(x) * 2
 outer(1); outer(1.0); outer(2); inner(1)
 """
-    found = first_use._measure_compilation(code)
+    found = suite._measure_compilation(code)
     assert [name for name, _ in found] == ["outer", "outer", "inner"]
     assert all(seconds > 0.0 for _, seconds in found)
     with pytest.raises(RuntimeError, match="no such thing"):
-        first_use._measure_compilation("raise ValueError('no such thing')")
+        suite._measure_compilation("raise ValueError('no such thing')")
 
 
 def test_without_kernels_on_disk_the_first_step_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_use, "LIMIT", 0.01)
+    monkeypatch.setattr(suite, "LIMIT", 0.01)
     measured = Suite("speed", "", "")
-    seconds, absent = first_use.add(measured, quick=True)
+    seconds, absent = suite._add_first_use(measured, quick=True)
     assert seconds == {} and measured.rows == []
-    assert absent[first_use.FIRST] == "no kernels are cached on disk here"
+    assert absent[suite.FIRST] == "no kernels are cached on disk here"
 
 
 def test_ratios_are_taken_round_by_round() -> None:
@@ -181,9 +181,7 @@ def test_ratios_are_taken_round_by_round() -> None:
 
 def test_every_target_stands_in_the_table() -> None:
     measured = Suite("speed", "", "")
-    suite._add_targets(
-        measured, {first_use.FIRST: timing.Taken([0.6])}, {env_steps.LANE: "it rains"}
-    )
+    suite._add_targets(measured, {suite.FIRST: timing.Taken([0.6])}, {env_steps.LANE: "it rains"})
     (table,) = measured.tables
     assert [cells[0] for cells in table.cells] == [target.name for target in suite.TARGETS]
     said = [cells[-1] for cells in table.cells]
@@ -220,17 +218,18 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
         found.tables.append(None)
         held.extend(numbers)
 
-    for part in (env_steps, plant, learning):
-        workloads = timing.WorkloadSet("", "", "", absent={part.__name__: "not there"})
-        own = {part.__name__: (1.0,)}
-        monkeypatch.setattr(workloads, "measure", lambda *_, own=own: own)
-        monkeypatch.setattr(part, "make_workloads", lambda workloads=workloads: workloads)
+    makers = ((env_steps, "make_workloads"), (plant, "make_workloads"),
+              (env_steps, "make_learners"))  # fmt: skip
+    names = [f"{part.__name__}.{make}" for part, make in makers] + ["first use"]
+    for name, (part, make) in zip(names, makers, strict=False):
+        workloads = timing.WorkloadSet("", "", "", absent={name: "not there"})
+        monkeypatch.setattr(workloads, "measure", lambda *_, name=name: {name: (1.0,)})
+        monkeypatch.setattr(part, make, lambda workloads=workloads: workloads)
     monkeypatch.setattr(env_steps, "add_filters", lambda *_: None)
-    name = first_use.__name__
-    monkeypatch.setattr(first_use, "add", lambda *_: ({name: (1.0,)}, {name: "not there"}))
+    first = {"first use": (1.0,)}, {"first use": "not there"}
+    monkeypatch.setattr(suite, "_add_first_use", lambda *_: first)
     monkeypatch.setattr(suite, "_add_targets", judge)
     monkeypatch.setattr(suite, "_make_verdict", lambda *_: "")
     suite.STUDY.run(Request(quick=True))
     taken, absent = held
-    parts = [part.__name__ for part in (env_steps, plant, learning, first_use)]
-    assert list(taken) == parts and list(absent) == parts
+    assert list(taken) == names and list(absent) == names
