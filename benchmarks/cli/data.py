@@ -5,7 +5,6 @@ cv2 is imported when a command needs it, after the limit on a picture's pixels i
 
 import math
 import os
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from typer import Exit
 
-from ...envs.io import atomic_file, read_document, write_atomic, write_document
+from ...envs.io import read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.tables import print_suite
@@ -221,7 +220,7 @@ class _Lane:
         os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS))  # read when loaded
         with require_extra("vision", "the lane finder needs {}"):
             import cv2
-        from ...envs.sensors.camera.pictures import PICTURES, Film, read_picture
+        from ...envs.sensors.camera.pictures import PICTURES, Film, draw_lane, read_picture
 
         source, out = self.source, self.out
         if (source is None) == (self.calibrate is None):
@@ -242,14 +241,17 @@ class _Lane:
                 text = f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
                 raise ValueError(text) from None
             finder = self._make_finder([picture], source)
-            lanes, seconds = _process_picture(picture, finder, out)
+            lanes = [finder.find(picture)]
+            if out is not None:
+                _, data = cv2.imencode(out.suffix.lower(), draw_lane(picture, finder, lanes[0]))
+                write_atomic(out, data.tobytes())
         else:
             film = Film(source)
             finder = self._make_finder(film.read_head(_MAX_TRIES), source)
-            lanes, seconds = _process_film(film, finder, out)
+            lanes = _process_film(film, finder, out)
             if (count := len(lanes)) < film.frame_count:
                 _console.print(f"the film ends after {count} of the {film.frame_count} frames due")
-        _report(source, finder.camera, lanes, seconds)
+        _report(source, finder.camera, lanes)
         if self.json is not None:
             frames = [lane._asdict() for lane in lanes]
             write_document(self.json, {"source": str(source), "frames": frames})
@@ -305,55 +307,29 @@ class _Lane:
         return LaneFinder(camera, lane_width, calibration.NEAR, calibration.FAR, view=view)
 
 
-def _process_picture(
-    picture: "Image", finder: "LaneFinder", out: Path | None
-) -> tuple[list["Lane"], float]:
-    """Find the lane of a picture, draw it, and return it with its least CPU seconds."""
+def _process_film(film: "Film", finder: "LaneFinder", out: Path | None) -> list["Lane"]:
+    """Find a film's lanes, and draw them."""
     import cv2
 
     from ...envs.sensors.camera.pictures import draw_lane
 
-    lane, seconds = finder.find(picture), np.inf
-    for _ in range(10):
-        began = time.thread_time()
-        finder.find(picture)
-        seconds = min(seconds, time.thread_time() - began)
-    if out is not None:
-        _, data = cv2.imencode(out.suffix.lower(), draw_lane(picture, finder, lane))
-        write_atomic(out, data.tobytes())
-    return [lane], seconds
-
-
-def _process_film(
-    film: "Film", finder: "LaneFinder", out: Path | None
-) -> tuple[list["Lane"], float]:
-    """Find a film's lanes, draw them, and return them with the median CPU seconds of a frame."""
-    import cv2
-
-    from ...envs.sensors.camera.pictures import draw_lane
-
-    lanes, times = [], []
     with TemporaryDirectory() as folder, use_shared_bar(_console, "lane", "pictures") as bar:
-        part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
-        writer = None
-        if out is not None:
-            code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
-            writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
-        for picture in bar.track(film, film.frame_count or None, task_id=bar.task_ids[0]):
-            began = time.thread_time()
+        pictures = bar.track(film, film.frame_count or None, task_id=bar.task_ids[0])
+        if out is None:
+            return [finder.find(picture) for picture in pictures]
+        lanes, part = [], Path(folder, f"lane{out.suffix.lower()}")
+        code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
+        writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
+        for picture in pictures:
             lanes.append(finder.find(picture))
-            times.append(time.thread_time() - began)
-            if writer is not None:
-                writer.write(draw_lane(picture, finder, lanes[-1]))
-        if writer is not None and out is not None:
-            writer.release()
-            with atomic_file(out) as file:
-                file.write(part.read_bytes())
-    return lanes, float(np.median(times))
+            writer.write(draw_lane(picture, finder, lanes[-1]))
+        writer.release()
+        write_atomic(out, part.read_bytes())
+    return lanes
 
 
-def _report(source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float) -> None:
-    """Print the lanes, the camera's mounting and the frames per second."""
+def _report(source: Path, camera: "Pinhole", lanes: list["Lane"]) -> None:
+    """Print the lanes and the camera's mounting."""
     shown = [lane for lane in lanes if lane.quality > 0.0]
     lines = [f"{source.name}: a lane in {len(shown)} of {len(lanes)} frames"]
     if len(lanes) == 1:
@@ -364,8 +340,6 @@ def _report(source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
             f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
             f"{y.mean():+.2f} m (sd {y.std():.2f}), quality {np.mean(quality):.2f}"
         )
-    lines.append(
-        f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "
-        f"{1.0 / seconds:.0f} frames a second of one core"
-    )
+    tilt = np.degrees(camera.tilt)
+    lines.append(f"camera {camera.height:.2f} m high, tilted {tilt:+.2f} deg")
     _console.print("\n".join(lines), markup=False)
