@@ -15,7 +15,7 @@ from sideslip.agents.training.callbacks import POLICY, RunOptions
 from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
 from sideslip.agents.training.trainer import Trainer
 from sideslip.agents.training.warm_start import _NetworkAgent
-from sideslip.benchmarks.cli.train import _choose_folder, _describe_for_zoo
+from sideslip.benchmarks.cli.policies import _choose_folder, _describe_for_zoo
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}

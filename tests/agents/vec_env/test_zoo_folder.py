@@ -18,7 +18,7 @@ from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import Trainer
-from sideslip.benchmarks.cli.train import _choose_folder, _describe_for_zoo
+from sideslip.benchmarks.cli.policies import _choose_folder, _describe_for_zoo
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"

