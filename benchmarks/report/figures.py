@@ -66,7 +66,7 @@ def draw_time_series(
     dots: Collection[str] = (),
     zero_line: bool = False,
 ) -> go.Figure:
-    """Draw series on one axis over time, "truth" on top and thicker; ValueError for unequal ones.
+    """Draw series on one axis over time, "truth" on top and thicker.
 
     Args:
         t: Times (s), shape (n,).
@@ -80,8 +80,6 @@ def draw_time_series(
     figure = go.Figure()
     for name, colour_and_dash in _choose_line_styles(series).items():
         y = np.asarray(series[name], float)
-        if y.shape != t.shape:
-            raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
         present = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
         x, y = t[present], y[present]
         shown = _find_peaks(y)
@@ -98,7 +96,7 @@ def draw_time_series(
 def draw_curves(
     x: Array, series: Mapping[str, Array | tuple[Array, Array, Array]], x_label: str, y_label: str
 ) -> go.Figure:
-    """Draw lines with dots; ValueError for a line that is not as long as `x`.
+    """Draw lines with dots.
 
     Args:
         x: Places of the dots, shape (n,).
@@ -110,8 +108,6 @@ def draw_curves(
     for name, pen in _choose_line_styles(series).items():
         line = series[name]
         value, *bounds = line if isinstance(line, tuple) else (line,)
-        if len(value) != len(x):
-            raise ValueError(f"series {name!r} has {len(value)} values, x {len(x)}")
         trace = _make_line(name, np.asarray(x, float), np.asarray(value, float), *pen)
         trace.mode = "lines+markers"
         if bounds:
@@ -122,7 +118,7 @@ def draw_curves(
 
 
 def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
-    """Draw paths, seen from above; ValueError where the two of one differ in length.
+    """Draw paths, seen from above.
 
     Args:
         paths: Paths (x, y) (m) by name.
@@ -130,8 +126,6 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
     figure = go.Figure()
     for name, colour_and_dash in _choose_line_styles(paths).items():
         x, y = (np.asarray(values, float) for values in paths[name])
-        if x.shape != y.shape:
-            raise ValueError(f"track {name!r}: x has shape {x.shape}, y {y.shape}")
         shown = np.unique(np.linspace(0, len(y) - 1, min(len(y), POINTS)).round().astype(int))
         figure.add_trace(_make_line(name, x[shown], y[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
@@ -185,19 +179,10 @@ def draw_groups(
 def _make_line(
     name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False
 ) -> go.Scatter:
-    x, y = _reduce_precision(x), _reduce_precision(y)
     if dots:
         return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
     pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else 1.8}
     return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
-
-
-def _reduce_precision(values: Array) -> Array:
-    """Reduce to single precision, but for a small range far from zero."""
-    finite = values[np.isfinite(values)]
-    lost = np.abs(finite - finite.astype(np.float32))
-    far = len(finite) > 0 and lost.max() > 1e-4 * np.ptp(finite)
-    return values if far else values.astype(np.float32)
 
 
 def _compute_slimness(figure: go.Figure) -> float:

@@ -18,9 +18,9 @@ from ...estimators.analysis.bound import compute_error_bound
 from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
-from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
 from ..report.study import Request, Study
+from ..report.tables import describe_leader, format_verdict
 
 _CHUNK = 5
 _COLUMNS = (
@@ -144,7 +144,7 @@ def _compose_verdict(results: Results) -> str:
 
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
-    groups, angle = {}, "sideslip angle / mrad"
+    groups = {}
     for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
         records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)
         ratios = {record["estimator"]: record["rmse_over_bound"] for record in records}
@@ -156,21 +156,12 @@ def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
     for experiment in EXPERIMENTS:
         env = _make_env(experiment)
         log = rollout(env, seed=0).log
-        filters, beta = make_filters(experiment.filters, env.unwrapped), log.truth["beta"]
-        traces = {label: filter_.run(log)["beta"] for label, filter_ in filters.items()}
-        lines = {"truth": 1e3 * beta} | {label: 1e3 * item for label, item in traces.items()}
-        missed = {label: 1e3 * (item - beta) for label, item in traces.items()}
-        over_time = draw.draw_time_series(log.time, lines, angle)
-        if experiment is EXPERIMENTS[0]:
-            over_time.update_layout(meta="wide")
-            text = f"{experiment.text} The truth lies on top of the estimates."
-            suite.answers.append(("What does one drive look like?", over_time, text))
-        else:
-            title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
-            suite.figures.append((title, over_time, experiment.text))
-        figure = draw.draw_time_series(log.time, missed, f"error of the {angle}", zero_line=True)
-        title, caption = f"{experiment.paper}: errors (seed 0)", "Estimate minus truth."
-        suite.figures.append((title, figure, caption))
+        filters = make_filters(experiment.filters, env.unwrapped).items()
+        lines = {"truth": 1e3 * log.truth["beta"]}
+        lines |= {label: 1e3 * filter_.run(log)["beta"] for label, filter_ in filters}
+        figure = draw.draw_time_series(log.time, lines, "sideslip angle / mrad")
+        title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
+        suite.figures.append((title, figure, experiment.text))
 
 
 STUDY = Study(

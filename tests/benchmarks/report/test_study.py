@@ -18,8 +18,7 @@ from sideslip.estimators.make import ESTIMATORS
 
 pytest.importorskip("plotly")
 pytest.importorskip("moviepy")
-from sideslip.benchmarks.report import figures
-from sideslip.benchmarks.report.film import check_film, make_track_kml
+from sideslip.benchmarks.report.film import check_film
 from sideslip.benchmarks.report.html import check_page, write_report
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
@@ -167,7 +166,6 @@ def test_seeds_are_run_in_chunks_of_each_condition() -> None:
     assert [drive["a"][0] for drive in other] == [4] * 5 and other[0]["b"] == (0.0, 1.0)
 
 
-FEW, MANY, NAN = np.arange(2.0), np.arange(3.0), np.array([0.0, np.nan])
 SHORT_ROW = Suite("s", "S", "", tables=[ResultTable("short row", ("a", "b"), [["1"]])])
 
 
@@ -179,11 +177,6 @@ def write_unmarked_page(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda _: figures.draw_time_series(MANY, {"dakf": FEW}, "x"), ValueError,
-         "'dakf' has shape"),
-        (lambda _: figures.draw_track({"truth": (MANY, FEW)}), ValueError, "track 'truth'"),
-        (lambda _: figures.draw_curves(FEW, {"a": MANY}, "x", "y"), ValueError,
-         "has 3 values, x 2"),
         (lambda at: write_report(at / "a.html", [SHORT_ROW], "", {}), ValueError,
          r"short row.*1 cells under 2 headers"),
         (lambda at: write_report(at / "a.html", [], "", {}), ValueError, "at least one suite"),
@@ -191,9 +184,6 @@ def write_unmarked_page(folder: Path) -> None:
          r"a film ends in .mp4 or .gif, got '.*film.avi'"),
         (lambda at: check_film(at / "a"), ValueError, "a film ends in .mp4 or .gif"),
         (lambda at: check_film(at / "none/a.mp4"), FileNotFoundError, "no such folder"),
-        (lambda _: make_track_kml("x", {}), ValueError, "track"),
-        (lambda _: make_track_kml("x", {"short": (MANY, FEW)}), ValueError, "track"),
-        (lambda _: make_track_kml("x", {"lost": (NAN, FEW)}), ValueError, "track"),
         (write_unmarked_page, ValueError,
          r"page\.md: expected the lines <!-- tables of SUITE -->"),
     ],
