@@ -4,6 +4,7 @@ Every engine and every number of workers give the same results.
 """
 
 import io
+import math
 import os
 import socket
 import sys
@@ -27,6 +28,7 @@ Result = TypeVar("Result")
 
 PROCESSES, _RAY = _ENGINES = ("processes", "ray")
 RETRIES = 3  # deaths of its worker or node that a case outlives on a cluster
+_EVERY = 15.0  # s between two lines where no bar can be drawn
 _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
 
 
@@ -95,9 +97,6 @@ def _call(function: Callable[[Case], Result], case: Case) -> Result:
     return function(case)
 
 
-_EVERY = 15.0  # s between two lines
-
-
 def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
     """Split the seeds 0 .. seeds-1 into runs of consecutive seeds.
 
@@ -109,7 +108,7 @@ def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
 
 
 class Bar(progress.Progress):
-    """A progress bar, or where none can be drawn a line on standard error every 15 s.
+    """A progress bar, or where none can be drawn a line on standard error every `_EVERY`.
 
     Args:
         console: Console of the bar; None: nothing is shown.
@@ -120,9 +119,11 @@ class Bar(progress.Progress):
         text, count = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
         times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
         columns = (text, progress.BarColumn(20), count, *times)
-        super().__init__(*columns, console=console, disable=not shown)
+        # the pace is that of the whole work, but for the first step: what a stopped run has done
+        super().__init__(
+            *columns, console=console, disable=not shown, speed_estimate_period=math.inf
+        )
         self._speaks, self._over = console is not None and not shown, Event()
-        self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
     def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
         """Add a task as rich does, and report it in a line.
@@ -152,16 +153,12 @@ class Bar(progress.Progress):
 
     def _say(self) -> None:
         for task in self.tasks[-1:] if self._speaks else ():
-            passed, text = task.elapsed or 0.0, ""
-            last_id, since, done = self._before
+            text = ""
             if task.total is not None:
                 text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
-            if task.id != last_id or not done:  # what a stopped run has done took no time in this
-                self._before = task.id, passed, task.completed
-            elif task.total is not None and task.completed > done:
-                pace = (passed - since) / (task.completed - done)
-                text += f"{pace * (task.total - task.completed):.0f} s left, "
-            line = f"{task.description}: {text}{passed:.0f} s".lstrip(": ")
+            if left := task.time_remaining:
+                text += f"{left:.0f} s left, "
+            line = f"{task.description}: {text}{task.elapsed or 0.0:.0f} s".lstrip(": ")
             Console(stderr=True, soft_wrap=True).print(line, highlight=False, markup=False)
 
 

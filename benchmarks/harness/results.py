@@ -5,11 +5,8 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from ... import __version__
 from ...envs.io import atomic_file, from_json, write_atomic
@@ -19,7 +16,6 @@ from .stats import Estimate
 from .verdict import Explorer
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
     from plotly.graph_objects import Figure
 
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
@@ -79,7 +75,7 @@ HONESTY = (
 
 @dataclass
 class ResultTable:
-    """A table for the screen, the report and pandas."""
+    """A table for the screen and the report."""
 
     title: str
     columns: Sequence[object]  # each a `Column`, or the heading of one of texts
@@ -102,30 +98,6 @@ class ResultTable:
                 text = f"{len(line)} cells under {len(columns)} headers: {line}"
                 raise ValueError(f"table {self.title!r}: {text}")
         return [(column, [line[i] for line in lines]) for i, column in enumerate(columns)]
-
-    @property
-    def header(self) -> tuple[str, ...]:
-        """Headings of the columns."""
-        return tuple(column.heading or column.key for column, _ in self.split())
-
-    def to_pandas(self) -> "DataFrame":
-        """Convert the table to pandas, in the headings' units (needs the extra `report`)."""
-        from pandas import DataFrame
-
-        columns = self.split()
-        scaled = [[_rescale(cell, column.scale) for cell in cells] for column, cells in columns]
-        return DataFrame(list(zip(*scaled, strict=True)), columns=self.header)
-
-    def _repr_html_(self) -> str:
-        """Format the table for a notebook."""
-        table = self.to_pandas().to_html(index=False, border=0)
-        return f"<b>{escape(self.title)}</b>{table}<p>{escape(self.note)}</p>"
-
-
-def _rescale(cell: Cell, scale: float) -> Cell:
-    if cell is None or isinstance(cell, str):
-        return cell
-    return cell.rescale(scale) if isinstance(cell, Estimate) else scale * np.asarray(cell)
 
 
 @dataclass
@@ -174,18 +146,6 @@ class Suite:
                 if math.isfinite(number.value):
                     columns |= number._asdict() | {"suite": self.name, "metric": metric}
                     self.rows.append(ResultRow(**columns))
-
-    def to_pandas(self) -> "DataFrame":
-        """Convert the rows to a pandas table (needs the extra `report`)."""
-        from pandas import DataFrame
-
-        return DataFrame([asdict(row) for row in self.rows])
-
-    def _repr_html_(self) -> str:
-        """Format the verdict and the first table for a notebook."""
-        lines = "".join(f"<p>{escape(line)}</p>" for line in self.headlines)
-        first = "".join(table._repr_html_() for table in self.tables[:1])
-        return f"<h3>{escape(self.title)}</h3>{lines}{first}"
 
 
 def check_writable(*paths: Path | None) -> None:
@@ -266,8 +226,7 @@ def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
         path: File.
         rows: Rows of a run's suites.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from pandas import DataFrame
 
     with atomic_file(path) as file:
-        pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), file)
+        DataFrame(list(rows)).to_parquet(file, index=False)

@@ -26,7 +26,7 @@ class Panel:
 
 @dataclass
 class Explorer:
-    """Time series of which two are shown beside each other; ValueError for an incomplete cell."""
+    """Time series of which two are shown beside each other."""
 
     title: str
     menus: Sequence[str]  # labels of the parts of a cell's key but the last one, which is the entry
@@ -37,17 +37,6 @@ class Explorer:
     pair: tuple[str, str] = ("", "")  # the two entries at the start
     # length and width of the car (m) by the shared part of the key
     bodies: Mapping[tuple[str, ...], tuple[float, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if not self.cells:
-            raise ValueError(f"explorer {self.title!r} has no cells")
-        for key, signals in self.cells.items():
-            if len(key) != (n_names := len(self.menus) + 1):
-                text = f"{len(self.menus)} menus and an entry make {n_names}"
-                raise ValueError(f"cell {key} has {len(key)} names, {text}")
-            missing = {name for panel in self.panels for name, _ in panel.lines} - set(signals)
-            if missing or "t" not in signals:
-                raise ValueError(f"cell {key} lacks {', '.join(sorted(missing)) or 't'}")
 
 
 def format_verdict(*lines: str) -> str:

@@ -27,8 +27,8 @@ from ...envs.validation import Mask
 from ...estimators.filters import FILTERS
 from ..harness.results import Column, ResultTable, Suite, write_text
 from ..harness.stats import Estimate, interval
+from ..harness.verdict import format_verdict
 from ..report.film import make_track_kml
-from ..report.tables import format_verdict
 
 _GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored
@@ -319,7 +319,8 @@ def write_kml(path: Path, replay: ReceiverReplay) -> None:
         replay: Results of a log.
     """
     track = replay.track
-    write_text(path, make_track_kml(replay.name, "fixes", track.east, track.north, track.origin))
+    fixes = {"fixes": (track.east, track.north)}
+    write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:

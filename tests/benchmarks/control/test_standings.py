@@ -274,6 +274,6 @@ def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
     shown = _make_motion_table("", standing)
     for metric in EPISODE:
         if metric.heading:
-            column = list(shown.header).index(metric.heading)
+            column = [x.heading for x in format_columns(shown)].index(metric.heading)
             value = float(texts(shown)[0][column]) / metric.scale
             assert value == pytest.approx(standing[0].mean(metric.name), abs=0.5 / metric.scale)

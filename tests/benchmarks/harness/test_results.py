@@ -12,10 +12,7 @@ import pytest
 
 from sideslip.benchmarks.harness.metrics import EPISODE, METRICS, REDUCTIONS, compute_dissipation
 from sideslip.benchmarks.harness.results import (
-    Column,
     ResultRow,
-    ResultTable,
-    Suite,
     check_writable,
     read_json,
     write_json,
@@ -37,17 +34,6 @@ def test_rows_round_trip_through_json(tmp_path: Path) -> None:
     assert math.isnan(second.low) and second.value == 2.5 and second.verdict == "report only"
     assert "NaN" not in path.read_text()
     assert os.listdir(tmp_path) == ["rows.json"]
-
-
-def test_a_notebook_shows_verdict_and_table_and_pandas_has_the_rows() -> None:
-    columns = ("who", Column("cost", "cost / %", 100.0))
-    table = ResultTable("Costs", columns, [{"who": "a < b", "cost": 0.5}], "n = 3")
-    suite = Suite("s", "A suite", "", ROWS, [table], verdict="a wins.\nb does not.")
-    html = suite._repr_html_()
-    for text in ("<p>a wins.</p>", "A suite", "a &lt; b", "n = 3"):
-        assert text in html
-    assert suite.to_pandas().to_dict("records")[0]["metric"] == ROWS[0].metric
-    assert table.to_pandas()["cost / %"].tolist() == [50.0]
 
 
 def test_rows_as_parquet(tmp_path: Path) -> None:

@@ -10,8 +10,6 @@ from sideslip.benchmarks.harness.stats import Estimate
 from sideslip.benchmarks.harness.verdict import (
     LETTERS,
     LINES,
-    Explorer,
-    Panel,
     describe_leader,
     format_verdict,
 )
@@ -138,13 +136,3 @@ def test_speed_counts_its_goals_and_names_those_that_are_missed() -> None:
     assert lines[0].startswith("10 ms of driving cost 10 us on one core, 0.5 us a car")
     assert "it is 30 for lane-keeping" in lines[1]
     assert lines[2] == "1 of 3 goals are met; not met: b (3 of >= 9 x)."
-
-
-def test_cells_that_do_not_fit_an_explorer_are_refused() -> None:
-    t, panels = np.zeros(3), (Panel("slip / mrad", (("beta", "true"),)),)
-    with pytest.raises(ValueError, match="no cells"):
-        Explorer("x", ("a",), {}, panels)
-    with pytest.raises(ValueError, match="has 1 names, 1 menus and an entry make 2"):
-        Explorer("x", ("a",), {("p",): {"t": t, "beta": t}}, panels)
-    with pytest.raises(ValueError, match="lacks beta"):
-        Explorer("x", (), {("p",): {"t": t}}, panels)

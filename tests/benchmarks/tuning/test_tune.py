@@ -179,7 +179,7 @@ def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Pat
     )
     suite, found = tune_study.run(task, SearchOptions(8, storage(tmp_path), jobs=1), 3)
     comparison, numbers = suite.tables
-    assert comparison.header == ("tuning", "2 training seeds", "3 test seeds")
+    assert comparison.columns == ("tuning", "2 training seeds", "3 test seeds")
     assert [row[0] for row in comparison.cells] == ["default", "found"]
     assert numbers.cells[0][0] == "q_beta" and "over default" in comparison.note
     entry = tune_study.make_entry(task, found, "a command")
