@@ -6,7 +6,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from ..harness.parallel import split_seeds
-from ..harness.results import VERDICTS, ResultTable, Suite
+from ..harness.results import VERDICTS, Column, Line, ResultTable, Suite
 from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
 from . import (
@@ -97,7 +97,7 @@ _RANGE_NOTE = (
 
 
 def _add_tables(suite: Suite, results: LedgerResults) -> None:
-    verdicts, remarks, numbers = [], [], dict[str, list[list[str]]]()
+    verdicts, remarks, numbers = [], [], dict[str, list[Line]]()
     for entry in results.ledger:
         claim = entry.claim
         columns = {"verdict": entry.verdict, "paper": f"{entry.source}: {claim.text}"}
@@ -106,31 +106,27 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
             suite.add_rows([{**record, "n": len(item.values), item.part.metric: item.number}])
         verdicts.append([entry.source, claim.text, entry.verdict, _format_checks(entry.parts)])
         remarks += [[entry.source, claim.note]] if claim.note else []
-        cells = [_format_part(claim.source, item) for item in entry.parts]
-        numbers.setdefault(claim.paper, []).extend(cells)
+        lines = [_make_line(claim.source, item) for item in entry.parts]
+        numbers.setdefault(claim.paper, []).extend(lines)
     title = "The claims and what became of them"
-    header: tuple[str, ...] = ("paper", "claim", "verdict", "thresholds")
+    header = ("paper", "claim", "verdict", "thresholds")
     suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
     suite.tables.append(ResultTable("Why", ("paper", "what was found"), remarks, keyed=False))
-    header = ("number", "median [range]", "paper states", "threshold")
-    for paper, cells in numbers.items():
+    columns = ("number", Column("median [range]", form=".3g"), "paper states", "threshold")
+    for paper, lines in numbers.items():
         title = f"{paper}: what was measured"
-        suite.tables.append(ResultTable(title, header, cells, _RANGE_NOTE, keyed=False))
+        suite.tables.append(ResultTable(title, columns, lines, _RANGE_NOTE, keyed=False))
 
 
-def _format_part(source: str, item: MeasuredPart) -> list[str]:
+def _make_line(source: str, item: MeasuredPart) -> Line:
     part, number = item.part, item.number
-    median, low, high = map(_format_number, number)
-    shown = median if number.low == number.high else f"{median} [{low}, {high}]"
-    stated = f"{part.stated} ({100.0 * item.agreement:.0f} %)" if part.stated else ""
     met = "met" if item.meets_threshold else "MISSED"
-    check = f"{part.threshold} {met}" if part.threshold else ""
-    return [f"{source}: {part.label}", shown, stated, check]
-
-
-def _format_number(value: float) -> str:
-    """Format three digits; of rounding errors the order of magnitude is enough."""
-    return f"{value:.0e}" if 0.0 < abs(value) < 1e-6 else f"{value:.3g}"
+    return {
+        "number": f"{source}: {part.label}",
+        "median [range]": number if number.low < number.high else number.value,
+        "paper states": part.stated and f"{part.stated} ({100.0 * item.agreement:.0f} %)",
+        "threshold": part.threshold and f"{part.threshold} {met}",
+    }
 
 
 def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:

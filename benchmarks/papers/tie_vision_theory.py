@@ -145,13 +145,6 @@ def _make_transitions() -> tuple[Array, Array]:
     return held, latched
 
 
-def _compute_literal_gain(Q: Array) -> Array:
-    """Compute the Kalman gain of (13) at 1 ms with a measurement at every step, (6, 3)."""
-    _, latched = _make_transitions()
-    noise = np.diag([*Q, 0.0, 0.0]) * 1e-3
-    return kalman.kalman_gain(solve_discrete_are(latched.T, C.T, noise, R), C, R)
-
-
 def _compute_spectral_radius(K: Array) -> float:
     """Compute the growth of (error, estimated error e) over a frame: (19)-(22), gyro at 1 ms."""
     held, latched = _make_transitions()
@@ -174,8 +167,11 @@ def _measure_tunings(seed: int) -> Numbers:
     sensors = {"camera": CAMERA_33_30}
     make: Any = partial(make_estimator, "multirate-residual-kf", vehicle=COMS, sensors=sensors)
     shipped = [make(speed=SPEED, Q=Q, allow_unstable=True).spectral_radius for Q in tunings]
-    literal = [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings]
-    radii = {LITERAL: literal, SPREAD: shipped}
+    _, latched = _make_transitions()
+    noises = (np.diag([*Q, 0.0, 0.0]) * 1e-3 for Q in tunings)
+    covariances = (solve_discrete_are(latched.T, C.T, noise, R) for noise in noises)
+    gains = (kalman.kalman_gain(P, C, R) for P in covariances)  # a measurement at every step
+    radii = {LITERAL: list(map(_compute_spectral_radius, gains)), SPREAD: shipped}
     shares = {name: float(np.mean(np.array(x) > 1.0 + 1e-9)) for name, x in radii.items()}
     return {(name, "share"): value for name, value in shares.items()}
 

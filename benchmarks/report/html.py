@@ -132,11 +132,6 @@ _MIN_PACKED = 40  # a shorter array is left as it is
 _LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
 
 
-def _pack_text(text: str) -> str:
-    """Pack a text for the page's `unpack`; the same text gives the same letters."""
-    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
-
-
 def _encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, object]:
     """Encode numbers as steps in quanta; null for a gap.
 
@@ -181,12 +176,10 @@ def write_report(
 
     Args:
         path: File, written whole or not at all.
-        suites: Results of one suite at least; ValueError without one.
+        suites: Results of one suite at least.
         command: Command line that made the suites.
         environment: Versions by name.
     """
-    if not suites:
-        raise ValueError("a report needs at least one suite")
     facts = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
     drawn = any(suite.answers or suite.figures or suite.explorers for suite in suites)
     script = _read_asset("report.js") + "\n\n" + _read_asset("explorer.js")
@@ -274,8 +267,9 @@ def _select_samples(values: Array) -> Array:
 
 
 def _format_data(name: str, text: str) -> str:
-    """Format a packed text, which no browser runs."""
-    return f'<script type="application/gzip" data-name="{name}">{_pack_text(text)}</script>'
+    """Pack a text for the page's `unpack`, which no browser runs; it gives the same letters."""
+    packed = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+    return f'<script type="application/gzip" data-name="{name}">{packed}</script>'
 
 
 def _hash(script: str) -> str:

@@ -115,14 +115,6 @@ class Study(Generic[Results]):
         results = self.measure(replace(request, episodes=count))
         self.add_tables(suite, results)
         suite.verdict = self.compose_verdict(results)
-        if self.add_figures is not None and (figures := import_figures()) is not None:
-            self.add_figures(suite, results, figures)
+        if self.add_figures is not None and find_spec("plotly") is not None:
+            self.add_figures(suite, results, import_module(".figures", __package__))
         return suite
-
-
-def import_figures() -> ModuleType | None:
-    """Import the functions that draw, `report.figures`; None where plotly is not installed."""
-    try:
-        return import_module(".figures", __package__)
-    except ModuleNotFoundError:
-        return None

@@ -139,7 +139,7 @@ def test_pictures_are_drawn_where_plotly_is(monkeypatch: pytest.MonkeyPatch) -> 
     drawn: list[Any] = []
     run(Request(), add_figures=lambda *arguments: drawn.append(arguments))
     assert drawn[0][1] == 8 and drawn[0][2].draw_groups
-    monkeypatch.setattr("sideslip.benchmarks.report.study.import_figures", lambda: None)
+    monkeypatch.setattr("sideslip.benchmarks.report.study.find_spec", lambda _: None)
     run(Request(), add_figures=lambda *arguments: drawn.append(arguments))
     assert len(drawn) == 1
 
@@ -179,7 +179,6 @@ def write_unmarked_page(folder: Path) -> None:
     [
         (lambda at: write_report(at / "a.html", [SHORT_ROW], "", {}), ValueError,
          r"short row.*1 cells under 2 headers"),
-        (lambda at: write_report(at / "a.html", [], "", {}), ValueError, "at least one suite"),
         (lambda at: check_film(at / "film.avi"), ValueError,
          r"a film ends in .mp4 or .gif, got '.*film.avi'"),
         (lambda at: check_film(at / "a"), ValueError, "a film ends in .mp4 or .gif"),
