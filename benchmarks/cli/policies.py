@@ -2,12 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from rich import box
@@ -28,7 +25,6 @@ if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask
     from ...agents.training.trainer import TrainResult
 
-ENV = "sideslip/YawVision-v1"
 EPISODES = 256  # of a policy's test
 
 
@@ -38,7 +34,7 @@ class _Export:
 
     zipped: Path = take_argument("Zip of stable-baselines3.", ..., metavar="ZIP")
     out: File = take("Default: NAME.safetensors beside it.", None, "--out", "-o")
-    env: str = take("The id that it was trained on.", ENV)
+    env: str = take("The id that it was trained on.", "sideslip/YawVision-v1")
     estimator: str = take("The estimator around it.", "")
     option: Texts = take("NAME=VALUE of the environment; repeatable.")
     normalise: File = take("VecNormalize's pickle; default: NAME.pkl or vecnormalize.pkl beside.")
@@ -68,28 +64,14 @@ def _describe_sizes(network: "Network") -> str:
     return " x ".join([str(network.inputs), *frames, *cells, *layers])
 
 
-@contextmanager
-def _export_policy(name: str, env: Text, trust: bool) -> Iterator[str]:
-    """Yield a policy's name or path; for a zip the path of its export in a temporary folder."""
-    if not name.endswith(".zip"):
-        yield name
-        return
-    from ...agents.training.export import export_zip
-
-    with TemporaryDirectory() as folder:
-        target = Path(folder) / f"{Path(name).stem}.safetensors"
-        export_zip(name, target, env or ENV, trust=trust)
-        yield str(target)
-
-
 @register("enjoy", "Drive a policy beside other controllers.")
 class _Enjoy:
     """Drive a learned policy: its cost against no control and the best classical line.
 
-    A zip drives the id that it was trained on (--env); `sideslip export` takes further options.
+    `sideslip export` makes a file of a zip.
     """
 
-    policy: str = take_argument("A shipped policy's name, or a file's or zip's path.", ...)
+    policy: str = take_argument("A shipped policy's name, or a file's path.", ...)
     env: Text = take("Another id than the policy's own.")
     episodes: int = take("Number of episodes.", 256, min=1)
     scenario: Text = take("A scenario's name.")
@@ -100,7 +82,6 @@ class _Enjoy:
     plot: File = take("Write the first episode as a PNG.", ends=".png .pdf .svg")
     video: File = take("Write it as a film, .mp4 or .gif, no control beside it.")
     card: bool = take("Show the policy's card, no more.", False, "--card")
-    trust: bool
 
     def run(self) -> None:
         from ...agents.learned.policy import load_policy
@@ -108,25 +89,22 @@ class _Enjoy:
         from ..report.film import FilmDriver, check_film, write_film
         from ..studies.policies import evaluate_policy
 
-        console = Console()
+        console, options = Console(), {"env_id": self.env, "scenario": self.scenario}
         check_film(self.video)
-        with _export_policy(self.policy, self.env, self.trust) as path:
-            if self.card:
-                _show_card(console, load_policy(path))
-                return
-            with use_shared_bar(console, f"enjoy {self.policy}"):
-                evaluation = evaluate_policy(
-                    path, self.episodes, env_id=self.env, scenario=self.scenario, seed=self.seed
-                )
-            write_output(console, [evaluation.make_suite()], vars(self))
-            name, seed, task = evaluation.policy.name, evaluation.seeds[0], evaluation.task
-            first = evaluation.entries[name]
-            show_episode(console, rollout(*first.make(task), seed), name, {"plot": self.plot})
-            if self.video is not None:
-                cars = (name, first), ("no control", evaluation.entries["none"])
-                drivers = [FilmDriver(driver, *entry.make(task)) for driver, entry in cars]
-                write_film(self.video, drivers, seed, console)
-                print_written(console, self.video)
+        if self.card:
+            _show_card(console, load_policy(self.policy))
+            return
+        with use_shared_bar(console, f"enjoy {self.policy}"):
+            evaluation = evaluate_policy(self.policy, self.episodes, seed=self.seed, **options)
+        write_output(console, [evaluation.make_suite()], vars(self))
+        name, seed, task = evaluation.policy.name, evaluation.seeds[0], evaluation.task
+        first = evaluation.entries[name]
+        show_episode(console, rollout(*first.make(task), seed), name, {"plot": self.plot})
+        if self.video is not None:
+            cars = (name, first), ("no control", evaluation.entries["none"])
+            drivers = [FilmDriver(driver, *entry.make(task)) for driver, entry in cars]
+            write_film(self.video, drivers, seed, console)
+            print_written(console, self.video)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:

@@ -112,10 +112,10 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
     header = ("paper", "claim", "verdict", "thresholds")
     suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
     suite.tables.append(ResultTable("Why", ("paper", "what was found"), remarks, keyed=False))
-    columns = ("number", Column("median [range]", form=".3g"), "paper states", "threshold")
+    heads = ("number", Column("median [range]", form=".3g"), "paper states", "threshold")
     for paper, lines in numbers.items():
         title = f"{paper}: what was measured"
-        suite.tables.append(ResultTable(title, columns, lines, _RANGE_NOTE, keyed=False))
+        suite.tables.append(ResultTable(title, heads, lines, _RANGE_NOTE, keyed=False))
 
 
 def _make_line(source: str, item: MeasuredPart) -> Line:
