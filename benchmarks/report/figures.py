@@ -129,8 +129,7 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
         shown = np.unique(np.linspace(0, len(y) - 1, min(len(y), POINTS)).round().astype(int))
         figure.add_trace(_make_line(name, x[shown], y[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
-    height = int(np.clip(120 + 900 * _compute_slimness(figure), 280, 640))
-    return _finish(_sort_facts(figure), "x / m", "y / m", height, hovermode="closest")
+    return _finish(_sort_facts(figure), "x / m", "y / m", 400, hovermode="closest")
 
 
 def draw_groups(
@@ -183,16 +182,6 @@ def _make_line(
         return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
     pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else 1.8}
     return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
-
-
-def _compute_slimness(figure: go.Figure) -> float:
-    """Compute the height over the width of all paths."""
-    spans = []
-    for axis in ("y", "x"):
-        values = np.concatenate([*(trace[axis] for trace in figure.data), np.zeros(0)])
-        finite = values[np.isfinite(values)]
-        spans.append(float(np.ptp(finite)) if len(finite) else 0.0)
-    return spans[0] / max(spans[1], 1e-9)
 
 
 def _sort_facts(figure: go.Figure) -> go.Figure:

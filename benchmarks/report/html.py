@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import Array
 from ...envs.rendering.palette import INK, find_base, find_colour
 from ..harness.results import ResultTable, Suite, write_text
 from ..harness.verdict import Explorer
@@ -59,7 +58,10 @@ def _format_column(column: TextColumn, is_first: bool, keyed: bool) -> list[str]
         has_value = column.is_numeric and value is not None
         data = f' data-value="{value!r}"'.replace("inf", "Infinity") if has_value else ""
         tag = 'th scope="row"' if is_first else "td"
-        key = _format_key(text) if is_first and keyed else ""
+        key = ""
+        if is_first and keyed and find_base(text) is not None:  # its colour as a small square
+            shade = find_colour(text).replace(INK, "var(--ink)")
+            key = f'<i class="key" style="background:{shade}"></i>'
         kind = ' class="long"' if len(text) > _MAX_LETTERS else _format_class(column.is_numeric)
         cells.append(f"<{tag}{kind}{data}>{key}{escape(text)}</{tag[:2]}>")
     return cells
@@ -67,14 +69,6 @@ def _format_column(column: TextColumn, is_first: bool, keyed: bool) -> list[str]
 
 def _format_class(is_number: bool) -> str:
     return ' class="number"' if is_number else ""
-
-
-def _format_key(cell: str) -> str:
-    """Format the colour of an estimator or controller as a small square."""
-    if find_base(cell) is None:
-        return ""
-    shade = find_colour(cell)
-    return f'<i class="key" style="background:{"var(--ink)" if shade == INK else shade}"></i>'
 
 
 def _mark_code(text: str) -> str:
@@ -243,27 +237,24 @@ def _format_figure(title: str, figure: "Figure", caption: str) -> str:
 
 def _format_explorer(explorer: Explorer) -> str:
     """Format two cells side by side; `explorer.js` makes the menus and draws."""
-    cells = ((list(key), signals.items()) for key, signals in explorer.cells.items())
+    cells = []
+    for key, signals in explorer.cells.items():  # POINTS samples at most, at the same places
+        n = len(signals["t"])
+        shown = np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))
+        cells.append([list(key), {name: _encode_steps(y[shown]) for name, y in signals.items()}])
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
         "panels": [{"label": p.label, "lines": list(map(list, p.lines))} for p in explorer.panels],
         "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
         "colours": {key[-1]: find_colour(key[-1]) for key in explorer.cells},
-        "cells": [[key, {x: _encode_steps(_select_samples(y)) for x, y in z}] for key, z in cells],
+        "cells": cells,
     }
     return (
         f'<figure class="explorer wide">\n<h3>{escape(explorer.title)}</h3>\n'
         f"{_format_data('explorer', json.dumps(content, separators=(',', ':')))}\n"
         f"<figcaption>{_mark_code(explorer.caption)}</figcaption>\n</figure>"
     )
-
-
-def _select_samples(values: Array) -> Array:
-    """Select at most POINTS samples, of every signal of a cell at the same places."""
-    n = len(values)
-    chosen: Array = values[np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))]
-    return chosen
 
 
 def _format_data(name: str, text: str) -> str:

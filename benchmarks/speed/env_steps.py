@@ -38,7 +38,6 @@ FILTERED = f"{AT_ONCE} + exact-kf, full P"
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
 CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
 CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT}"
-ENVPOOL = f"{PENDULUMS} (EnvPool)"
 
 
 def _choose_upright_action(obs: Array) -> npt.NDArray[np.int_]:
@@ -102,15 +101,6 @@ def _make_cartpoles() -> Workload:
     return Workload(run_steps, len(actions) * COUNT)
 
 
-def _make_envpool() -> Workload:
-    import envpool
-
-    env: Any = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=COUNT, num_threads=1)
-    env.reset()
-    idle = np.zeros((COUNT, 1), np.float32)
-    return Workload(lambda: _repeat_step(env, idle, _STEPS), _STEPS * COUNT)
-
-
 def _make_lane_keeping() -> Workload:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -140,7 +130,6 @@ def make_workloads() -> WorkloadSet:
     field.add(CARTPOLES, _make_cartpoles)
     # Pendulum has no batch of arrays
     field.add(PENDULUMS, lambda: _make_batch(make("Pendulum-v1", COUNT, "sync"), 1))
-    field.add(ENVPOOL, _make_envpool, "envpool")
     return field
 
 

@@ -41,14 +41,11 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 
 def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the optional packages: the suite needs none of them."""
-    without(monkeypatch, "highway_env", "envpool")
+    without(monkeypatch, "highway_env")
     measured, taken, absent = measure(env_steps.make_workloads())
     assert {env_steps.FUSION_V1, env_steps.V1_AT_ONCE, env_steps.FILTERED} <= set(taken)
     assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
-    assert absent == {
-        env_steps.LANE: "highway-env is not installed",
-        env_steps.ENVPOOL: "envpool is not installed",
-    }
+    assert absent == {env_steps.LANE: "highway-env is not installed"}
     rows = {(row.scenario, row.metric) for row in measured.rows}
     assert rows == {(name, "us_per_step") for name in taken}
     assert all(0.0 < row.low <= row.value <= row.high for row in measured.rows)
