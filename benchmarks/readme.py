@@ -1,11 +1,10 @@
-"""The tables of results in README.md and docs/results/benchmark.md, and README's sentences.
+"""The tables of results in README.md and docs/results/benchmark.md.
 
 `python -m sideslip.benchmarks.readme` drives the entries in every task with steering, and writes
 their rows to docs/first.json and both tables. The columns of transfer are those of
 docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes.
 """
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -55,8 +54,6 @@ PAGE_ENTRIES = ENTRIES | {  # the lines of the page's tables
     "policy on late samples alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
     "a controller given the true car, not its state": [(PARAMETERS, "")],
 }
-_BEST, _TUNED = "`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`"
-_FAST = "road", "limit"  # tiers of the passenger car
 _PROCEDURES = {"distill-car-steering": "policy on joint"}
 _TRANSFER = {
     "FMVSS 126": ("fmvss-126 passenger-car", "amplitude", 1.0, ".1f"),
@@ -205,34 +202,6 @@ def format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
     """
     body = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([f"| | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|", *body])
-
-
-def _make_headlines(root: Path) -> list[str]:
-    """Make README's sentences with numbers from the files in docs.
-
-    `python -m sideslip.benchmarks.tuning.next_car --out docs/next_car.json` and `sideslip bench
-    speed --json docs/speed.json` write the other files.
-    """
-    table = json.loads((root / "docs/next_car.json").read_text(encoding="utf-8"))
-    whole = table["rows"][0]
-    key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
-    (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
-    cells, pairs = _Cells(read_json(root / ROWS)), (ENTRIES[_BEST], ENTRIES[_TUNED])
-    (best, best_lost), (tuned, tuned_lost) = (
-        [
-            [round(100.0 * cells.find(f"tier {tier}", pair)[metric].value) for tier in _FAST]
-            for metric in METRICS[:2]
-        ]
-        for pair in pairs
-    )
-    return [
-        f"costs {best[0]} % of untuned LQG on the road and {best[1]} % at the limit. Tuned LQG "
-        f"costs {tuned[0]} and {tuned[1]} %. At the limit MPC loses {best_lost[1]} % of the "
-        f"cars, tuned LQG {tuned_lost[1]} %.",
-        f"On {table['n']} of them it errs {whole['rms / deg']:.2f} deg (RMS), and its 95 % "
-        f"interval holds {whole['in 95 % / %']:.0f} % of the time.",
-        f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
-    ]
 
 
 def replace_table(text: str, new_table: str) -> str:

@@ -17,7 +17,7 @@ from ..harness.stats import Estimate
 with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
 
-SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
+_SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
 """Colours from bad to good, safe for the colour-blind."""
 POINTS = 1000  # maximum of points of a line: a figure is no wider in pixels
 _DASHES = {"reference": "dash", "bound": "dot"}
@@ -26,11 +26,7 @@ _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
 
 
 def _choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Choose (colour, dash) of each line: no two alike, a variant of a known name dashed.
-
-    >>> [dash for _, dash in _choose_line_styles(["exact-kf", "exact-kf, true model"]).values()]
-    ['solid', 'dash']
-    """
+    """Choose (colour, dash) of each line: no two alike, a variant of a known name dashed."""
     styles: dict[str, tuple[str, str]] = {}
     for name in names:
         known = find_base(name)
@@ -62,7 +58,6 @@ def draw_time_series(
     t: Array,
     series: Mapping[str, Array],
     unit_label: str,
-    x_label: str = "time / s",
     dots: Collection[str] = (),
     zero_line: bool = False,
 ) -> go.Figure:
@@ -72,7 +67,6 @@ def draw_time_series(
         t: Times (s), shape (n,).
         series: Values by name, shape (n,) each.
         unit_label: Quantity and unit, as "sideslip angle / mrad".
-        x_label: Quantity and unit of `t`.
         dots: Names that are drawn as dots, for packets with NaN between them.
         zero_line: Whether a line is drawn at zero, for errors.
     """
@@ -90,7 +84,7 @@ def draw_time_series(
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
     if zero_line:
         figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
-    return _finish(_sort_facts(figure), x_label, unit_label, 380, hovermode="x unified")
+    return _finish(_sort_facts(figure), "time / s", unit_label, 380, hovermode="x unified")
 
 
 def draw_curves(
@@ -211,8 +205,8 @@ def draw_heat_map(
         unit: Unit of the numbers.
         good: Which values are the good ones (blue), "high" or "low".
     """
-    flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
-    scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
+    flipped = [(1.0 - at, shade) for at, shade in _SHARE_SCALE[::-1]]
+    scale = [list(stop) for stop in (_SHARE_SCALE if good == "high" else flipped)]
     low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
     trace = go.Heatmap(
         z=values, x=list(columns), y=list(names), zmin=float(low), zmax=float(high),

@@ -127,11 +127,7 @@ _LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
 
 
 def _encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, object]:
-    """Encode numbers as steps in quanta; null for a gap.
-
-    >>> _encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
-    {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
-    """
+    """Encode numbers as steps in quanta; null for a gap."""
     v = np.asarray(values, float)
     finite = np.isfinite(v)
     low, high = (float(v[finite].min()), float(v[finite].max())) if finite.any() else (0.0, 0.0)

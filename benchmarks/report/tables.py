@@ -49,13 +49,7 @@ def format_columns(table: ResultTable) -> list[TextColumn]:
 
 
 def _format_cell(cell: Cell, column: Column) -> str:
-    """Format a cell: a number with its interval in brackets, nothing for NaN.
-
-    >>> _format_cell(Estimate(0.0312, 0.03, 0.0325), Column("rmse", "RMSE / mrad", 1e3, ".1f"))
-    '31.2 [30.0, 32.5]'
-    >>> _format_cell((2.0, 3.5), Column("x", form="{:.0f} of {:.1f}")), _format_cell(7, Column("n"))
-    ('2 of 3.5', '7')
-    """
+    """Format a cell: a number with its interval in brackets, nothing for NaN."""
     if isinstance(cell, str):
         return cell
     if _get_value(cell) is None or cell is None:

@@ -1,5 +1,6 @@
 """The tables and numbers of README and docs/results/benchmark.md are those of their files."""
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -45,9 +46,30 @@ def test_the_readme_is_a_door() -> None:
 
 
 def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
+    """`python -m sideslip.benchmarks.tuning.next_car --out docs/next_car.json` and `sideslip bench
+    speed --json docs/speed.json` write two of them."""
+    table = json.loads((ROOT / "docs/next_car.json").read_text())
+    key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(ROOT / "docs/speed.json")
+    (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
+    cells = readme._Cells(read_json(ROOT / readme.ROWS))
+    (best, best_lost), (tuned, tuned_lost) = (
+        [
+            [round(100.0 * cells.find(f"tier {tier}", readme.ENTRIES[name])[metric].value)
+             for tier in ("road", "limit")]
+            for metric in readme.METRICS[:2]
+        ]
+        for name in ("`adaptive-nmpc` on `joint`", "tuned LQG: `lqr` on `exact-kf`")
+    )  # fmt: skip
     text = " ".join((ROOT / readme.README).read_text().split())
-    lines = readme._make_headlines(ROOT)
-    assert lines and all(line in text for line in lines)
+    for line in (
+        f"costs {best[0]} % of untuned LQG on the road and {best[1]} % at the limit. Tuned LQG "
+        f"costs {tuned[0]} and {tuned[1]} %. At the limit MPC loses {best_lost[1]} % of the "
+        f"cars, tuned LQG {tuned_lost[1]} %.",
+        f"On {table['n']} of them it errs {table['rows'][0]['rms / deg']:.2f} deg (RMS), and its "
+        f"95 % interval holds {table['rows'][0]['in 95 % / %']:.0f} % of the time.",
+        f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
+    ):
+        assert line in text
 
 
 def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -> None:

@@ -30,8 +30,8 @@ def test_colours_stay_with_their_names() -> None:
     names = [*COLOURS, "somebody-else", "two-dof (1 ms)", "two-dof (33 ms)"]
     styles = figures._choose_line_styles(names)
     assert len(set(styles.values())) == len(names)
-    style = figures._choose_line_styles(["multirate-kf"])["multirate-kf"]
-    assert style == (COLOURS["multirate-kf"], "solid")
+    styles = figures._choose_line_styles(["exact-kf", "exact-kf, true model"])
+    assert [dash for _, dash in styles.values()] == ["solid", "dash"]
 
 
 def test_every_filter_controller_and_rung_has_a_colour_of_its_own() -> None:
