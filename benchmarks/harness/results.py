@@ -86,17 +86,12 @@ class ResultTable:
     opened: bool = False  # the report shows it unfolded
 
     def split(self) -> list[tuple[Column, list[Cell]]]:
-        """Split the table into columns with their cells; ValueError for a line of other length."""
+        """Split the table into columns with their cells."""
         columns = [x if isinstance(x, Column) else Column(str(x)) for x in self.columns]
-        lines = list[Sequence[Cell]]()
-        for line in self.cells:
-            if isinstance(line, Mapping):
-                lines.append([line.get(column.key) for column in columns])
-            elif len(line) == len(columns):
-                lines.append(line)
-            else:
-                text = f"{len(line)} cells under {len(columns)} headers: {line}"
-                raise ValueError(f"table {self.title!r}: {text}")
+        lines = [
+            [line.get(column.key) for column in columns] if isinstance(line, Mapping) else line
+            for line in self.cells
+        ]
         return [(column, [line[i] for line in lines]) for i, column in enumerate(columns)]
 
 

@@ -109,7 +109,7 @@ def _compute_length_share(car: TestCar) -> float:
 
 def _make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
     """Make a run through a track at a speed (m/s)."""
-    last = make_sections(track, car.vehicle.width, 0.0, _compute_length_share(car))[-1]
+    last = _make_lanes(car, track, 0.0)[-1]
     way = last.start + last.length + RUN_OUT
     return {
         "steering": "driver", "path": track, "path_speed": speed / _compute_length_share(car),

@@ -33,7 +33,7 @@ _MAX_LETTERS = 40  # letters: a longer cell wraps
 
 
 def _format_table(table: ResultTable) -> str:
-    """Format a folded table; ValueError for a row that is not as long as the header."""
+    """Format a folded table."""
     columns = format_columns(table)
     heads = "".join(
         f'<th scope="col" aria-sort="none"{_format_class(column.is_numeric)}>'

@@ -35,7 +35,7 @@ class TextColumn(NamedTuple):
 
 
 def format_columns(table: ResultTable) -> list[TextColumn]:
-    """Format the columns of a table; ValueError for a line that is not as long.
+    """Format the columns of a table.
 
     Args:
         table: Table.
