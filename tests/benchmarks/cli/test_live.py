@@ -118,6 +118,8 @@ def test_a_zip_is_exported_and_drives(run: Run, zipped: Path, tmp_path: Path) ->
     )
     card = load_policy(other).card
     assert card.estimator == "bicycle-kf" and card.env_id == GPS
+    status, out, err = run("enjoy", other, "--card")
+    assert status == 0 and "x 8 x 4 x 1" in out and "bicycle-kf" in out, err
     for file, trust in ((other, ()), (zipped, ("--trust",))):
         status, out, err = run("run", GPS, "--agent", file, "--estimator", "bicycle-kf", *trust)
         assert status == 0 and "cost" in out, err
