@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from .agents import make_agent, register_agent
     from .agents.rollout import rollout
     from .estimators import make_estimator, register_estimator
-    from .estimators.frame import estimate
-    from .estimators.stream import Stream
+    from .estimators.joint import Stream, estimate
 
 __version__ = "0.2.0"
 __all__ = [
@@ -52,8 +51,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Stream": ".estimators.stream",
-    "estimate": ".estimators.frame",
+    "Stream": ".estimators.joint",
+    "estimate": ".estimators.joint",
     "make_agent": ".agents",
     "make_estimator": ".estimators",
     "register_agent": ".agents",

@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
 from ..envs.validation import check_options
-from ..estimators.registry import Registry
+from ..estimators.make import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.lane_keeping import LaneKeeping
 from .controllers.lqr import Lqr

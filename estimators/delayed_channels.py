@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord, advance, process_packet_all
+from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord
 from .core.record import FILTER, FilterRecords
 from .design.options import FAST_CHANNELS, FIND
 from .design.periodic import count_ticks
-from .estimator import Estimator, compile_filter_call
+from .estimator import Estimator, compile_advance
 from .protocol import compute_std
 
 _MAX_SEARCHED_LATENCY = 0.12  # s
@@ -127,7 +127,7 @@ class _LatencySearch:
         packets = np.ascontiguousarray(packets[is_past])
         nis = np.full(len(packets), np.nan)
         record = StepRecord(fast, count, packets, len(packets))
-        compile_filter_call(advance)(filters, gains, record, 0, NO_OUTPUTS._replace(nis=nis))
+        compile_advance()(filters, gains, record, 0, NO_OUTPUTS._replace(nis=nis))
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
@@ -162,9 +162,6 @@ class LateEstimator(Estimator):
         """Ticks by column."""
         search = self._search
         return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
-
-    def _receive(self, packet: Array) -> None:
-        self.take(StepRecord(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1))
 
     def take(self, record: StepRecord, outputs: FilterOutputs = NO_OUTPUTS) -> None:
         """Process rows and packets; one that `delayed_filters` uses in a later call has no NIS.
@@ -214,13 +211,9 @@ class LateEstimator(Estimator):
         """Pass rows and packets to `delayed_filters`."""
         packets = np.ascontiguousarray(pending[:, :_INDEX_COLUMN])
         pending_nis = np.full(len(pending), np.nan)
-        if len(fast):
-            record = StepRecord(fast, len(fast), packets, len(packets))
-            outputs = NO_OUTPUTS._replace(nis=pending_nis)
-            compile_filter_call(advance)(self.delayed_filters, self.gains, record, 0, outputs)
-        else:
-            for packet in packets:
-                compile_filter_call(process_packet_all)(self.delayed_filters, self.gains, packet)
+        record = StepRecord(fast, len(fast), packets, len(packets))
+        outputs = NO_OUTPUTS._replace(nis=pending_nis)
+        compile_advance()(self.delayed_filters, self.gains, record, 0, outputs)
         if len(nis):
             is_new = pending[:, _INDEX_COLUMN] >= 0.0
             nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
@@ -236,7 +229,7 @@ class LateEstimator(Estimator):
             rows = _align_rows(self._rows, self._lags)
             packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
             record = StepRecord(rows, len(rows), packets, len(packets))
-            compile_filter_call(advance)(self.filters, self.gains, record, 0, NO_OUTPUTS)
+            compile_advance()(self.filters, self.gains, record, 0, NO_OUTPUTS)
 
     @property
     def latency(self) -> dict[str, float]:

@@ -5,14 +5,13 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba.extending import is_jitted
 
-from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
+from ..envs.numerics.jit import compile_call
+from ..envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
 from .core.filter import (
@@ -20,7 +19,6 @@ from .core.filter import (
     FilterOutputs,
     StepRecord,
     advance,
-    process_packet_all,
     reset_filters,
     write_estimate,
 )
@@ -33,49 +31,23 @@ from .design.options import FilterConfig
 from .design.periodic import MARGINAL, Schedule, allocate_gains, count_ticks, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
-_T = TypeVar("_T")
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-
-
-def compile_call(function: Callable[..., _T], *example_args: object) -> Callable[..., _T]:
-    """Return a function compiled for exactly the types and layouts of the example's arguments.
-
-    numba finds out the types at every other call, which costs more than a filter's step.
-
-    Args:
-        function: A jitted function; any other is returned as it is.
-        *example_args: Arguments whose types and layouts the call takes.
-
-    Returns:
-        A callable with the same positional arguments.
-    """
-    if not is_jitted(function):
-        return function
-    jitted: Any = function
-    return jitted.compile(tuple(map(numba.typeof, example_args)))  # type: ignore[no-any-return]
-
-
-_MATRIX, _VECTOR = np.zeros((1, 1)), np.zeros(1)
-_RECORD, _OUTPUTS = StepRecord(_MATRIX, 0, _MATRIX, 0), FilterOutputs(_MATRIX, _MATRIX, _VECTOR)
-_Call = Callable[..., Any]
-_EXAMPLES: dict[_Call, tuple[object, ...]] = {
-    advance: (_RECORD, 0, _OUTPUTS),
-    process_packet_all: (np.zeros(PACKET_WIDTH),),
-    write_estimate: (_VECTOR, _MATRIX),
-}
+_FILTERS, _GAINS, _MATRIX = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
 
 
 @cache
-def compile_filter_call(function: _Call) -> _Call:
-    """Compile a function of `core.filter` to a plain call.
+def compile_advance() -> Callable[..., int]:
+    """Return `core.filter.advance` as a plain call with the same positional arguments."""
+    record, outputs = (
+        StepRecord(_MATRIX, 0, _MATRIX, 0),
+        FilterOutputs(_MATRIX, _MATRIX, _MATRIX[0]),
+    )
+    return compile_call(advance, _FILTERS, _GAINS, record, 0, outputs)
 
-    Args:
-        function: `advance`, `process_packet_all` or `write_estimate`.
 
-    Returns:
-        A callable with the same positional arguments.
-    """
-    return compile_call(function, np.zeros(1, FILTER), np.zeros((1, 1, 1)), *_EXAMPLES[function])
+@cache
+def _compile_write_estimate() -> Callable[..., bool]:
+    return compile_call(write_estimate, _FILTERS, _GAINS, _MATRIX[0], _MATRIX)
 
 
 class Estimator:
@@ -215,11 +187,10 @@ class Estimator:
             record: Rows and packets, C-contiguous float64.
             outputs: Arrays to fill.
         """
-        call = compile_filter_call(advance)
-        done = call(self.filters, self.gains, record, 0, outputs)
+        done = compile_advance()(self.filters, self.gains, record, 0, outputs)
         while done < record.rows:
             self.design_missing()
-            done = call(self.filters, self.gains, record, done, outputs)
+            done = compile_advance()(self.filters, self.gains, record, done, outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Process one fast row: from the last tick to this one, with the gyro.
@@ -227,30 +198,21 @@ class Estimator:
         Args:
             fast_row: Fast row of this tick, shape (FAST_WIDTH,).
         """
-        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), np.zeros((0, PACKET_WIDTH)))
+        self.step(np.reshape(fast_row, (1, -1)), np.zeros((0, PACKET_WIDTH)))
 
     def update(self, packet: npt.ArrayLike) -> None:
         """Process one packet that has arrived, after the fast row of this tick.
 
         Args:
-            packet: Packet, shape (PACKET_WIDTH,); ValueError for another one.
+            packet: Packet, shape (PACKET_WIDTH,).
         """
-        values = np.ascontiguousarray(packet, np.float64)
-        if values.shape != (PACKET_WIDTH,):
-            raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
-        self._receive(values)
-
-    def _receive(self, packet: Array) -> None:
-        compile_filter_call(process_packet_all)(self.filters, self.gains, packet)
+        self.step(np.zeros((0, FAST_WIDTH)), np.reshape(packet, (1, -1)))
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record; errors as in `prepare_record`.
 
         Args:
             source: Record, or a log that has one.
-
-        Returns:
-            States, standard deviations and NIS of the record.
         """
         record = self.prepare_record(source)
         fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
@@ -259,14 +221,37 @@ class Estimator:
         self.take(StepRecord(fast, len(fast), packets, len(packets)), FilterOutputs(X, S, nis))
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
-    def prepare_record(self, source: Log | Record) -> Record:
-        """Reset for a record and check that it fits: its rows, its tick and its columns.
+    def run_with_health(
+        self, source: Log | Record, seconds: float
+    ) -> tuple[Estimates, npt.NDArray[np.bool_]]:
+        """Run as `run` does, and look at `is_healthy` now and then.
 
         Args:
             source: Record, or a log that has one.
+            seconds: Time between two looks (s).
 
         Returns:
-            The record; ValueError for one that does not fit.
+            States and standard deviations, without NIS, and the health at every row's next look.
+        """
+        record = self.prepare_record(source)
+        fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
+        X, S = np.empty((2, len(fast), len(self.names)))
+        healthy, block = np.empty(len(fast), np.bool_), max(round(seconds / self.dt), 1)
+        for start in range(0, len(fast), block):
+            now, rows = slice(start, start + block), fast[start : start + block]
+            ends = record.first + np.array([start, start + len(rows)])
+            first, last = np.searchsorted(packets[:, PACKET.arrived], ends)
+            part = StepRecord(rows, len(rows), packets[first:last], last - first)
+            self.take(part, NO_OUTPUTS._replace(X=X[now], S=S[now]))
+            healthy[now] = self.is_healthy
+        time, nis = np.asarray(record.ticks * record.dt, np.float64), np.full(len(packets), np.nan)
+        return Estimates(time, X, S, self.names, nis), healthy
+
+    def prepare_record(self, source: Log | Record) -> Record:
+        """Reset for a record and return it; ValueError where rows, tick or columns do not fit.
+
+        Args:
+            source: Record, or a log that has one.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
@@ -305,7 +290,7 @@ class Estimator:
     def _read_estimate(self, width: int) -> tuple[Array, Array]:
         """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
         x, P = np.empty(len(self.names)), np.zeros((width, width))
-        while not compile_filter_call(write_estimate)(self.filters, self.gains, x, P):
+        while not _compile_write_estimate()(self.filters, self.gains, x, P):
             self._design_cell(int(self._f.cell))
         return x, P
 

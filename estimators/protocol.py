@@ -152,9 +152,6 @@ class ForeignEstimator:
 
         Args:
             source: Record, or a log that has one; ValueError if it is empty or has another tick.
-
-        Returns:
-            States and standard deviations of the record.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
@@ -186,13 +183,10 @@ class ForeignEstimator:
 
 
 def get_label(source: object) -> str:
-    """Return the name of an estimator or its factory for messages.
+    """Return the name of an estimator, or of its factory or class, for messages.
 
     Args:
         source: Name, factory or estimator.
-
-    Returns:
-        Its name, or that of its class.
     """
     if isinstance(source, str):
         return source
@@ -202,12 +196,9 @@ def get_label(source: object) -> str:
 
 
 def compute_std(P: Array) -> Array:
-    """Compute the standard deviations of a covariance; NaN stays.
+    """Compute the standard deviations (n,) of a covariance; NaN stays.
 
     Args:
         P: Covariance, shape (n, n).
-
-    Returns:
-        Standard deviations, shape (n,).
     """
     return np.sqrt(np.maximum(np.diag(P), 0.0))

@@ -71,13 +71,10 @@ class SignalCalibration(NamedTuple):
 
 
 def read_wires(source: VehicleSource | None) -> SignalCalibration:
-    """Read the calibration in a vehicle's file; that of others is unknown.
+    """Read the calibration in a vehicle's file, which errors name; that of others is unknown.
 
     Args:
         source: Vehicle as for `make_vehicle`, or "identify".
-
-    Returns:
-        The calibration; the error of a value out of place has the file's name.
     """
     if source is None or source == "identify" or not is_document(source):
         return SignalCalibration()

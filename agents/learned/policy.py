@@ -20,7 +20,7 @@ from ...envs.io import check_types, from_json, write_atomic
 from ...envs.record import Array
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import describe_unknown
-from ...estimators.registry import is_user_file
+from ...estimators.make import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env

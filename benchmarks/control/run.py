@@ -29,7 +29,7 @@ from ...envs.task import FAILURES
 from ...envs.ticks import TICK
 from ...envs.validation import parse_actions
 from ...envs.vehicle.dynamics import Motion
-from ...estimators.registry import describe_error
+from ...estimators.make import describe_error
 from ..harness.metrics import EPISODE, REDUCTIONS, StepSample, compute_dissipation
 from ..harness.parallel import run_cases
 from .entries import SLOW_EPISODES, ControlCase, Entry

@@ -14,8 +14,7 @@ from ...agents.training.export import check_trusted
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import make_vehicle
-from ...estimators.make import ESTIMATORS
-from ...estimators.registry import find_class, is_user_file
+from ...estimators.make import ESTIMATORS, find_class, is_user_file
 from ..control.entries import (
     ADAPTIVE,
     CONTROLLERS,

@@ -26,9 +26,8 @@ from ...agents.env_info import EnvView
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.validation import parse_actions
-from ...estimators.make import make_estimator
+from ...estimators.make import describe_error, make_estimator
 from ...estimators.protocol import EstimatorLike
-from ...estimators.registry import describe_error
 from ..control.entries import check_agent
 
 _MEMORY = 4 * 2**30  # bytes of address space

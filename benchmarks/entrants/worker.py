@@ -32,7 +32,7 @@ from ...envs.numerics.kernel_cache import LAYERS, find_kernel_folder
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...estimators.core.filter import StepRecord
-from ...estimators.registry import is_user_file
+from ...estimators.make import is_user_file
 from ...estimators.vector.batch import ForeignBatch
 from ..control.run import NUMBERS, Chunk, DriveResult, run_chunk
 from .child import DONE, ChildSettings

@@ -19,7 +19,13 @@ from ...envs.scenarios.draws import KMH
 from ...envs.vehicle import linear
 from ...envs.vehicle.linear import make_course_model
 from ...envs.vehicle.parameters import COMS
-from ...estimators.design import dual_rate, kalman
+from ...estimators.design.gains import (
+    SampledSystem,
+    compute_pseudo_shares,
+    frame_map,
+    joseph_form,
+    kalman_gain,
+)
 from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers, PaperFilter, compare
 from .manoeuvres import EstimationSimulation
 
@@ -36,7 +42,7 @@ def _make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
 def _make_pseudo_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     """Make the maps with pseudo measurements (14), G from (31)."""
     error, maps = np.eye(len(A)), []
-    for i, share in enumerate(dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)):
+    for i, share in enumerate(compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)):
         error = (A @ error if i > 0 else error) - share @ C  # of the sample's innovation
         maps.append(error)
     return maps
@@ -143,12 +149,12 @@ def _measure_maps(seed: int) -> Numbers:
     rng = np.random.default_rng(seed)
     a = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
     c = rng.normal(size=(3, 3))
-    square = compare_maps(a, c, kalman.kalman_gain(np.eye(3), c, np.eye(3)), RATIO)
+    square = compare_maps(a, c, kalman_gain(np.eye(3), c, np.eye(3)), RATIO)
     Q = np.diag(10.0 ** rng.uniform([-4, -4, -8, -2, -2, -7], [-2, -2, -6, 0, 0, -5])) * 1e-3
     P = np.eye(6) * 1e-2
     for _ in range(5000):  # 5 s of fast measurements
-        L = kalman.kalman_gain(P, C, R)
-        P = A @ kalman.joseph_form(P, L, C, R) @ A.T + Q
+        L = kalman_gain(P, C, R)
+        P = A @ joseph_form(P, L, C, R) @ A.T + Q
     application = compare_maps(A, C, L, RATIO)
     return {(SQUARE, "difference"): square, (APPLICATION, "difference"): application}
 
@@ -165,8 +171,8 @@ def _measure_gains(seed: int) -> Numbers:
         ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
     }
     for name, q in tunings.items():
-        shares = dual_rate.SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
-        growth = np.linalg.eigvals(dual_rate.frame_map(A, C, shares))
+        shares = SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
+        growth = np.linalg.eigvals(frame_map(A, C, shares))
         radii[name, "spectral_radius"] = float(np.abs(growth).max())
     return radii
 

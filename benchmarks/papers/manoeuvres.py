@@ -13,7 +13,7 @@ from ...agents.rollout import Rollout, rollout
 from ...envs.record import PACKET, Array, Log
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.scenarios.scenario import Scenario
-from ...estimators.analysis.bound import compute_error_bound
+from ...estimators.analysis.limits import compute_error_bound
 from ..harness.drives import SETTLED, make_env, make_filter_arguments
 from . import ledger
 from .ledger import Example, Numbers, PaperFilter, SeedFunction, Simulation

@@ -25,7 +25,7 @@ from ...envs.scenarios.draws import KMH
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ...envs.vehicle.parameters import COMS, Vehicle
-from ...estimators.design.kalman import kalman_gain
+from ...estimators.design.gains import kalman_gain
 from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers, PaperFilter, compare
 from .manoeuvres import EstimationSimulation, SlipSimulation
 

@@ -17,7 +17,7 @@ from ...envs.scenarios.draws import KMH
 from ...envs.sensors.slow import CAMERA_33_30
 from ...envs.vehicle.linear import make_vision_model
 from ...envs.vehicle.parameters import COMS
-from ...estimators.design import kalman
+from ...estimators.design.gains import kalman_gain
 from ...estimators.make import make_estimator
 from .dual_rate import compare_maps
 from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers
@@ -170,7 +170,7 @@ def _measure_tunings(seed: int) -> Numbers:
     _, latched = _make_transitions()
     noises = (np.diag([*Q, 0.0, 0.0]) * 1e-3 for Q in tunings)
     covariances = (solve_discrete_are(latched.T, C.T, noise, R) for noise in noises)
-    gains = (kalman.kalman_gain(P, C, R) for P in covariances)  # a measurement at every step
+    gains = (kalman_gain(P, C, R) for P in covariances)  # a measurement at every step
     radii = {LITERAL: list(map(_compute_spectral_radius, gains)), SPREAD: shipped}
     shares = {name: float(np.mean(np.array(x) > 1.0 + 1e-9)) for name, x in radii.items()}
     return {(name, "share"): value for name, value in shares.items()}
@@ -181,7 +181,7 @@ def _measure_maps(seed: int) -> Numbers:
     model = make_vision_model(COMS, SPEED)
     G, _ = model.discretise(1e-3)
     Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
-    K = kalman.kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
+    K = kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
     return {("pseudo-residuals", "difference"): compare_maps(G, model.C, K, PERIOD)}
 
 

@@ -11,17 +11,14 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
 from ...agents.baselines import CONSTANT_ERRORS, compute_range_rms
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, PACKET, Log
 from ...envs.scenarios.world import IDEAL
 from ...envs.sensors.slow import SLOW_NAMES
-from ...estimators.core.filter import NO_OUTPUTS, StepRecord
 from ...estimators.design.models import COURSE_SPEED
 from ...estimators.design.options import NOISE
-from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ...estimators.protocol import Estimates
 from ...estimators.wrappers.truth import calibrate
@@ -193,22 +190,6 @@ def _run_informed_filter(condition: Condition, seed: int) -> Estimates:
     return make_unchecked_filter(NAME, log, truth.fiala, options).run(calibrated)
 
 
-def _run_with_health(estimator: Estimator, log: Log) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Sideslip angle and its deviation (rad), shape (n,); `is_healthy` after each `_WATCH`."""
-    record, healthy = estimator.prepare_record(log), list[bool]()
-    rows, count = round(_WATCH / record.dt), len(record.fast)
-    X, S = np.empty((2, count, len(estimator.names)))
-    for part in (slice(start, min(start + rows, count)) for start in range(0, count, rows)):
-        ends = record.first + part.start, record.first + part.stop
-        first, last = np.searchsorted(record.packets[:, PACKET.arrived], ends)
-        fast, packets = record.fast[part], record.packets[first:last]
-        step = StepRecord(fast, len(fast), packets, len(packets))
-        estimator.take(step, NO_OUTPUTS._replace(X=X[part], S=S[part]))
-        healthy.append(estimator.is_healthy)
-    place = estimator.names.index("beta")
-    return X[:, place], S[:, place], np.array(healthy)
-
-
 class Outcome(NamedTuple):
     """Numbers of a drive; mean squared errors in rad2."""
 
@@ -231,12 +212,13 @@ def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     if rows.sum() * dt < 0.5:
         return None
     filter_ = make_unchecked_filter(NAME, wrong, base.nominal, {})
-    estimate, deviation, healthy = _run_with_health(filter_, wrong)
+    run, healthy = filter_.run_with_health(wrong, _WATCH)
+    deviation, n_watch = run.std[:, run.names.index("beta")], round(_WATCH / dt)
     gyro = make_estimator(GYRO_ALONE, vehicle=base.nominal, dt=dt).run(wrong)["beta"]
-    runs = estimate, _run_informed_filter(condition, seed)["beta"], gyro
-    square, informed, by_gyro = (float(np.mean((run - beta)[rows] ** 2)) for run in runs)
-    nees, coverage, _ = compute_honesty((estimate - beta)[rows], deviation[rows])
-    healthy = healthy[: int(driven.sum() * dt / _WATCH)]
+    runs = run["beta"], _run_informed_filter(condition, seed)["beta"], gyro
+    square, informed, by_gyro = (float(np.mean((each - beta)[rows] ** 2)) for each in runs)
+    nees, coverage, _ = compute_honesty((run["beta"] - beta)[rows], deviation[rows])
+    healthy = healthy[::n_watch][: int(driven.sum() * dt / _WATCH)]
     time = _WATCH * np.arange(1, len(healthy) + 1)
     said = time[~healthy & (time > condition.fault)] - condition.fault
     clean = healthy[time <= condition.fault]

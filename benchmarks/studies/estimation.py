@@ -14,7 +14,7 @@ import numpy as np
 
 from ...agents.rollout import rollout
 from ...envs.record import Array
-from ...estimators.analysis.bound import compute_error_bound
+from ...estimators.analysis.limits import compute_error_bound
 from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean

@@ -11,8 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import Array
-from ..design.dual_rate import GAINS, RULES, SampledSystem, frame_map
-from ..design.kalman import check_covariance
+from ..design.gains import (
+    DUAL_RATE_GAINS,
+    DUAL_RATE_RULES,
+    SampledSystem,
+    check_covariance,
+    frame_map,
+)
 from ..design.periodic import MARGINAL, find_unobservable, spectral_radius
 from ..protocol import Estimates, UnobservableWarning
 
@@ -146,14 +151,11 @@ class DualRate:
         self.x = self.x + self.shares[0] @ self._innovation
 
     def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
-        """Reset, then filter inputs and samples of k = 0, r, 2 r, ...
+        """Reset, then filter inputs and samples of k = 0, r, 2 r, ...; time is in steps.
 
         Args:
             U: Inputs, finite, shape (K, p), else ValueError.
             Y: Samples, shape (K // r + 1, q); a row that holds a NaN is a sample that never came.
-
-        Returns:
-            Estimates of k = 0 .. K, time in steps.
         """
         u, y = np.array(U, np.float64), np.array(Y, np.float64)
         p, q = self._B.shape[1], len(self._C)
@@ -188,7 +190,10 @@ def _parse_poles(
     intersample: str, gains: str, poles: npt.ArrayLike | None, n: int
 ) -> npt.NDArray[np.complex128] | None:
     """Parse the poles to place, (n,); ValueError for a contradiction or an unknown rule or gain."""
-    for name, word, known in (("intersample", intersample, RULES), ("gains", gains, GAINS)):
+    for name, word, known in (
+        ("intersample", intersample, DUAL_RATE_RULES),
+        ("gains", gains, DUAL_RATE_GAINS),
+    ):
         if word not in known:
             raise ValueError(f"{name} is one of {', '.join(known)}, got {word!r}")
     if gains == "from-29" and intersample != "pseudo":

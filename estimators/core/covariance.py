@@ -1,4 +1,4 @@
-"""The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
+"""The covariance and its gains in compiled code: `design.gains`'s equations on a filter's memory.
 
 Only the first n of N = `total` states move; the others are clones. Rows are computed by eights of
 columns, zero beyond N. Measurements come one scalar at a time, so that a gain is a division. The
@@ -43,9 +43,6 @@ def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
         f: Memory of the filter.
         s: Index of the slow sensor.
         i: Index of its row.
-
-    Returns:
-        Value in the row's unit.
     """
     value = dot(f.C[s, i], f.x, f.n)
     return value + f.road_turn if f.ground[s, i] == 1 else value

@@ -147,16 +147,13 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 @jit
 def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
-    """Read the present covariance of two states; with periodic gains that of the settled cycle.
+    """Read P[i, j], a present covariance; with periodic gains that of the settled cycle.
 
     Args:
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         i: Index of a state.
         j: Index of a state, i <= j.
-
-    Returns:
-        P[i, j].
     """
     if f.periodic == 1:
         row = 1 + f.at * maximum(f.fasts, 1)  # that of this step
@@ -166,15 +163,12 @@ def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scala
 
 @jit
 def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
-    """Compute the present standard deviation of a state.
+    """Compute a state's present standard deviation; of a lost filter, larger by its surprise.
 
     Args:
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         i: Index of the state.
-
-    Returns:
-        Standard deviation in the state's unit; of a filter that is lost, larger by its surprise.
     """
     growth = maximum(compute_excess(f), 1.0)
     return sqrt(maximum(read_covariance(f, gains, i, i), 0.0) * growth)
@@ -205,6 +199,18 @@ def _update_second_layer(
     second.r[s, 0] = speed_variance
     second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
     process_packet(second, gains, velocity)
+
+
+@jit
+def _take_packet(
+    layers: FilterRecords, gains: GainTables, packets: Matrix, position: int, nis: Vector
+) -> None:
+    """Process a packet by all layers, and write its NIS."""
+    was_used = process_packet(layers[0], gains, packets[position])
+    if len(nis) > 0:
+        nis[position] = layers[0].nis
+    if was_used and len(layers) > 1:
+        _update_second_layer(layers[0], layers[1], gains, packets[position])
 
 
 @jit
@@ -279,15 +285,12 @@ def advance(
         # a packet waits only if it arrives at a later tick of this call; due, overdue or beyond the
         # last row it goes now, and `process_packet` judges it
         while position < count and not (f.tick < packets[position, PACKET.arrived] <= end_tick):
-            was_kept = process_packet(f, gains, packets[position])
-            if len(nis) > 0:
-                nis[position] = f.nis
-            if was_kept and len(layers) > 1:
-                _update_second_layer(f, layers[1], gains, packets[position])
+            _take_packet(layers, gains, packets, position, nis)
             position += 1
         if len(X) > 0:
             _write_row(layers, gains, j, X, S)
-    f.counts[COUNTERS.future] += count - position  # packets of a call without rows
+    for k in range(position, count):  # of a call without rows
+        _take_packet(layers, gains, packets, k, nis)
     return int(rows)
 
 
@@ -301,16 +304,3 @@ def reset_filters(layers: FilterRecords, first: int) -> None:
     """
     for i in range(len(layers)):
         _reset_filter(layers[i], first)
-
-
-@jit
-def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """Process a packet by all layers of an estimator.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet, shape (PACKET_WIDTH,).
-    """
-    if process_packet(layers[0], gains, packet) and len(layers) > 1:
-        _update_second_layer(layers[0], layers[1], gains, packet)

@@ -115,15 +115,12 @@ def store_due_captures(f: FilterRecord, last: int) -> None:
 
 @jit
 def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
-    """Return whether a sample of a sensor on its clock came before or is refused; it is counted.
+    """Return whether a sample of a sensor on its clock must not be used; then it is counted.
 
     Args:
         f: Memory of the filter.
         s: Index of the slow sensor.
         captured: Captured tick of the sample.
-
-    Returns:
-        True for a sample that must not be used.
     """
     frame = (captured - f.phase[s]) // f.period[s]
     last_stamp = f.known_stamps[s, frame % N_STAMPS]
@@ -224,9 +221,6 @@ def compute_sample_variance(f: FilterRecord, s: int, i: int) -> Scalar:
         f: Memory of the filter.
         s: Index of the slow sensor.
         i: Index of its row.
-
-    Returns:
-        Variance in the row's unit squared.
     """
     factor, variance = interpolate_hdop(f, s, f.sample), f.r[s, i]
     captured = int(f.sample[PACKET.captured])
@@ -330,9 +324,6 @@ def check_sample(f: FilterRecord, s: int, first: int) -> bool:
         f: Memory of the filter.
         s: Index of the slow sensor.
         first: Clone of its first row, negative where it measures the states.
-
-    Returns:
-        True for a sample to use.
     """
     passed = _test_innovation(f, s, first)
     if f.recovery_count == 0:

@@ -59,9 +59,6 @@ def is_steering_felt(V: Scalar) -> Scalar:
 
     Args:
         V: Speed of the model (m/s).
-
-    Returns:
-        True above walking pace, by more than the speed moves without a new model.
     """
     return V * (1.0 - 2.0 * SPEED_TOLERANCE) > MIN_SPEED
 
@@ -232,9 +229,6 @@ def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
         s: Index of the slow sensor.
         i: Index of its row.
         V: Speed of the model (m/s).
-
-    Returns:
-        Variance in the row's unit squared.
     """
     scaled = f.noise_over_speed[s, i]
     return scaled / (V * V) if scaled > 0.0 else f.r[s, i]

@@ -250,15 +250,12 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 @noinline
 def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
-    """Use a packet that has arrived, queue it for the next step, or drop and count it.
+    """Use a packet that has arrived or queue it for the next step; False: dropped and counted.
 
     Args:
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        False if it was dropped.
     """
     copy_into(packet, f.sample)
     f.nis = np.nan

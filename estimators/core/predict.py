@@ -44,14 +44,11 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
 
 @jit
 def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
-    """Return whether a speed is too far from the model's.
+    """Return whether a speed is further from the model's than `SPEED_TOLERANCE`.
 
     Args:
         speed: Speed (m/s).
         model_speed: Speed of the model (m/s).
-
-    Returns:
-        True beyond `SPEED_TOLERANCE`.
     """
     return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
 
@@ -78,14 +75,11 @@ def _find_cell(f: FilterRecord, speed: float) -> int:
 
 @jit
 def find_next_cell(f: FilterRecord, row: Vector) -> Scalar:
-    """Find the table of gains that the next row will use.
+    """Find the index of the table of gains that the next row will use.
 
     Args:
         f: Memory of the filter.
         row: That fast row, shape (FAST_WIDTH,).
-
-    Returns:
-        Index of the cell.
     """
     if f.measured == 1:
         speed = _filter_speed(f, row)

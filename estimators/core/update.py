@@ -20,6 +20,7 @@ from .innovation import (
     CONSTANT,
     DUAL_RATE,
     LARSEN,
+    NONE,
     PSEUDO,
     STORED_ONE,
     check_sample,
@@ -27,7 +28,6 @@ from .innovation import (
     note_surprise,
     propagate_larsen_gains,
 )
-from .innovation import NONE as NONE
 from .model import MIN_SPEED, PSI, is_finite
 from .predict import compute_residual
 from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables
@@ -209,7 +209,7 @@ def _correct(f: FilterRecord, s: int, first: int) -> None:
 
 @noinline
 def update_filter(f: FilterRecord, gains: GainTables, s: int, first: int, is_gated: bool) -> bool:
-    """Correct by the packet of a slow sensor in f.sample, whose values are sound.
+    """Correct by a slow sensor's sound packet in f.sample; False if the gate refuses it.
 
     Args:
         f: Memory of the filter.
@@ -217,9 +217,6 @@ def update_filter(f: FilterRecord, gains: GainTables, s: int, first: int, is_gat
         s: Index of the slow sensor.
         first: Clone of the sample's first row, or negative, as of `find_clone`.
         is_gated: Whether the gate judges it and its NIS is taken: not once more when rewound.
-
-    Returns:
-        False if the gate refuses it.
     """
     if is_gated:
         f.nis = np.nan
@@ -259,13 +256,10 @@ _MAX_FAST, _MAX_SLOW = 3.0, 15.0
 
 @jit
 def compute_excess(f: FilterRecord) -> Scalar:
-    """Compute how far a filter's surprise is beyond what one that knows its place has.
+    """Compute a filter's mean surprise over its limit, of fast rows or slow samples, the larger.
 
     Args:
         f: Memory of the filter.
-
-    Returns:
-        Mean surprise over its limit, of fast rows or slow samples, the larger.
     """
     return maximum(f.surprise[0] * (1.0 / _MAX_FAST), f.surprise[1] * (1.0 / _MAX_SLOW))
 

@@ -15,7 +15,7 @@ from ..core import record as size
 from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from . import models
-from .kalman import kalman_gain
+from .gains import kalman_gain
 from .models import TYRES, FilterModel
 from .options import FilterConfig
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
@@ -102,7 +102,7 @@ _SPACING = 0.5  # m/s between two tables of gains
 def assemble(
     config: FilterConfig, vehicle: Vehicle, dt: float, speed: float | None
 ) -> tuple[FilterRecords, tuple[Schedule, ...]]:
-    """Assemble the memory of a filter and the schedules of its first slow sensor.
+    """Assemble a filter's memory, shape (layers,), and the schedules of its first slow sensor.
 
     ValueError says that a schedule does not fit ticks, that a sensor can be later than the filter's
     window, or that options do not go together.
@@ -112,9 +112,6 @@ def assemble(
         vehicle: The filter's vehicle.
         dt: Tick (s).
         speed: Speed (m/s) if it is held, None where it is measured.
-
-    Returns:
-        Memory, shape (layers,), and schedules.
     """
     layers, first = np.zeros(len(config.models), FILTER).view(np.recarray), 0
     for f, model in zip(layers, config.models, strict=True):

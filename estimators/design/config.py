@@ -15,8 +15,8 @@ from ..core.innovation import RULES
 from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
-from . import dual_rate, models
-from .kalman import INVERSES, check_covariance
+from . import models
+from .gains import DUAL_RATE_GAINS, DUAL_RATE_RULES, INVERSES, check_covariance
 from .models import BIASES, SCALE, STATES, TYRES, WANDER, FilterModel
 from .options import (
     FAST_CHANNELS,
@@ -238,10 +238,10 @@ def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) ->
     is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
     chosen: _Values = {"intersample": row.intersample, "poles": row.poles}
     if is_dual_rate or row.second:
-        words = dual_rate.RULES if is_dual_rate else (row.intersample, "predict")
+        words = DUAL_RATE_RULES if is_dual_rate else (row.intersample, "predict")
         default = "pseudo" if is_dual_rate else row.intersample
         chosen["intersample"] = reader.read_choice("intersample", default, words)
-    known_gains = dual_rate.GAINS if is_dual_rate else ("", "periodic", "covariance")
+    known_gains = DUAL_RATE_GAINS if is_dual_rate else ("", "periodic", "covariance")
     gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
     rule = chosen["intersample"]
     if gains == "from-29" and rule != "pseudo":

@@ -19,7 +19,7 @@ from ...envs.record import FAST, Array
 from ...envs.sensors.link import SlowSensor
 from ..core.innovation import RULES
 from ..filters import FilterDefinition
-from .kalman import INVERSES
+from .gains import INVERSES
 from .models import BIASES, MEASUREMENTS, NONLINEAR, STATES, WANDER, FilterModel
 
 FAST_CHANNELS: dict[str, tuple[int, ...]] = {

@@ -29,21 +29,17 @@ from ..core.innovation import (
     find_clone,
 )
 from ..core.record import FILTER, WINDOW, FilterRecord, FilterRecords, GainTables
-from .dual_rate import SampledSystem
-from .kalman import compute_inverse, observer_gain, transition_matrix
+from .gains import SampledSystem, compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
 
 
 def count_ticks(seconds: float, dt: float, label: str) -> int:
-    """Convert a time to a number of ticks; ValueError where it is no whole number.
+    """Convert a time to a number of ticks; ValueError where that is no whole number.
 
     Args:
         seconds: Time (s).
         dt: Tick (s).
         label: Name of the time for messages.
-
-    Returns:
-        Number of ticks.
     """
     count = round(seconds / dt)
     if abs(seconds / dt - count) > 1e-6 * max(1.0, count):
@@ -143,14 +139,11 @@ def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]
 
 
 def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
-    """Allocate empty tables of gains, one for each cell of speed.
+    """Allocate zeros for gains (cells of speed, rows, columns); (1, 1, 1) where P gives them.
 
     Args:
         f: Memory of the filter.
         schedule: Schedule of its slow sensor.
-
-    Returns:
-        Zeros, shape (cells, rows, columns); (1, 1, 1) where gains come from P.
     """
     cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
     return np.zeros((cells, *_compute_table_shape(f, schedule)) if f.periodic else (1, 1, 1))
@@ -203,13 +196,10 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
 
 
 def build_measurement_rows(f: FilterRecord) -> Array:
-    """Build C over states and clones: the fast rows, then the slow ones, of first clones if any.
+    """Build C (m + p, total): the fast rows, then the slow ones, of first clones if any.
 
     Args:
         f: Memory of the filter.
-
-    Returns:
-        Measurement matrix, shape (m + p, total).
     """
     s, m = int(f.first_slow), int(f.fasts)
     p = int(f.rows[s]) if s >= 0 else 0
@@ -365,14 +355,11 @@ def spectral_radius(M: Array) -> float:
 
 
 def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Find the directions in which an error stays for ever.
+    """Find directions in which an error stays for ever, as "beta 1, psi -1, ..." each.
 
     Args:
         M: Map of the error over a cycle, shape (size, size).
         names: Names of the states, the first rows of M.
-
-    Returns:
-        Text of each, "beta 1, psi -1, ...".
     """
     values, vectors = np.linalg.eig(M)
     directions = []

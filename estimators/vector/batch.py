@@ -1,68 +1,227 @@
-"""Many filters of one kind side by side, compiled together, or an object a row."""
+"""Many filters of one kind in one compiled call: those of one shape in SIMD lanes, others alone.
+
+A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
+`core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
+Its model stays there and is loaded anew where its speed changed; its state in every call. A user's
+own estimators are an object a row.
+"""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.numerics.simd8 import allocate_aligned
-from ...envs.record import Array
+from ...envs.numerics.jit import compile_call, jit, jit_nrt
+from ...envs.numerics.packed import count_lanes
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
+from ...envs.numerics.simd import LANES
+from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
+from ...envs.record import FAST, FAST_WIDTH
 from ..core.filter import StepRecord
-from ..core.record import FILTER
+from ..core.innovation import BUFFER, LARSEN, NONE
+from ..core.model import KINEMATIC, VELOCITY_ROLL
+from ..core.record import (
+    FILTER,
+    N_CORE,
+    N_FAST,
+    N_INPUTS,
+    N_SMALL,
+    N_TOTAL,
+    X_OFFSET,
+    FilterRecord,
+)
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
-from ..wrappers.outputs import Observed, write_outputs
-from .lane_ticks import FilterBank
-from .lanes import compile_observe_batch, make_blocks
+from ..wrappers.outputs import Observed, OutputTable, observe, write_outputs
+from .lanes import FilterBank, LaneBlock, advance_block, get_gains
 
 Build = Callable[..., AnyEstimator]
 _Mask = npt.NDArray[np.bool_]
 
+_MIN_LANES = 4  # filters that are computed alone in less time than in lanes
+_MAX_STATES = 16  # states and clones
+_ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
+_FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
+    ((_ROW_LENGTH,), ("x", "own_decay", "decay", "drift", "PC", "gain")),
+    ((_MAX_STATES, _ROW_LENGTH), ("P",)),  # on and above the diagonal, as Q
+    ((N_CORE, _ROW_LENGTH), ("G", "GT", "Q")),
+    ((N_INPUTS, _ROW_LENGTH), ("HT",)),
+    ((N_FAST, _ROW_LENGTH), ("K", "C_fast")),  # K: periodic gains of this tick
+    ((N_FAST, N_INPUTS), ("D_fast",)),
+    ((N_FAST,), ("rest_fast", "r_fast", "y")),
+    ((N_INPUTS, 2), ("u_factor",)),
+    ((N_FAST, 2), ("y_factor",)),
+    ((N_INPUTS,), ("u", "u_new")),
+    ((FAST_WIDTH,), ("row",)),  # of this tick
+)
+# of a lane: ticks are those of now, of the last row, of the next packet to take and capture;
+# model_speed, 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds
+# is of no use; apart, 1: the tick is computed by the record; wild, 1: its residual is none
+_SCALARS = (
+    *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
+    *("now", "last", "due", "next", "here", "apart", "wild"),
+)
+# of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
+# within the cycle, table of gains, packets done
+_INTS = ("shaped", "tick", "at", "cell", "cursor")
+_SHAPE = (
+    *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
+    *("store_predictions", "tyres", "robust"),
+)
+_FIELDS = (
+    [
+        (name, np.float64, (*shape, LANES))
+        for shape, names in (*_FLOATS, ((), _SCALARS))
+        for name in names
+    ]
+    + [(name, np.int64, (LANES,)) for name in _INTS]
+    + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
+    + [("u_column", np.int64, (N_INPUTS, 2)), ("y_column", np.int64, (N_FAST, 2))]
+    + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
+)
+BLOCK = pad_to_cache_line(_FIELDS)
 
-class _GainPool:
-    """Estimators by the design of their specs, and their gains in one flat array, the pool."""
 
-    def __init__(self, build: Build) -> None:
-        self._build = build
-        self._estimators: dict[Any, Estimator] = {}
-        self._places: dict[Any, tuple[int, ...]] = {}
-        self.pool = np.zeros(0)
+def _make_blocks(count: int) -> Any:
+    """Allocate empty blocks of the dtype `BLOCK` with `count` lanes or more."""
+    return allocate_aligned((-(-count // LANES),), BLOCK)
 
-    def __getitem__(self, design: Any) -> Estimator:
-        return self._estimators[design]
 
-    def get_estimator(self, spec: EstimatorSpec) -> Estimator:
-        """Return the estimator for a spec, built unless it is at hand."""
-        design = spec.design
-        if design not in self._estimators:
-            estimator = self._build(**spec._asdict())
-            if not isinstance(estimator, Estimator):
-                text = "a batch is of filters of ours or of none"
-                raise TypeError(f"{text}, got {estimator!r} as well")
-            self._estimators[design] = estimator
-        return self._estimators[design]
+@jit
+def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
+    """Return whether a filter's ticks are computed in its lane now; the first shapes the block."""
+    # lanes compute models that change by speed alone, of which every tick predicts and corrects
+    # without rules between samples, and store nothing of the past but predictions
+    if b.shaped[lane] == 0:
+        is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
+        is_plain = f.stride == 1 and f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
+        has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
+        is_supported = f.delay_rule != BUFFER and f.delay_rule != LARSEN and f.total <= _MAX_STATES
+        is_supported = is_supported and is_steady and is_plain and has_fixed_noise
+        if is_supported and b.n == 0:
+            _set_shape(b, f)
+        b.shaped[lane] = 1 if is_supported and _is_same_shape(b, f) else -1
+    return b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
 
-    def gains(self, design: Any) -> Array:
-        """Return a design's table in the pool, shape (cells, rows, columns)."""
-        start, *shape = self._places[design]
-        return self.pool[start : start + int(np.prod(shape))].reshape(shape)
 
-    def place(self, used_keys: Sequence[Any]) -> npt.NDArray[np.int64]:
-        """Lay the gains of all rows' designs side by side in a new pool: their places, (N, 4)."""
-        self._estimators = {design: self._estimators[design] for design in dict.fromkeys(used_keys)}
-        tables = [
-            self.gains(design) if design in self._places else estimator.gains
-            for design, estimator in self._estimators.items()
-        ]
-        ends = np.cumsum([table.size for table in tables])
-        self.pool = np.concatenate([table.ravel() for table in tables])
-        self._places = {
-            design: (int(end) - table.size, *table.shape)
-            for design, table, end in zip(self._estimators, tables, ends, strict=True)
-        }
-        return np.array([self._places[design] for design in used_keys], np.int64)
+@jit
+def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Scalar:
+    is_same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
+    is_same = is_same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
+    is_same = is_same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
+    is_same = is_same and f.store_predictions == b.store_predictions
+    for k in range(2):
+        for i in range(f.inputs):
+            is_same = is_same and f.u_column[i, k] == b.u_column[i, k]
+        for i in range(f.fasts):
+            is_same = is_same and f.y_column[i, k] == b.y_column[i, k]
+    return is_same
+
+
+@jit
+def _set_shape(b: LaneBlock, f: FilterRecord) -> None:
+    """Write into the block what all its filters share."""
+    b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
+    b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
+    b.store_predictions, b.tyres, b.robust = f.store_predictions, f.tyres, f.robust
+    b.columns = 0
+    if f.measured == 1:
+        _add_column(b, FAST.wheel_left)
+        _add_column(b, FAST.wheel_right)
+    for k in range(2):
+        for i in range(f.inputs):
+            b.u_column[i, k] = f.u_column[i, k]
+            _add_column(b, f.u_column[i, k])
+        for i in range(f.fasts):
+            b.y_column[i, k] = f.y_column[i, k]
+            _add_column(b, f.y_column[i, k])
+
+
+@jit
+def _add_column(b: LaneBlock, column: int) -> None:
+    for i in range(b.columns):
+        if b.column[i] == column:
+            return
+    b.column[b.columns] = column
+    b.columns += 1
+
+
+@jit
+def _fetch(f: FilterRecord, template: FilterRecord) -> None:
+    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
+    for i in range(0, X_OFFSET + template.total, 8):
+        prefetch(f.padding, i)
+    for i in range(0, N_SMALL, 8):
+        prefetch(f.P, N_TOTAL, i)
+    for j in range(0, template.total, 8):
+        for i in range(template.total):
+            prefetch(f.P, i, j)
+    for j in range(0, template.n, 8):
+        for i in range(template.n):
+            prefetch(f.Q, i, j)
+            if i < template.dense:
+                prefetch(f.G, i, j)
+            if j < template.dense:
+                prefetch(f.GT, i, j)
+
+
+@jit
+def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
+    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
+    n_rows, count = 0, 0
+    for lane in range(count_lanes()):
+        i = first + lane
+        b.here[lane] = 0.0
+        if i < len(filters) and done[i] == -1 and rows[i] > 0:
+            is_same = count == 0 or rows[i] == n_rows
+            if is_same and len(filters[i]) == 1 and _is_lane_compatible(b, lane, filters[i, 0]):
+                b.here[lane], n_rows = 1.0, rows[i]
+                count += 1
+    return n_rows if count >= _MIN_LANES else 0
+
+
+@jit_nrt
+def _observe_batch(
+    bank: FilterBank, done: Vector, lanes: Vector, record: StepRecord, observed: Observed
+) -> int:
+    """Call `observe` for every filter that has rows to do; return how many still have."""
+    # record, observed: of N cars; done: rows done, -1 where a filter has not started, updated;
+    # filters of one shape go in lanes
+    fast, rows, packets, counts = record
+    obs, table, beta, gamma, out, summary = observed
+    filters, n_waiting = bank.filters, 0
+    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
+        b = lanes[first // LANES]
+        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
+        if n_rows > 0:
+            n_done = advance_block(b, first, bank, fast, n_rows, packets, counts)
+        for lane in range(minimum(count_lanes(), len(filters) - first)):
+            i = first + lane
+            if done[i] < rows[i]:
+                f, gains = filters[i], get_gains(bank, i)
+                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
+                outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
+                if n_done == 0 and i + 1 < len(filters):
+                    for layer in range(len(f)):
+                        _fetch(filters[i + 1, layer], f[layer])
+                row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
+                done[i] = observe(f, gains, row_record, start, outputs)
+                n_waiting += 1 if done[i] < rows[i] else 0
+    return n_waiting
+
+
+@cache
+def _compile_observe_batch() -> Callable[..., int]:
+    """Return `_observe_batch` as a plain call, for the types that all banks and records have."""
+    counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
+    bank = FilterBank(np.zeros((1, 1), FILTER), numbers, np.zeros((1, 4), np.int64))
+    record, obs = StepRecord(cube, counts, cube, counts), np.zeros((1, 0), np.float32)
+    table = OutputTable(0, np.zeros((0, 3), np.int64), numbers)
+    observed = Observed(obs, table, numbers, numbers, obs, np.zeros((1, 4)))
+    return compile_call(_observe_batch, bank, counts, _make_blocks(1), record, observed)
 
 
 class BatchEstimator:
@@ -80,11 +239,11 @@ class BatchEstimator:
     """
 
     def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:
-        self.name, self.dt = name, dt
-        self._designs = _GainPool(build)
+        self.name, self.dt, self._build = name, dt, build
         self._specs: list[EstimatorSpec] = list(specs)
-        self._design_keys: list[Any] = [None] * len(specs)  # each row's design
-        first = self._designs.get_estimator(specs[0])
+        self._designs: list[Hashable] = [None] * len(specs)
+        self._shared: dict[Hashable, Estimator] = {}  # by design
+        first = self._get_estimator(specs[0])
         self.names, self.units = first.names, first.units
         self.filters = allocate_aligned((len(specs), len(first.filters)), FILTER)
         self.configure(range(len(specs)), specs)
@@ -95,16 +254,38 @@ class BatchEstimator:
         if "filters" not in state:  # estimators of a user's, each an object of its own
             return
         filters, self.filters = self.filters, allocate_aligned(self.filters.shape, FILTER)
-        self.filters[:], self._lanes = filters, make_blocks(len(filters))
+        self.filters[:] = filters
+        self._pool_gains()
+
+    def _get_estimator(self, spec: EstimatorSpec) -> Estimator:
+        """Return the estimator for a spec, built unless it is at hand."""
+        if spec.design not in self._shared:
+            estimator = self._build(**spec._asdict())
+            if not isinstance(estimator, Estimator):
+                text = "a batch is of filters of ours or of none"
+                raise TypeError(f"{text}, got {estimator!r} as well")
+            self._shared[spec.design] = estimator
+        return self._shared[spec.design]
+
+    def _pool_gains(self) -> None:
+        """Lay the gains of all designs in use side by side in a new pool; empty the lanes."""
+        self._shared = {design: self._shared[design] for design in self._designs}
+        self._pool = np.concatenate([each.gains.ravel() for each in self._shared.values()])
+        places, start = dict[Hashable, tuple[int, ...]](), 0
+        for design, estimator in self._shared.items():
+            shape, end = estimator.gains.shape, start + estimator.gains.size
+            places[design], estimator.gains = (start, *shape), self._pool[start:end].reshape(shape)
+            start = end
+        self._places = np.array([places[design] for design in self._designs], np.int64)
+        self._lanes = _make_blocks(len(self.filters))  # they hold models
 
     def __len__(self) -> int:
         return len(self.filters)
 
     def __getitem__(self, i: int) -> Any:
-        design = self._design_keys[i]
-        estimator = copy.copy(self._designs[design])
+        estimator = copy.copy(self._shared[self._designs[i]])
         estimator.sensors = {name: self._specs[i].sensors[name] for name in estimator.sensors}
-        estimator.filters, estimator.gains = self.filters[i], self._designs.gains(design)
+        estimator.filters = self.filters[i]
         return estimator
 
     def __iter__(self) -> Iterator[Any]:
@@ -122,14 +303,12 @@ class BatchEstimator:
         has_changed = False
         for i, spec in zip(rows, specs, strict=True):
             self._specs[i], design = spec, spec.design
-            if design == self._design_keys[i]:
-                continue
-            built = self._designs.get_estimator(spec)
-            self._check_states(i, built.names)
-            self._design_keys[i], self.filters[i], has_changed = design, built.filters, True
+            if design != self._designs[i]:
+                built = self._get_estimator(spec)
+                self._check_states(i, built.names)
+                self._designs[i], self.filters[i], has_changed = design, built.filters, True
         if has_changed:
-            self._lanes = make_blocks(len(self))  # empty: they hold models
-            self._places = self._designs.place(self._design_keys)
+            self._pool_gains()
 
     def _check_states(self, i: int, names: tuple[str, ...]) -> None:
         if names != self.names:
@@ -155,10 +334,10 @@ class BatchEstimator:
             observed: Observations and outputs of N cars.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, record.rows)
-        bank = FilterBank(self.filters, self._designs.pool, self._places)
-        while compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
+        bank = FilterBank(self.filters, self._pool, self._places)
+        while _compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
             missing = np.flatnonzero(done < record.rows)  # without gains; each design is made once
-            keys = [(self._design_keys[i], int(self.filters[i, 0].missing_cell)) for i in missing]
+            keys = [(self._designs[i], int(self.filters[i, 0].missing_cell)) for i in missing]
             for i in dict(zip(keys, missing.tolist(), strict=True)).values():
                 self[i].design_missing()
 
@@ -194,7 +373,7 @@ class ForeignBatch(BatchEstimator):
         self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
         self._build, others = build, [build(**spec._asdict()) for spec in specs[1:]]
         self._estimators: list[AnyEstimator] = [first, *others]
-        self._design_keys = [spec.design for spec in specs]
+        self._designs = [spec.design for spec in specs]
         self.configure(range(len(specs)), specs)
 
     def __len__(self) -> int:
@@ -211,9 +390,9 @@ class ForeignBatch(BatchEstimator):
             specs: Spec of each of these estimators.
         """
         for i, spec in zip(rows, specs, strict=True):
-            if spec.design != self._design_keys[i]:
+            if spec.design != self._designs[i]:
                 self._estimators[i] = self._build(**spec._asdict())
-                self._design_keys[i] = spec.design
+                self._designs[i] = spec.design
             self._check_states(i, self[i].names)
             self[i].sensors = dict(spec.sensors)
 

@@ -27,13 +27,20 @@ from ..wrappers.truth import (
 )
 from ..wrappers.truth import TruthObservation as SingleTruth
 from .batch import BatchEstimator, ForeignBatch
-from .records import AnyVectorEnv, BatchedEnv, Mask, Observations, Snapshot, VectorObservation
+from .records import AnyVectorEnv, Mask, Observations, Snapshot, VectorObservation
 
 _MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
+_BATCHED_MEMBERS = (
+    *_MEMBERS,
+    *(f"final_{name}" for name in _MEMBERS),  # before a car's newest reset
+    *("slow_sensors", "nominal", "held_speed"),  # of each car, as those of a single env
+    *("layout", "dt"),
+)
+"""What a vector env that steps all cars at once offers."""
 
 
 class _BatchedRecords:
-    """The records of a `BatchedEnv`."""
+    """The records of a vector env that offers `_BATCHED_MEMBERS`."""
 
     def __init__(self, env: Any) -> None:
         self._env = env
@@ -98,8 +105,8 @@ class EstimateObservation(VectorObservation):
 
     `sideslip.estimators.EstimateObservation` of all rows: every row gets the bits that the single
     wrapper would give it. It must be the innermost wrapper; others of its class may be stacked,
-    each with its own `name`. It works on `SyncVectorEnv` and on a vector env that offers what
-    `records.BatchedEnv` lists.
+    each with its own `name`. It works on `SyncVectorEnv` and on a vector env with records as those
+    of `StabilityVectorEnv`.
 
     A row whose episode ended starts a new one with a fresh filter; where that is within the step
     that ended it, the old filter first takes the last record into `final_obs`. As the environments
@@ -156,7 +163,7 @@ class EstimateObservation(VectorObservation):
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
 
     def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
-        # a `BatchedEnv` raises these before it moves any row
+        # such an env raises these before it moves any row
         if isinstance(self._records, _BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
@@ -274,7 +281,7 @@ def _find_records(env: AnyVectorEnv) -> _SyncRecords | _BatchedRecords:
         )
     if isinstance(layer, SyncVectorEnv):
         return _SyncRecords(layer)
-    if missing := [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]:
+    if missing := [name for name in _BATCHED_MEMBERS if not hasattr(layer, name)]:
         text = "EstimateObservation reads the records of a sideslip vector environment"
         raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
     return _BatchedRecords(layer)

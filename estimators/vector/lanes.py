@@ -1,225 +1,398 @@
-"""The batch's part of an observation, compiled: filters of one shape in SIMD lanes, others alone.
+"""The ticks of a block of filters, by lanes.
 
-A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
-`core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
-Its model stays there and is loaded anew where its speed changed; its state in every call.
+A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
+row is not sound. So is every packet, and what is stored of a capture.
 """
 
-from collections.abc import Callable
-from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from ...envs.numerics.jit import jit, jit_nrt
-from ...envs.numerics.packed import count_lanes
-from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
-from ...envs.numerics.simd import LANES
-from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
-from ...envs.record import FAST, FAST_WIDTH
-from ..core.filter import StepRecord
-from ..core.innovation import BUFFER, LARSEN
-from ..core.model import KINEMATIC, VELOCITY_ROLL
-from ..core.record import (
-    FILTER,
-    N_CORE,
-    N_FAST,
-    N_INPUTS,
-    N_SMALL,
-    N_TOTAL,
-    X_OFFSET,
-    FilterRecord,
+from ...envs.numerics.jit import jit, jit_nrt, noinline
+from ...envs.numerics.packed import count_lanes, load_element, store_element
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
+from ...envs.numerics.simd8 import prefetch
+from ...envs.record import FAST, FAST_WIDTH, PACKET, Array
+from ..core.covariance import correct_scalar, project
+from ..core.filter import run_tick
+from ..core.innovation import store_due_captures
+from ..core.model import CURVATURE, LATERAL, is_finite
+from ..core.packets import process_packet
+from ..core.predict import (
+    compute_residual,
+    compute_signal,
+    find_next_cell,
+    is_speed_changed,
+    propagate,
+    read_fast_row,
 )
-from ..core.update import NONE
-from ..estimator import compile_call
-from ..wrappers.outputs import Observed, OutputTable, observe
-from .lane_ticks import FilterBank, LaneBlock, advance_block, get_gains
+from ..core.record import N_SLOW, WINDOW, X_OFFSET, FilterRecord, FilterRecords, GainTables
 
-_MIN_LANES = 4  # filters that are computed alone in less time than in lanes
-_MAX_STATES = 16  # states and clones
-_ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
-_FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
-    ((_ROW_LENGTH,), ("x", "own_decay", "decay", "drift", "PC", "gain")),
-    ((_MAX_STATES, _ROW_LENGTH), ("P",)),  # on and above the diagonal, as Q
-    ((N_CORE, _ROW_LENGTH), ("G", "GT", "Q")),
-    ((N_INPUTS, _ROW_LENGTH), ("HT",)),
-    ((N_FAST, _ROW_LENGTH), ("K", "C_fast")),  # K: periodic gains of this tick
-    ((N_FAST, N_INPUTS), ("D_fast",)),
-    ((N_FAST,), ("rest_fast", "r_fast", "y")),
-    ((N_INPUTS, 2), ("u_factor",)),
-    ((N_FAST, 2), ("y_factor",)),
-    ((N_INPUTS,), ("u", "u_new")),
-    ((FAST_WIDTH,), ("row",)),  # of this tick
-)
-# of a lane: ticks are those of now, of the last row, of the next packet to take and capture;
-# model_speed, 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds
-# is of no use; apart, 1: the tick is computed by the record; wild, 1: its residual is none
-_SCALARS = (
-    *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
-    *("now", "last", "due", "next", "here", "apart", "wild"),
-)
-# of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
-# within the cycle, table of gains, packets done
-_INTS = ("shaped", "tick", "at", "cell", "cursor")
-_SHAPE = (
-    *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
-    *("store_predictions", "tyres", "robust"),
-)
-_FIELDS = (
-    [
-        (name, np.float64, (*shape, LANES))
-        for shape, names in (*_FLOATS, ((), _SCALARS))
-        for name in names
-    ]
-    + [(name, np.int64, (LANES,)) for name in _INTS]
-    + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
-    + [("u_column", np.int64, (N_INPUTS, 2)), ("y_column", np.int64, (N_FAST, 2))]
-    + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
-)
-BLOCK = pad_to_cache_line(_FIELDS)
+LaneBlock = Any
+"""One record of the dtype `batch.BLOCK`; `b` in compiled code."""
 
 
-def make_blocks(count: int) -> Any:
-    """Allocate empty blocks.
+class FilterBank(NamedTuple):
+    """The filters of a batch, and the gains of all of them in one array."""
 
-    Args:
-        count: Number of filters N.
-
-    Returns:
-        Records of the dtype `BLOCK`, enough for N lanes.
-    """
-    return allocate_aligned((-(-count // LANES),), BLOCK)
-
-
-@jit
-def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
-    """Return whether a filter's ticks are computed in its lane now; the first shapes the block."""
-    # lanes compute models that change by speed alone, of which every tick predicts and corrects
-    # without rules between samples, and store nothing of the past but predictions
-    if b.shaped[lane] == 0:
-        is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
-        is_plain = f.stride == 1 and f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
-        has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
-        is_supported = f.delay_rule != BUFFER and f.delay_rule != LARSEN and f.total <= _MAX_STATES
-        is_supported = is_supported and is_steady and is_plain and has_fixed_noise
-        if is_supported and b.n == 0:
-            _set_shape(b, f)
-        b.shaped[lane] = 1 if is_supported and _is_same_shape(b, f) else -1
-    return b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
-
-
-@jit
-def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Scalar:
-    is_same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
-    is_same = is_same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
-    is_same = is_same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
-    is_same = is_same and f.store_predictions == b.store_predictions
-    for k in range(2):
-        for i in range(f.inputs):
-            is_same = is_same and f.u_column[i, k] == b.u_column[i, k]
-        for i in range(f.fasts):
-            is_same = is_same and f.y_column[i, k] == b.y_column[i, k]
-    return is_same
-
-
-@jit
-def _set_shape(b: LaneBlock, f: FilterRecord) -> None:
-    """Write into the block what all its filters share."""
-    b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
-    b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
-    b.store_predictions, b.tyres, b.robust = f.store_predictions, f.tyres, f.robust
-    b.columns = 0
-    if f.measured == 1:
-        _add_column(b, FAST.wheel_left)
-        _add_column(b, FAST.wheel_right)
-    for k in range(2):
-        for i in range(f.inputs):
-            b.u_column[i, k] = f.u_column[i, k]
-            _add_column(b, f.u_column[i, k])
-        for i in range(f.fasts):
-            b.y_column[i, k] = f.y_column[i, k]
-            _add_column(b, f.y_column[i, k])
-
-
-@jit
-def _add_column(b: LaneBlock, column: int) -> None:
-    for i in range(b.columns):
-        if b.column[i] == column:
-            return
-    b.column[b.columns] = column
-    b.columns += 1
-
-
-@jit
-def _fetch(f: FilterRecord, template: FilterRecord) -> None:
-    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
-    for i in range(0, X_OFFSET + template.total, 8):
-        prefetch(f.padding, i)
-    for i in range(0, N_SMALL, 8):
-        prefetch(f.P, N_TOTAL, i)
-    for j in range(0, template.total, 8):
-        for i in range(template.total):
-            prefetch(f.P, i, j)
-    for j in range(0, template.n, 8):
-        for i in range(template.n):
-            prefetch(f.Q, i, j)
-            if i < template.dense:
-                prefetch(f.G, i, j)
-            if j < template.dense:
-                prefetch(f.GT, i, j)
-
-
-@jit
-def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
-    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
-    n_rows, count = 0, 0
-    for lane in range(count_lanes()):
-        i = first + lane
-        b.here[lane] = 0.0
-        if i < len(filters) and done[i] == -1 and rows[i] > 0:
-            is_same = count == 0 or rows[i] == n_rows
-            if is_same and len(filters[i]) == 1 and _is_lane_compatible(b, lane, filters[i, 0]):
-                b.here[lane], n_rows = 1.0, rows[i]
-                count += 1
-    return n_rows if count >= _MIN_LANES else 0
+    filters: FilterRecords  # dtype `FILTER`, shape (N, layers)
+    pool: Array  # gains, shape (total,)
+    places: npt.NDArray[np.int64]  # offset, cells, rows and columns of each in the pool, (N, 4)
 
 
 @jit_nrt
-def _observe_batch(
-    bank: FilterBank, done: Vector, lanes: Vector, record: StepRecord, observed: Observed
-) -> int:
-    """Call `observe` for every filter that has rows to do; return how many still have."""
-    # record, observed: of N cars; done: rows done, -1 where a filter has not started, updated;
-    # filters of one shape go in lanes
-    fast, rows, packets, counts = record
-    obs, table, beta, gamma, out, summary = observed
-    filters, n_waiting = bank.filters, 0
-    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
-        b = lanes[first // LANES]
-        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
-        if n_rows > 0:
-            n_done = advance_block(b, first, bank, fast, n_rows, packets, counts)
-        for lane in range(minimum(count_lanes(), len(filters) - first)):
+def get_gains(bank: FilterBank, i: int) -> GainTables:
+    """Return the table of gains of a filter, a view of shape (cells, rows, columns).
+
+    Args:
+        bank: Filters and gains.
+        i: Index of the filter.
+    """
+    place = bank.places[i]
+    start, cells, height, width = place[0], place[1], place[2], place[3]
+    return bank.pool[start : start + cells * height * width].reshape((cells, height, width))
+
+
+@jit
+def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load what a filter's ticks read and do not write."""
+    n, dense = f.n, f.dense
+    for i in range(n):
+        b.own_decay[i, lane], b.decay[i, lane] = f.own_decay[i], f.decay[i]
+        b.drift[i, lane] = f.drift[i]
+        for j in range(n):
+            b.GT[i, j, lane] = f.GT[i, j]
+        for j in range(i, n):
+            b.Q[i, j, lane] = f.Q[i, j]
+    for i in range(dense):
+        for j in range(n):
+            b.G[i, j, lane] = f.G[i, j]
+    for i in range(n, f.total):
+        b.own_decay[i, lane] = f.own_decay[i]
+    for k in range(f.inputs):
+        b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
+        for j in range(dense):
+            b.HT[k, j, lane] = f.HT[k, j]
+    for i in range(f.fasts):
+        b.y_factor[i, 0, lane], b.y_factor[i, 1, lane] = f.y_factor[i, 0], f.y_factor[i, 1]
+        b.rest_fast[i, lane], b.r_fast[i, lane] = f.rest_fast[i], f.r_fast[i]
+        for j in range(n):
+            b.C_fast[i, j, lane] = f.C_fast[i, j]
+        for k in range(f.inputs):
+            b.D_fast[i, k, lane] = f.D_fast[i, k]
+    b.model_speed[lane], b.smoothing[lane], b.step[lane] = f.model_speed, f.smoothing, f.step
+
+
+@jit
+def _load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load a filter's model, where its speed changed, and its state into its lane."""
+    if b.model_speed[lane] != f.model_speed:
+        _load_model(b, lane, f)
+    _load_states(b, lane, f)
+    for k in range(b.inputs):
+        b.u[k, lane] = f.u[k]
+    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
+    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
+    _load_clock(b, lane, f)
+
+
+@jit
+def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    N = b.total
+    for i in range(N):
+        b.x[i, lane] = f.x[i]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                b.P[i, j, lane] = f.P[i, j]
+
+
+@jit
+def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Load the tick of the next capture."""
+    first = np.inf
+    for s in range(N_SLOW):
+        if f.period[s] > 0:
+            first = min(first, float(f.next[s]))
+    b.next[lane] = first
+
+
+@jit
+def _store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Store the state of a lane in its filter's record."""
+    _store_states(b, lane, f)
+    for k in range(b.inputs):
+        f.u[k] = b.u[k, lane]
+    for i in range(b.fasts):
+        f.y[i] = b.y[i, lane]
+    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
+    f.tick, f.at = b.tick[lane], b.at[lane]
+
+
+@jit
+def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    N = b.total
+    for i in range(N):
+        f.x[i] = b.x[i, lane]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
+
+
+@jit
+def _store_lane_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+    """Store by its record what a lane's filter captured at its last tick; before the next one."""
+    _store_states(b, lane, f)
+    f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
+    store_due_captures(f, b.tick[lane])
+    _load_states(b, lane, f)
+    _load_clock(b, lane, f)
+
+
+@jit
+def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Matrix, j: int, rows: int) -> None:
+    """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
+    last = minimum(first + count_lanes(), len(filters))
+    for i in range(first, last):
+        for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
+            prefetch(fast, i, j, k)
+    for lane in range(count_lanes() * j // rows, count_lanes() * (j + 1) // rows):
+        if first + lane < last:
+            f = filters[first + lane, 0]
+            for k in range(0, X_OFFSET + b.total, 8):
+                prefetch(f.padding, k)
+            for i in range(b.total if b.periodic == 0 else 0):
+                for k in range(0, b.total, 8):
+                    prefetch(f.P, i, k)
+
+
+@jit
+def _read_rows(b: LaneBlock, first: int, fast: Matrix, j: int) -> None:
+    """Read row j of each lane's filter into b.row."""
+    for lane in range(count_lanes()):
+        if b.here[lane] == 1.0:
+            for k in range(b.columns):
+                b.row[b.column[k], lane] = fast[first + lane, j, b.column[k]]
+    store_element(b.now, load_element(b.now) + 1.0)
+
+
+@jit
+def _read_signals(b: LaneBlock) -> Any:
+    """Read b.u_new (inputs) and b.y (measurements); return speeds and which ticks stand apart."""
+    is_outlier = load_element(b.here) != 1.0  # lanes without a filter: masked below
+    for i in range(b.inputs):
+        store_element(b.u_new, compute_signal(b.row, b.u_column[i], b.u_factor[i]), i)
+        is_outlier = is_outlier | (is_finite(load_element(b.u_new, i)) ^ True)
+    for i in range(b.fasts):
+        store_element(b.y, compute_signal(b.row, b.y_column[i], b.y_factor[i]), i)
+        is_outlier = is_outlier | (is_finite(load_element(b.y, i)) ^ True)
+    speed = load_element(b.speed)
+    if b.measured == 1:
+        wheel_speed = 0.5 * (
+            load_element(b.row, FAST.wheel_left) + load_element(b.row, FAST.wheel_right)
+        )
+        speed = speed + load_element(b.smoothing) * (wheel_speed - speed)
+        is_outlier = (
+            is_outlier
+            | (is_finite(wheel_speed) ^ True)
+            | is_speed_changed(speed, load_element(b.model_speed))
+        )
+    return speed, is_outlier & (load_element(b.here) == 1.0)
+
+
+@jit
+def _gather_gains(b: LaneBlock, first: int, bank: FilterBank) -> None:
+    """Gather the periodic gains of this tick in b.K."""
+    for lane in range(count_lanes()):
+        if b.here[lane] == 1.0:
+            place = bank.places[first + lane]
+            row = b.cell[lane] * place[2] + 1 + b.at[lane] * maximum(b.fasts, 1)
+            for k in range(b.fasts):
+                for j in range(b.total):
+                    b.K[k, j, lane] = bank.pool[place[0] + (row + k) * place[3] + j]
+
+
+@jit
+def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
+    """Correct all lanes by their fast measurements; a residual that is not finite is skipped."""
+    for i in range(b.fasts):
+        residual = compute_residual(b, i)
+        is_invalid = (
+            (is_finite(residual) ^ True)
+            & (load_element(b.apart) == 0.0)
+            & (load_element(b.here) == 1.0)
+        )
+        has_invalid = any_lane(is_invalid)
+        if has_invalid:
+            store_element(b.wild, select(is_invalid, 1.0, 0.0))
+            for lane in range(count_lanes()):
+                if b.wild[lane] == 1.0:
+                    _store_lane(b, lane, filters[first + lane, 0])
+        if b.periodic == 1:
+            for j in range(b.total):
+                store_element(b.x, load_element(b.x, j) + load_element(b.K, i, j) * residual, j)
+        else:
+            variance = project(b, b.C_fast[i]) + load_element(b.r_fast, i)
+            correct_scalar(b, variance, residual)
+        if has_invalid:
+            for lane in range(count_lanes()):
+                if b.wild[lane] == 1.0:
+                    _load_lane(b, lane, filters[first + lane, 0])
+
+
+@jit
+def _store_captures(b: LaneBlock, first: int, filters: Matrix) -> None:
+    """Store what lanes that do this tick together captured at the last one."""
+    if any_lane((load_element(b.now) > load_element(b.next)) & (load_element(b.here) == 1.0)):
+        for lane in range(count_lanes()):
+            is_due = b.now[lane] > b.next[lane]
+            if is_due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:
+                _store_lane_captures(b, lane, filters[first + lane, 0])
+
+
+@jit
+def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> None:
+    """Step all lanes by one tick."""
+    store_element(b.speed_before, load_element(b.model_speed))
+    store_element(b.speed, speed)
+    for k in range(b.inputs):
+        store_element(b.u, load_element(b.u_new, k), k)
+    if b.kind == LATERAL and b.inputs > CURVATURE:
+        turn = load_element(b.model_speed) * load_element(b.u, CURVATURE) * load_element(b.step)
+        store_element(b.road_turn, load_element(b.road_turn) + turn)
+    propagate(b, b.u)
+    for lane in range(count_lanes()):
+        b.tick[lane] += 1
+        b.at[lane] = b.at[lane] + 1 if b.at[lane] + 1 < b.cycle else 0
+    if b.store_predictions == 1:
+        for lane in range(count_lanes()):
+            if b.here[lane] == 1.0 and b.apart[lane] == 0.0:
+                f, slot = bank.filters[first + lane, 0], b.tick[lane] % WINDOW
+                f.past_road_turn[slot] = b.road_turn[lane]
+                for i in range(b.n):
+                    f.predicted[slot, i] = b.x[i, lane]
+    if b.periodic == 1:
+        _gather_gains(b, first, bank)
+    _correct(b, first, bank.filters)
+
+
+@jit
+def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> bool:
+    """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
+    if b.periodic == 1:
+        for lane in range(count_lanes()):
+            if b.apart[lane] == 1.0:
+                i = first + lane
+                f, place = bank.filters[i, 0], bank.places[i]
+                f.speed = b.speed[lane]
+                cell = find_next_cell(f, fast[i, j])
+                if bank.pool[place[0] + cell * place[2] * place[3]] == 0.0:
+                    return False
+    for lane in range(count_lanes()):
+        if b.apart[lane] == 1.0:
+            _store_lane(b, lane, bank.filters[first + lane, 0])
+    return True
+
+
+@noinline
+def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
+    """Step one filter by one tick."""
+    read_fast_row(f, row)
+    run_tick(f, gains)
+
+
+@jit
+def _step_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> None:
+    """Step the lanes that stand apart by their records, which the lanes take over."""
+    for lane in range(count_lanes()):
+        if b.apart[lane] == 1.0:
             i = first + lane
-            if done[i] < rows[i]:
-                f, gains = filters[i], get_gains(bank, i)
-                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
-                outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
-                if n_done == 0 and i + 1 < len(filters):
-                    for layer in range(len(f)):
-                        _fetch(filters[i + 1, layer], f[layer])
-                row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
-                done[i] = observe(f, gains, row_record, start, outputs)
-                n_waiting += 1 if done[i] < rows[i] else 0
-    return n_waiting
+            _step_filter(bank.filters[i, 0], get_gains(bank, i), fast[i, j])
+            _load_lane(b, lane, bank.filters[i, 0])
 
 
-@cache
-def compile_observe_batch() -> Callable[..., int]:
-    """Return `_observe_batch` as a plain call, for the types that all banks and records have."""
-    counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
-    bank = FilterBank(np.zeros((1, 1), FILTER), numbers, np.zeros((1, 4), np.int64))
-    record, obs = StepRecord(cube, counts, cube, counts), np.zeros((1, 0), np.float32)
-    table = OutputTable(0, np.zeros((0, 3), np.int64), numbers)
-    observed = Observed(obs, table, numbers, numbers, obs, np.zeros((1, 4)))
-    return compile_call(_observe_batch, bank, counts, make_blocks(1), record, observed)
+@jit
+def _set_next_due(b: LaneBlock, lane: int, packets: Matrix, count: int) -> None:
+    """Set when the lane's next packet is taken; one that no tick of this call waits for is next."""
+    k, due_tick = b.cursor[lane], np.inf
+    if k < count:
+        arrived = packets[k, PACKET.arrived]
+        due_tick = arrived if b.now[lane] < arrived <= b.last[lane] else -np.inf
+    b.due[lane] = due_tick
+
+
+@jit
+def _process_packets(
+    b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Matrix, count: int
+) -> None:
+    """Process the packets of a lane's filter that are here now, by its record."""
+    k = b.cursor[lane]
+    _store_lane(b, lane, f)
+    while k < count and not (f.tick < packets[k, PACKET.arrived] <= b.last[lane]):
+        process_packet(f, gains, packets[k])
+        k += 1
+    b.cursor[lane] = k
+    _load_lane(b, lane, f)
+    _set_next_due(b, lane, packets, count)
+
+
+@jit_nrt
+def advance_block(
+    b: LaneBlock,
+    first: int,
+    bank: FilterBank,
+    fast: Matrix,
+    rows: int,
+    packets: Matrix,
+    counts: Vector,
+) -> int:
+    """Advance the filters that are `here` from their first row on, as `core.filter.advance` does.
+
+    Args:
+        b: Block of lanes.
+        first: Index of the filter in the first lane.
+        bank: Filters and gains.
+        fast: Fast rows, shape (N, k, FAST_WIDTH).
+        rows: Number of fast rows, equal for these filters.
+        packets: Packets, shape (N, capacity, PACKET_WIDTH).
+        counts: Number of packets of each filter, shape (N,).
+
+    Returns:
+        Number of rows done by all alike: fewer than `rows` where one of them has no gains.
+    """
+    filters = bank.filters
+    store_element(b.due, np.inf)
+    for lane in range(count_lanes()):
+        if b.here[lane] == 1.0:
+            i = first + lane
+            _load_lane(b, lane, filters[i, 0])
+            b.cursor[lane], b.now[lane] = 0, float(b.tick[lane])
+            b.last[lane] = b.tick[lane] + rows
+            _set_next_due(b, lane, packets[i], counts[i])
+    for j in range(rows):
+        _fetch_next(b, first + count_lanes(), filters, fast, j, rows)
+        _read_rows(b, first, fast, j)
+        speed, is_outlier = _read_signals(b)
+        has_outlier = any_lane(is_outlier)
+        store_element(b.apart, select(is_outlier, 1.0, 0.0))
+        if has_outlier and not _store_outliers(b, first, bank, fast, j):
+            rows = j
+            break
+        _store_captures(b, first, filters)
+        _step_lanes(b, first, bank, speed)
+        if has_outlier:
+            _step_outliers(b, first, bank, fast, j)
+        if any_lane(load_element(b.now) >= load_element(b.due)):
+            for lane in range(count_lanes()):
+                if b.here[lane] == 1.0 and b.now[lane] >= b.due[lane]:
+                    i = first + lane
+                    lane_args = filters[i, 0], get_gains(bank, i), packets[i], counts[i]
+                    _process_packets(b, lane, *lane_args)
+    for lane in range(count_lanes()):
+        if b.here[lane] == 1.0:
+            f = filters[first + lane, 0]
+            _store_lane(b, lane, f)
+            f.cursor = b.cursor[lane]
+    return rows

@@ -1,8 +1,8 @@
-"""Vector envs as the wrappers use them, and the base of the wrappers."""
+"""The base of the wrappers of vector environments."""
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,35 +14,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrap
 from gymnasium.vector.utils import batch_space
 
 from ...envs.engine.views import CarTruth
-from ...envs.record import Array
-from ...envs.sensors.link import SlowSensor
 from ...envs.task import Infos, ObservationEntry, make_space
-from ...envs.vehicle.parameters import Vehicle
 
-IntArray = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
 Snapshot = dict[str, Any]
 AnyVectorEnv = VectorEnv[Any, Any, Any]
-
-
-class BatchedEnv(Protocol):
-    """The attributes of a vector env that steps all cars at once."""
-
-    rows: Array  # fast samples of each car, (N, k, FAST_WIDTH)
-    ticks_done: IntArray  # number of fast samples of each car, (N,)
-    packets: Array  # (N, capacity, PACKET_WIDTH)
-    delivered: IntArray  # number of packets of each car, (N,)
-    # a car's record before its newest reset, which is read in the step that ended its episode
-    final_rows: Array
-    final_ticks_done: IntArray
-    final_packets: Array
-    final_delivered: IntArray
-    slow_sensors: Sequence[Mapping[str, SlowSensor]]  # of each car, by name
-    nominal: Sequence[Vehicle]  # of each car
-    held_speed: Sequence[float | None]  # m/s, of each car where it is held
-    layout: tuple[ObservationEntry, ...]  # of a car's observation
-    dt: float  # tick (s)
 
 
 class VectorObservation(
@@ -145,9 +122,6 @@ class VectorObservation(
 
         Args:
             actions: Actions of all rows.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos.
 
         Raises:
             ResetNeeded: It is called before `reset`, or after a step that failed.

@@ -19,9 +19,8 @@ from ..core.filter import StepRecord
 from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS
-from ..make import make_estimator
+from ..make import find_entry_point, make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
-from ..registry import find_entry_point
 from .outputs import (
     BETA,
     HEALTHY,
@@ -70,9 +69,6 @@ def make_spec(base: Any) -> EstimatorSpec:
 
     Args:
         base: Environment without wrappers.
-
-    Returns:
-        Nominal vehicle, slow sensors and held speed.
     """
     return EstimatorSpec(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
 
@@ -157,14 +153,11 @@ class Arguments:
         return bool(options.get("noise_time", 0.0))
 
     def make_outputs(self, states: tuple[str, ...], inner: tuple[ObservationEntry, ...]) -> Outputs:
-        """Make the outputs of an estimator behind the entries of an inner observation.
+        """Make the outputs behind an inner observation's; ValueError for unknown or repeated ones.
 
         Args:
             states: Names of the estimator's states.
             inner: Entries of the inner observation, which `replace` leaves out.
-
-        Returns:
-            The entries, and how `observe` writes them; ValueError for unknown or repeated ones.
         """
         for output in self.outputs:
             if output not in states:
@@ -198,13 +191,10 @@ def _refuse_rebuild(label: str, **_: object) -> NoReturn:
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
-    """Choose the estimator where none is named.
+    """Choose the estimator where none is named: "dakf" with a GPS, else "exact-kf".
 
     Args:
         slow_sensors: Names of the slow sensors.
-
-    Returns:
-        "dakf" where there is a GPS, else "exact-kf".
     """
     return "dakf" if "gps" in slow_sensors else "exact-kf"
 
@@ -325,9 +315,6 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
 
         Args:
             action: Action of the env.
-
-        Returns:
-            Observation, reward, terminated, truncated and info.
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info

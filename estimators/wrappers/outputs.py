@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...envs.numerics.functions import wrap
-from ...envs.numerics.jit import as_python, jit, noinline
+from ...envs.numerics.jit import as_python, compile_call, jit, noinline
 from ...envs.numerics.primitives import ARRAYS, Matrix, Scalar, Vector, maximum, minimum
 from ...envs.task import ObservationEntry
 from ..core.filter import FilterOutputs, StepRecord, advance, compute_deviation, read_covariance
 from ..core.record import FILTER, FilterRecord, GainTables
 from ..core.update import compute_excess, is_healthy
-from ..estimator import compile_call
 from ..protocol import EstimatorLike, compute_std
 
 BETA, STD, NEES, HEALTHY = range(4)  # places in the summary of a step
@@ -115,7 +114,7 @@ def _compute_nees(
 def observe(
     filters: Vector, gains: Matrix, record: StepRecord, start: int, observed: Observed
 ) -> int:
-    """Advance the filter, then write the observation and the outputs.
+    """Advance the filter and write the observation; return the rows done as `advance` does.
 
     Args:
         filters: Memory of the filter, dtype `FILTER`, shape (layers,).
@@ -123,9 +122,6 @@ def observe(
         record: Record to process.
         start: Number of fast rows that are done already.
         observed: Observation and outputs.
-
-    Returns:
-        Number of fast rows done, as `advance` returns it.
     """
     obs, (inner, plan, limits), beta, gamma, out, summary = observed
     nothing = FilterOutputs(record.fast[:0], record.fast[:0], summary[:0])

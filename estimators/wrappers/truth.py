@@ -36,14 +36,11 @@ _STATES = {
 
 
 def calibrate(readings: Readings, calibration: Readings) -> Readings:
-    """Correct readings by what is told of their sensors.
+    """Correct readings by what is told of their sensors: true values but for noise.
 
     Args:
         readings: Readings, shape (..., k).
         calibration: Offset and scale of each, shape (2, k), or (N, 2, k) of N cars.
-
-    Returns:
-        True values but for noise, shape (..., k).
     """
     return (readings - calibration[..., 0, :]) / calibration[..., 1, :]
 
@@ -111,9 +108,6 @@ class TruthEntries:
             values: Parameters at the reset, shape (..., len(parameters)).
             calibration: Offset and scale of the readings, shape (..., 2, k).
             true_state: States, shape (..., len(TrueState)); None without entries of states.
-
-        Returns:
-            Observation of all entries, float32, shape (..., len(layout)).
         """
         parts = [obs, values]
         if true_state is not None:
@@ -223,13 +217,10 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         return self.observation(obs), info
 
     def observation(self, observation: _Floats) -> _Floats:
-        """Append parameters and states.
+        """Append parameters and states, float32, shape (len(layout),).
 
         Args:
             observation: Observation of the env, float32, shape (inner,).
-
-        Returns:
-            Observation of the wrapper, float32, shape (len(layout),).
         """
         base: Any = self.unwrapped
         true_state = base.true_state if self._entries.states else None

@@ -11,7 +11,7 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.parameters import Vehicle
-from sideslip.estimators.design.kalman import joseph_form, kalman_gain
+from sideslip.estimators.design.gains import joseph_form, kalman_gain
 from sideslip.estimators.design.options import NOISE, OPTIONS
 from tests.estimators.dense import MEASURED
 

@@ -11,7 +11,7 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import EstimateObservation, Estimator, make_estimator
-from sideslip.estimators.analysis.bound import compute_error_bound
+from sideslip.estimators.analysis.limits import compute_error_bound
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, simulate

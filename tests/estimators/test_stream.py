@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sideslip import estimate
-from sideslip.estimators.stream import SideslipEstimate, Stream
+from sideslip.estimators.joint import SideslipEstimate, Stream
 from tests.estimators.test_frame import drive
 
 Sample = tuple[str, float, float]

@@ -10,8 +10,8 @@ import pytest
 
 from sideslip.agents import AGENTS, make_agent, register_agent
 from sideslip.estimators import FILTERS, make_estimator, register_estimator
-from sideslip.estimators.make import ESTIMATORS
-from sideslip.estimators.registry import (
+from sideslip.estimators.make import (
+    ESTIMATORS,
     _import_entry_point,
     _load_user_class,
     describe_error,

@@ -11,8 +11,8 @@ from sideslip.benchmarks.papers.dual_rate import (
     compare_maps,
     make_extended_model,
 )
-from sideslip.estimators.design import dual_rate as spread
-from sideslip.estimators.design.kalman import kalman_gain
+from sideslip.estimators.design import gains as spread
+from sideslip.estimators.design.gains import kalman_gain
 
 Array = npt.NDArray[np.float64]
 

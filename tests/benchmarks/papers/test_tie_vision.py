@@ -21,7 +21,7 @@ from sideslip.benchmarks.papers.tie_vision import (
 )
 from sideslip.envs import COMS
 from sideslip.envs.vehicle.linear import make_bicycle_model, make_vision_model
-from sideslip.estimators.design.kalman import joseph_form, kalman_gain
+from sideslip.estimators.design.gains import joseph_form, kalman_gain
 
 V = 25.0 / 3.6
 DESIGN = LoopDesign()

@@ -146,10 +146,10 @@ def test_a_filter_that_is_lost_says_so() -> None:
 def test_looking_at_the_health_changes_no_bit() -> None:
     log, _, base = drive(BASE, duration=SHORT)
     filter_ = make_unchecked_filter(conditions.NAME, log, base.nominal, {})
-    beta, deviation, healthy = conditions._run_with_health(filter_, log)
+    watched, healthy = filter_.run_with_health(log, conditions._WATCH)
     run = filter_.run(log)
-    assert np.array_equal(beta, run["beta"]) and len(healthy) == len(log.time) // 100 + 1
-    assert np.array_equal(deviation, run.std[:, run.names.index("beta")])
+    assert np.array_equal(watched.x, run.x) and len(healthy) == len(log.time)
+    assert np.array_equal(watched.std, run.std)
 
 
 def test_a_run_has_rows_verdict_and_picture(monkeypatch: pytest.MonkeyPatch) -> None:

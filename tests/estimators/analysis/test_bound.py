@@ -12,7 +12,7 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.estimators import make_estimator
-from sideslip.estimators.analysis.bound import compute_error_bound
+from sideslip.estimators.analysis.limits import compute_error_bound
 from tests.estimators.riccati import riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 

@@ -8,14 +8,14 @@ import pytest
 
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import make_estimator
-from sideslip.estimators.analysis.observability import (
+from sideslip.estimators.analysis.limits import (
     GPS_SPEED,
     UNKNOWNS,
     WHEELS,
     _find_unobservable_subspace,
     make_observability_table,
 )
-from sideslip.estimators.design.kalman import transition_matrix
+from sideslip.estimators.design.gains import transition_matrix
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

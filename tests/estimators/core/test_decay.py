@@ -16,8 +16,7 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
 from sideslip.estimators.core.filter import NO_OUTPUTS, StepRecord
-from sideslip.estimators.design.dual_rate import RULES
-from sideslip.estimators.design.kalman import INVERSES
+from sideslip.estimators.design.gains import DUAL_RATE_RULES, INVERSES
 from sideslip.estimators.design.periodic import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS
 
@@ -82,7 +81,7 @@ VARIANTS = [
     *(
         case("dual-rate", GPS, disturbances="none", intersample=rule, **placed)
         for placed in ({}, {"gains": "placed", "poles": [-3.0, -4.0, -5.0]})
-        for rule in RULES
+        for rule in DUAL_RATE_RULES
     ),
     case("dual-rate", GPS, disturbances="none", gains="from-29"),
     case("dual-rate", GPS, gains="from-29"),

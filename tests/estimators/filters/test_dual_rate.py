@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import DualRate, make_estimator
-from sideslip.estimators.design.dual_rate import SampledSystem, frame_map
+from sideslip.estimators.design.gains import SampledSystem, frame_map
 from tests.estimators.simulation import FIG6, simulate
 
 from .literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh

@@ -14,7 +14,7 @@ from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
-from sideslip.estimators.vector.lanes import _MIN_LANES, BLOCK, make_blocks
+from sideslip.estimators.vector.batch import _MIN_LANES, BLOCK, _make_blocks
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.fleets import make_batch, states, step
@@ -155,7 +155,7 @@ def test_which_filters_are_in_lanes() -> None:
 
 def test_blocks_and_records_lie_on_cache_lines() -> None:
     """A copy's, too, and next to each other what is fetched together."""
-    made, batch = make_blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
+    made, batch = _make_blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
     assert len(made) == -(-33 // LANES) and made.dtype == BLOCK
     copies = [batch, copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
     for array in (made, *(each.filters for each in copies), *(each._lanes for each in copies)):

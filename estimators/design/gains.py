@@ -1,19 +1,126 @@
-"""The corrections of dual-rate filters between slow samples, as parts of the last innovation.
+"""Gains in textbook letters: Kalman's, placed poles, generalised inverses, and dual-rate's shares.
 
-At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H u + B_i eps_k for
-i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
+At fixed speed and ratio r, every rule of dual-rate is x_{k+i} = F x_{k+i-1} + H u + B_i eps_k for
+i = 0 .. r-1, with the last innovation eps_k: B_i = L G_i with the gain L and the matrix G_i of the
+pseudo measurement (14).
 """
 
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import Array
-from .kalman import Poles, compute_inverse, joseph_form, kalman_gain, observer_gain
+from ..core.record import FilterRecord
 
-RULES = ("predict", "hold", "oh", "pseudo")
-GAINS = ("constant", "from-29", "placed")
+Poles = Array | npt.NDArray[np.complex128]
+INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
+DUAL_RATE_RULES = ("predict", "hold", "oh", "pseudo")
+"""Corrections of dual-rate filters between slow samples."""
+DUAL_RATE_GAINS = ("constant", "from-29", "placed")
+_RIDGE = 1e-3  # lambda of Tikhonov's inverse, in the square of a row's SI unit
 _CYCLES, _SETTLED = 400, 1e-12  # most samples of a recursion, relative change where it ends
+
+
+def check_covariance(name: str, M: Array, definite: bool = False) -> None:
+    """Check that a matrix is a covariance: finite, symmetric, semidefinite; else ValueError.
+
+    Args:
+        name: Name for messages.
+        M: Matrix, shape (n, n).
+        definite: Whether it must be positive definite.
+    """
+    if not np.isfinite(M).all():
+        raise ValueError(f"{name} is not finite")
+    if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
+        raise ValueError(f"{name} is not symmetric")
+    lowest = np.linalg.eigvalsh(M).min(initial=np.inf)
+    if lowest < -1e-12 * np.abs(M).max(initial=1e-300):
+        raise ValueError(f"{name} is indefinite: its least eigenvalue is {lowest:.3g}")
+    if definite and not lowest > 0.0:
+        raise ValueError(f"{name} must be positive definite: its least eigenvalue is {lowest:.3g}")
+
+
+def kalman_gain(P: Array, C: Array, R: Array) -> Array:
+    """Compute the Kalman gain K = P C^T (C P C^T + R)^-1, shape (n, p).
+
+    With R = 0 it is a generalised inverse of C: the Moore-Penrose one for P = I, the P-weighted
+    one for a covariance P; with P = I, R = lambda I it is Tikhonov's.
+
+    Args:
+        P: Covariance of the state, shape (n, n).
+        C: Measurement matrix, shape (p, n).
+        R: Covariance of the measurement noise, shape (p, p).
+    """
+    PC = P @ C.T
+    return np.asarray(np.linalg.solve((C @ PC + R).T, PC.T).T, np.float64)
+
+
+def joseph_form(P: Array, K: Array, C: Array, R: Array) -> Array:
+    """Compute the covariance (n, n) after a correction: (I - K C) P (I - K C)^T + K R K^T.
+
+    A sum of two squares stays symmetric and positive semidefinite under rounding.
+
+    Args:
+        P: Covariance before it, shape (n, n).
+        K: Any gain, shape (n, p).
+        C: Measurement matrix, shape (p, n).
+        R: Covariance of the measurement noise, shape (p, p).
+    """
+    rest = np.eye(len(P)) - K @ C
+    return np.asarray(rest @ P @ rest.T + K @ R @ K.T)
+
+
+def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
+    """Compute the generalised inverse of C, shape (n, p), that tie-vision (20) needs.
+
+    C has full row rank only, so C^T C of the printed (20) is singular; the Moore-Penrose inverse is
+    C^T (C C^T)^-1. "bayes" is the mean of the error given the residual, P C^T (C P C^T + R)^-1: for
+    an optimal gain it leaves nothing to correct between the samples.
+
+    Args:
+        kind: Name of `INVERSES`; "p-weighted" weighs by P, "tikhonov" is regularised by `_RIDGE`.
+        C: Measurement matrix, shape (p, n).
+        P: Covariance of the state, shape (n, n).
+        R: Covariance of the measurement noise, shape (p, p).
+    """
+    zero, ridge = np.zeros((len(C), len(C))), _RIDGE * np.eye(len(C))
+    noises = {"moore-penrose": zero, "p-weighted": zero, "tikhonov": ridge, "bayes": R}
+    return kalman_gain(P if kind in ("p-weighted", "bayes") else np.eye(len(P)), C, noises[kind])
+
+
+def transition_matrix(f: FilterRecord, G: Array) -> Array:
+    """Compute F (n, n) of a step: G on the dense states, the others decay.
+
+    Args:
+        f: Memory of the filter.
+        G: Transition of the dense states, shape (dense, n).
+    """
+    n, dense = int(f.n), len(G)
+    F = np.zeros((n, n))
+    F[:dense] = G
+    F[range(dense, n), range(dense, n)] = f.decay[dense:n]
+    return F
+
+
+def observer_gain(F: Array, C: Array, poles: Poles) -> Array:
+    """Compute the gain K (n, p) that gives (I - K C) F its poles; ValueError where none does.
+
+    Args:
+        F: Transition matrix, shape (n, n).
+        C: Measurement matrix, shape (p, n).
+        poles: Poles in the z-plane, shape (n,), no more equal ones than there are outputs.
+    """
+    try:
+        from scipy.signal import place_poles  # slow to load
+
+        K: Array = place_poles(F.T, (C @ F).T, poles).gain_matrix.T
+    except ValueError as error:
+        raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: {error}") from None
+    placed = np.linalg.eigvals((np.eye(len(F)) - K @ C) @ F)
+    if np.abs(np.sort_complex(placed) - np.sort_complex(poles)).max() > 1e-6:
+        raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: not observable")
+    return K
 
 
 class SampledSystem(NamedTuple):
@@ -26,17 +133,14 @@ class SampledSystem(NamedTuple):
     steps: int  # between two samples
 
     def compute_shares(self, rule: str, gains: str, poles: Poles | None) -> Array:
-        """Compute B_i of a rule.
+        """Compute B_i of a rule, shape (steps, n, q).
 
         Args:
-            rule: Name of `RULES`.
-            gains: Name of `GAINS`.
+            rule: Name of `DUAL_RATE_RULES`.
+            gains: Name of `DUAL_RATE_GAINS`.
             poles: Poles in the z-plane for one step, shape (n,), for gains "placed": of the
                 fast-rate filter (I - L C) F for "oh" and "pseudo", of the single-rate one, to the
                 power of `steps`, for the others.
-
-        Returns:
-            B_i, shape (steps, n, q).
         """
         F, C, steps, is_single_rate = self.F, self.C, self.steps, rule in ("predict", "hold")
         if gains == "from-29":
@@ -82,13 +186,10 @@ class SampledSystem(NamedTuple):
         return np.repeat(L[None], self.steps, axis=0)
 
     def compute_shares_29(self) -> Array:
-        """Compute the limits of B_i = L_i G_i, with G_i of (31) and the Kalman gain for (29).
+        """Compute the limits of B_i = L_i G_i (steps, n, q), G_i of (31), Kalman gains for (29).
 
         The covariance recursion is the paper's, which takes pseudo measurements for independent
         ones; its error can grow (by 1.17 to 1.22 a sample for a course alone).
-
-        Returns:
-            B_i, shape (steps, n, q).
         """
         F, Q, C, R, steps = self
         n, q = len(F), len(C)
@@ -117,13 +218,10 @@ class SampledSystem(NamedTuple):
         return shares
 
     def compute_covariances(self, B: Array) -> Array:
-        """Compute the error's covariances that B_i lead to: the limit of a long recursion.
+        """Compute the error's covariances after each step, (steps, n, n), that B_i lead to.
 
         Args:
             B: B_i, shape (steps, n, q).
-
-        Returns:
-            Covariances after each step, shape (steps, n, n).
         """
         steps, n, q = B.shape
         covariances = np.zeros((steps, n, n))
@@ -146,7 +244,7 @@ class SampledSystem(NamedTuple):
 
 
 def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
-    """Compute B_i of the pseudo measurement with one gain: dual-rate (31) and Oh's (35).
+    """Compute B_i (steps, n, q) of the pseudo measurement with one gain: (31) and Oh's (35).
 
     B_i = L C F [(I - L C) F]^(i-1) E.
 
@@ -156,9 +254,6 @@ def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int
         L: Gain, shape (n, q).
         first: E, the estimated error after the sample over its innovation, C^+ - L, shape (n, q).
         steps: Number of steps between two samples.
-
-    Returns:
-        B_i, shape (steps, n, q).
     """
     shares, e = [L], first
     for _ in range(1, steps):
@@ -169,15 +264,12 @@ def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
-    """Compute the map from the error before a sample to that before the next one.
+    """Compute the map (n, n) from the error before a sample to that before the next one.
 
     Args:
         F: Transition matrix of a step, shape (n, n).
         C: Measurement matrix, shape (q, n).
         shares: B_i, shape (steps, n, q).
-
-    Returns:
-        Map, shape (n, n).
     """
     M, eps = np.eye(len(F)), C
     for B in shares:

@@ -1,25 +1,32 @@
-"""Which constant errors of sensors and road can be seen, by exact-kf's discrete model.
+"""What no estimator can do better: the least error, and which constant errors cannot be seen.
+
+The least error is the covariance of the optimal filter of the true model. It is defined where the
+plant is linear (small angles, linear tyres, speed held) and the filter knows vehicle, noise and the
+disturbances' statistics; deterministic wind and biases do not change it.
 
 A direction v of the states is unobservable where C F^k v = 0 for all k: no filter parts its states
 but by their priors. The scale of the wheels' radii is no state of a filter, which takes its speed
-as it is. Here it is one, of the model that is linearised in a steady turn.
+as it is. Here it is one, of exact-kf's discrete model, linearised in a steady turn.
 """
 
 import itertools
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.record import Array
+from ...envs.record import Array, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.ticks import TICK
-from ...envs.vehicle.parameters import COMS
+from ...envs.vehicle.parameters import COMS, Vehicle
 from ..core.filter import reset_filters
 from ..design.assemble import assemble
 from ..design.config import parse_config
-from ..design.kalman import transition_matrix
+from ..design.gains import transition_matrix
+from ..design.models import select_states
 from ..filters import FILTERS
+from ..make import make_estimator
 
 WHEELS, GPS_SPEED = "wheel_scale", "gps speed"
 UNKNOWNS = {
@@ -40,6 +47,36 @@ _DRIVES = {"straight": 0.0, "steady turn": 0.1}  # rad, steering angle
 _SPEED = 7.0  # m/s
 _SPEED_STEP = 1e-4  # relative, of a difference by speed
 _TOLERANCE = 1e-6  # of a singular value where the largest is about 1, what counts as zero
+
+
+def compute_error_bound(
+    vehicle: Vehicle,
+    *,
+    record: Record,
+    sensors: Mapping[str, SlowSensor],
+    speed: float,
+    dt: float = TICK,
+    **options: Any,
+) -> Array:
+    """Compute the optimal estimate of beta's standard deviation (rad) at every row, shape (K,).
+
+    The lowest possible RMSE over a stretch of time is the root of the mean square of this. The
+    start is known exactly, as it is in the environment.
+
+    Args:
+        vehicle: The true vehicle.
+        record: Record with the captured and arrived ticks of the packets.
+        sensors: All available slow sensors by name.
+        speed: Held speed (m/s).
+        dt: Tick (s).
+        **options: Options of `exact-kf` for the true noise, disturbances and latencies.
+    """
+    prior = dict.fromkeys(select_states(tuple(sensors)), 0.0)
+    options = {"slow": list(sensors), "prior": prior} | options
+    exact = make_estimator(
+        "exact-kf", vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options
+    )
+    return exact.run(record).std[:, 0]
 
 
 class _UnobservableSubspace(NamedTuple):

@@ -1,18 +1,20 @@
-"""A sideslip angle from samples that come one by one, in any order and late: for a CAN loop.
+"""A sideslip angle by the filter `joint`: of a recorded drive, or of samples as a CAN bus has them.
 
-The last second stands in a buffer. A sample is written where it was taken, and the filter runs anew
-from the oldest row that changed. So any order of samples gives the numbers of the sorted order.
+Of samples that come in any order and late, the last second stands in a buffer. A sample is written
+where it was taken, and the filter runs anew from the oldest row that changed. So any order of
+samples gives the numbers of the sorted order.
 """
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..envs.numerics import require_extra
 from ..envs.record import FAST, PACKET, Array
 from ..envs.recordings.dialect import LATENCIES, SENSORS, SLOW_QUANTITIES, TRUTH
-from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets
+from ..envs.recordings.log_file import MAX_HOLE, NEEDED, make_fast_rows, make_packets, read_parts
 from ..envs.recordings.tables import parse_column_name
 from ..envs.sensors.link import SlowSensor
 from ..envs.vehicle.parameters import VehicleSource, make_vehicle
@@ -20,11 +22,65 @@ from .core.filter import NO_OUTPUTS, StepRecord
 from .core.record import FilterRecords
 from .design.options import FAST_CHANNELS
 from .make import make_estimator
-from .wires import move_course, read_wires
+from .wires import apply_wires, move_course, read_wires
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..envs.recordings.containers import LogSource
+
+_HEALTH_TIME = 0.05  # s of a recorded drive, after which the filter is asked whether it is healthy
 _SNAPSHOT_ROWS = 16
 _ROOM = 4  # memories that the buffer holds
 _PATIENCE = 10  # successive fast samples outside the memory, after which the clock has jumped
+
+
+def estimate(
+    log: "LogSource",
+    vehicle: VehicleSource,
+    *,
+    mapping: Mapping[str, str] | None = None,
+    latency: Mapping[str, float] | None = None,
+) -> "pd.DataFrame":
+    """Estimate the sideslip angle of a recorded drive with `joint` (needs the extra `report`).
+
+    The log needs time, speed, yaw rate and steering at the road wheels, in columns such as time_s,
+    speed_x_kmh, yaw_rate_degps and steer_deg. Lateral acceleration, wheel speeds, course and camera
+    are used where they are there. A slow sensor's column is NaN, held or interpolated between its
+    samples. Rows are read as `read_parts` does; across a hole the filter begins anew. ValueError
+    stands for a missing column, no number, an unknown channel, or what is later than the memory.
+
+    Args:
+        log: Table, or its file (CSV, Parquet, MATLAB, MDF, CAN trace, ROS bag, MCAP, VBO).
+        vehicle: Vehicle as for `make_vehicle`. A file brings along the steering's ratio, sign and
+            offset, latencies, and where sensors sit.
+        mapping: Our column names, unit included, to the log's: {"yaw_rate_degps": "GyroZ"}.
+            "dbc" names the description of a CAN trace.
+        latency: Latency of a channel (s), such as {"gps": 0.2}; overrules the vehicle's file.
+
+    Returns:
+        Time (s), sideslip angle and its standard deviation (rad), yaw rate (rad/s), and whether
+        the filter is healthy; a row each tick of an even clock, close to the log's.
+    """
+    with require_extra("report", "estimating from a table needs pandas"):
+        import pandas as pd
+    wires = read_wires(vehicle)
+    wires = wires._replace(latency={**wires.latency, **(latency or {})}).check()
+    car, frames = make_vehicle(vehicle), []
+    for part in read_parts(log, mapping)[0]:
+        drive = apply_wires(part, wires)
+        options = {"sensors": drive.slow, "dt": drive.record.dt, "present": drive.record.present}
+        filter_ = make_estimator("joint", vehicle=car, **options)
+        estimates, healthy = filter_.run_with_health(drive, _HEALTH_TIME)
+        columns = {
+            "time_s": drive.origin + estimates.time,
+            "sideslip_rad": estimates["beta"],
+            "sideslip_sd_rad": estimates.std[:, estimates.names.index("beta")],
+            "yaw_rate_radps": estimates["gamma"],
+            "healthy": healthy,
+        }
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
 
 
 class SideslipEstimate(NamedTuple):
