@@ -7,6 +7,7 @@ The gyro's own innovations are left out: tyres that build up their force late lo
 
 import copy
 from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -56,8 +57,9 @@ class _LatencySearch:
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
 
-    def count_until_look(self) -> int:
-        """Return the number of rows until the next look."""
+    @property
+    def rows_until_look(self) -> int:
+        """Number of rows until the next look."""
         return min(look for look in self._looks if look > self._count) - self._count
 
     def take(self, rows: Array, packets: Array) -> None:
@@ -77,18 +79,13 @@ class _LatencySearch:
         return delayed_filters
 
     def _compare(self, delayed_filters: FilterRecords, gains: Array) -> FilterRecords:
-        rows, results = np.concatenate(self._rows), dict[int, tuple[float, int, FilterRecords]]()
-
-        def sum_nis(lag: int) -> float:
-            if lag not in results:
-                results[lag] = self._filter_stretch(lag, rows, gains)
-            return results[lag][0]
-
-        lag, curvature, margin = self._minimise_nis(sum_nis)
-        min_nis, count, memory = results[lag]
+        rows = np.concatenate(self._rows)
+        stretch = cache(partial(self._filter_stretch, rows=rows, gains=gains))  # by lag
+        lag, curvature, margin = self._minimise_nis(lambda lag: stretch(lag)[0])
+        min_nis, count, memory = stretch(lag)
         scale = max(min_nis / max(count, 1), 1.0)
         limit = 2.0 * _MIN_LOG_RATIO * scale
-        is_sharp, is_better = margin > limit, sum_nis(self.lag) - min_nis > limit
+        is_sharp, is_better = margin > limit, stretch(self.lag)[0] - min_nis > limit
         self.done = is_sharp and curvature > 0.0 and self._count == self._looks[-1]
         # the first step away from a latency that is surely wrong need not be to a sharp optimum
         if not curvature > 0.0 or not (is_sharp or (self.lag == 0 and is_better)):
@@ -177,7 +174,7 @@ class LateEstimator(Estimator):
         while start < rows or len(remaining):
             stop = min(start + 1, rows) if len(X) else rows
             if self._search and not self._search.done:
-                stop = min(stop, start + self._search.count_until_look())
+                stop = min(stop, start + self._search.rows_until_look)
             is_due = ~(remaining[:, PACKET.arrived] > tick + stop) | (stop == rows)
             self._update_delayed(fast[start:stop], remaining[is_due], tick + stop, nis)
             remaining = remaining[~is_due]

@@ -8,6 +8,7 @@ import importlib.util
 import inspect
 import math
 import operator
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -53,8 +54,9 @@ def find_class(text: str) -> tuple[Path, str]:
     path = Path(file)
     if not path.is_file():
         raise FileNotFoundError(f"{text!r}: there is no file {path}")
+    source = path.read_bytes()
     try:
-        tree = ast.parse(path.read_bytes(), str(path))
+        tree = ast.parse(source, str(path))
     except SyntaxError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from None
     except ValueError as error:  # a null byte
@@ -62,22 +64,11 @@ def find_class(text: str) -> tuple[Path, str]:
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     classes = [word for word in names if not word.startswith("_")]
     definitions = f"it defines {', '.join(classes) or 'no class'}"
-    if name and name not in set(_iterate_bindings(tree)):
+    if name and not re.search(rf"\b{re.escape(name)}\b".encode(), source):
         raise ValueError(f"{path} has no {name!r}; {definitions}")
     if not name and len(classes) != 1:
         raise ValueError(f"say what of {path} is meant, as {path}:NAME; {definitions}")
     return path, name or classes[0]
-
-
-def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
-    """Iterate over the names that a file binds somewhere."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef | ast.FunctionDef):
-            yield node.name
-        elif isinstance(node, ast.alias):
-            yield node.asname or node.name
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.id
 
 
 def _load_user_class(text: str) -> _Factory:

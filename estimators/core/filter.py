@@ -15,9 +15,9 @@ from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
-from .model import BETA, CURVATURE, LATERAL, build_model, is_finite
+from .model import BETA, CURVATURE, LATERAL, build_model, is_finite, linearise
 from .packets import apply_waiting, process_packet, store_history
-from .predict import advance_state, find_next_cell, linearise, read_fast_row
+from .predict import advance_state, find_next_cell, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 from .update import FIRST_VARIANCE, compute_excess, correct_fast
 

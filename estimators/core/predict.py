@@ -11,21 +11,17 @@ from .covariance import predict_covariance
 from .innovation import BUFFER, LARSEN, MAX_SURPRISE, PSEUDO, note_surprise
 from .model import (
     BETA,
-    CURVATURE,
     KINEMATIC,
     MIN_SPEED,
     SPEED_TOLERANCE,
     VELOCITY_ROLL,
     build_model,
     is_finite,
-    is_steering_felt,
+    linearise,
 )
-from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
+from .record import COUNTERS, N_CORE, N_SLOW, FilterRecord
 
-_FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
-_MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
-_MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its stiffness
 
 
 @jit
@@ -128,79 +124,6 @@ def read_fast_row(f: FilterRecord, row: Vector) -> None:
             f.cell = _find_cell(f, f.speed)
     if is_outdated:
         build_model(f, speed, turning)
-
-
-@jit
-def _compute_axle_force(
-    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, inverse_friction: Scalar
-) -> tuple[Scalar, ...]:
-    """Compute an axle's force (N) and its slopes by alpha, factor, 1/friction, by Fiala's law."""
-    # F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha / (3 friction F_z) within +-1.
-    # stiffness: C (N/rad), load: F_z (N) of the axle. Source: Pacejka, Tire and Vehicle Dynamics, 3
-    total_stiffness = stiffness * factor
-    slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
-    z = minimum(slip_ratio * inverse_friction, 1.0)
-    saturation = 1.0 - z + z * z * (1.0 / 3.0)
-    if z >= 1.0:  # it slides: |F| = friction F_z
-        limit = load / inverse_friction
-        force = limit if alpha > 0.0 else 0.0 - limit
-        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / inverse_friction
-    slope = (1.0 - z) * (1.0 - z)
-    friction_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
-    return (
-        total_stiffness * alpha * saturation,
-        maximum(slope, _MIN_SLOPE) * total_stiffness,
-        stiffness * alpha * slope,
-        friction_slope,
-    )
-
-
-@jit
-def linearise(f: FilterRecord, steer: Scalar) -> None:
-    """Expand both axles' forces at the present state, and set the process noise that follows it.
-
-    Args:
-        f: Memory of the filter.
-        steer: Measured steering angle of the front wheels (rad).
-    """
-    x, V = f.x, maximum(f.model_speed, MIN_SPEED)
-    if f.steer_offset_state > 0 and is_steering_felt(V):
-        steer = steer - x[f.steer_offset_state]
-    for i in range(2):
-        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
-    inverse = 0.0  # 1 / friction
-    if f.inverse_friction > 0:
-        inverse = minimum(maximum(x[f.inverse_friction], 0.0), _MAX_INVERSE_FRICTION)
-        x[f.inverse_friction] = inverse
-    beta, gamma = x[0], x[1]
-    total_force, moves = 0.0, f.speed > MIN_SPEED
-    for i in range(3 if f.inverse_friction > 0 else 2):  # tyres walk while the car moves
-        index = f.tyres + i if i < 2 else f.inverse_friction
-        walks = moves and f.P[index, index] < f.prior[index, index]
-        f.Q[index, index] = f.q_tyres[i] if walks else 0.0
-    if f.map_heading_state > 0:  # a map that is late errs by the road's turn in that time
-        error = f.map_lag * V * f.u[CURVATURE]
-        i = f.map_heading_state
-        f.Q[i, i] = (1.0 - f.decay[i] * f.decay[i]) * (f.prior[i, i] + error * error)
-    for i in range(2):
-        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
-        alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
-        factor = x[f.tyres + i]
-        force, slope, per_factor, per_friction = _compute_axle_force(
-            f.stiffness[i], f.load[i], alpha, factor, inverse
-        )
-        f.car[CAR.front_stiffness + i] = 0.5 * slope  # of one tyre
-        if not moves:  # the tyres are unobservable
-            per_factor, per_friction = 0.0, 0.0
-        f.force_slopes[i, 0], f.force_slopes[i, 1] = per_factor, per_friction
-        f.rest[i] = force - slope * alpha - per_factor * factor - per_friction * inverse
-        total_force += absolute(force)
-    if f.model_error > 0.0:
-        force_error = f.model_error * total_force
-        # the axles err independently: half a wheelbase is their mean arm
-        moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
-        f.Q[f.dense, f.dense] = f.q_nominal[0] + f.q_share[0] * force_error * force_error
-        f.Q[f.dense + 1, f.dense + 1] = f.q_nominal[1] + f.q_share[1] * moment_error * moment_error
 
 
 @jit

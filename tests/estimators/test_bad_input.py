@@ -19,6 +19,17 @@ BOTH = {"camera": CAMERA, "gps": GPS}
 SHORT = type(FIG7)(duration=0.3)
 
 
+NEEDS = ": gate, adapt.* need gains='covariance'"
+ACCEL = {"fast": ["gyro", "accel_y"]}
+LARSEN_HDOP: dict[str, Any] = {"slow": "gps", "hdop_table": [(1.0, 1.0), (2.0, 2.0)]}
+LARSEN_HDOP |= {"delay": "larsen"}
+
+
+def camera(late: float, jitter: float = 0.0) -> dict[str, Any]:
+    """The option of a camera that is so late (s)."""
+    return {"sensors": {"camera": SlowSensor(0.033, (late,), jitter=jitter)}}
+
+
 @pytest.mark.parametrize(
     ("name", "options", "error", "message"),
     [
@@ -40,6 +51,7 @@ SHORT = type(FIG7)(duration=0.3)
         ("exact-kf", {"fast": ["gyro", "lidar"]}, ValueError, "got .*'lidar'"),
         ("exact-kf", {"fast": ["gyro", "gyro"]}, ValueError, "fast is"),
         ("exact-kf", {"accel_bias_sd": 0.1}, ValueError, "accel_bias_sd needs accel_y among fast"),
+        ("exact-kf", {"bias_sd": -1.0}, ValueError, "bias_sd is in rad/s and not negative"),
         ("exact-kf", {"bias_sd": 0.1, "gains": "periodic"}, ValueError, "no settled gain"),
         ("multirate-kf", {"fast": ["gyro", "accel_y"]}, TypeError, "unknown option 'fast'"),
         ("exact-kf", {"slow": "gps", "camera_yaw_sd": 0.01}, ValueError, "yaw_sd needs camera"),
@@ -73,6 +85,56 @@ SHORT = type(FIG7)(duration=0.3)
         ("lob", {"poles": [-1.0, 0.0]}, ValueError, "negative numbers in rad/s, got .-1.0, 0.0"),
         ("lob", {"poles": [-1.0]}, ValueError, "lob: poles are one for each of beta, gamma, got"),
         ("dual-rate", {"gains": "placed"}, ValueError, "dual-rate: poles are negative.*, got ..$"),
+        # sensors that are later than the window
+        ("multirate-kf", {"gains": "periodic"} | camera(0.01, jitter=0.02), ValueError, "random"),
+        ("multirate-residual-kf", camera(0.05), ValueError, "before the next one"),
+        ("exact-kf", camera(0.3), ValueError, "can hold 8"),
+        (
+            "exact-kf",
+            {"sensors": {"gps": SlowSensor(0.2, (0.3,), jitter=0.2)}, "delay": "buffer"},
+            ValueError,
+            r"gps can be 0.5 s late; delay='buffer' has a window of 0.496 s \(496 ticks",
+        ),
+        (
+            "exact-kf",
+            {"delay": "stored"} | camera(0.512),
+            ValueError,
+            r"camera can be 0.512 s late; delay='stored' has a window of 0.511 s \(511 ticks",
+        ),
+        (
+            "exact-kf",
+            {"delay": "constant", "assumed_delay": 0.512} | camera(0.0),
+            ValueError,
+            r"assumed_delay of 0.512 s is not within the window of 0.512 s \(512 ticks\)",
+        ),
+        (
+            "exact-kf",
+            {"sensors": {"gps": SlowSensor(0.005, (0.4,))}, "delay": "buffer"},
+            ValueError,
+            "86 samples of gps can come within the longest delay; delay='buffer' stores 64",
+        ),
+        (
+            "exact-kf",
+            {"delay": "larsen"} | camera(0.1),
+            ValueError,
+            "the camera can be 0.1 s late, 4 of its periods .* delay='larsen' can hold 1",
+        ),
+        # rules that do not go together
+        ("exact-kf", {"delay": "larsen", "gate": 0.99}, ValueError, "delay='larsen' .* no gate"),
+        ("exact-kf", LARSEN_HDOP, ValueError, "no hdop_table"),
+        ("single-rate-kf", {"delay": "buffer"}, ValueError, "that listen at every tick"),
+        ("joint", {"delay": "buffer"}, ValueError, "does not store the noise that noise_time="),
+        ("multirate-kf", {"gains": "periodic", "gate": 0.99}, ValueError, f"multirate-kf{NEEDS}"),
+        ("multirate-kf", {"gains": "periodic", "adapt": 0.02}, ValueError, NEEDS),
+        ("multirate-residual-kf", {"gate": 0.99}, ValueError, NEEDS),
+        ("double-layer", {"gate": 0.99}, ValueError, NEEDS),
+        ("dual-rate", {"adapt": 0.1}, ValueError, NEEDS),
+        ("lob", {"gate": 0.5}, ValueError, NEEDS),
+        # tyres as states
+        ("exact-kf", WITH_TYRES | {"front_tyres_sd": 0.0}, ValueError, "another tyre's state"),
+        ("exact-kf", WITH_TYRES | {"rear_tyres_sd": -1.0}, ValueError, "not negative"),
+        ("exact-kf", ACCEL | {"accel_scale_sd": 0.1}, ValueError, "accel_scale_sd needs tyres"),
+        ("exact-kf", WITH_TYRES | {"accel_scale_sd": 0.1}, ValueError, "accel_y among fast"),
     ],
 )
 def test_constructor_errors_name_it(name: Any, options: Any, error: Any, message: Any) -> None:
@@ -98,19 +160,6 @@ def test_every_number_but_one_has_a_limit(key: str) -> None:
         return
     with pytest.raises(ValueError, match=f"exact-kf: {key} .*, got -1.0"):
         make_estimator("exact-kf", sensors=BOTH, speed=7.0, **options)
-
-
-@pytest.mark.parametrize(
-    ("sensor", "name", "options", "message"),
-    [
-        (SlowSensor(0.033, (0.01,), jitter=0.02), "multirate-kf", {"gains": "periodic"}, "random"),
-        (SlowSensor(0.033, (0.05,)), "multirate-residual-kf", {}, "before the next one"),
-        (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "can hold 8"),
-    ],
-)
-def test_schedules_that_do_not_fit(sensor: Any, name: Any, options: Any, message: Any) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_estimator(name, sensors={"camera": sensor}, **options)
 
 
 def test_random_delay_needs_no_option() -> None:

@@ -84,8 +84,8 @@ def test_every_filter_refuses_arrays_of_another_shape(name: Any) -> None:
     for packets in (np.zeros((1, PACKET_WIDTH - 1)), np.zeros(PACKET_WIDTH)):
         with pytest.raises(ValueError, match=rf"packets have shape \(k, {PACKET_WIDTH}\), got"):
             filter_.step(np.zeros((1, FAST_WIDTH)), packets)
-    with pytest.raises(ValueError, match=r"a packet has shape \(11,\), got \(1, 11\)"):
-        filter_.update(np.zeros((1, PACKET_WIDTH)))
+    with pytest.raises(ValueError, match=r"packets have shape \(k, 11\), got \(1, 10\)"):
+        filter_.update(np.zeros(PACKET_WIDTH - 1))
     with pytest.raises(ValueError):
         filter_.predict(["fast"] * FAST_WIDTH)
     assert filter_.get_state().tobytes() == before.tobytes()

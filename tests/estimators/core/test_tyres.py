@@ -13,7 +13,7 @@ from sideslip.envs import Log
 from sideslip.envs.vehicle.tyres import FIALA, Tyre, compute_lateral_forces
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.limits import compute_error_bound
-from sideslip.estimators.core.predict import _compute_axle_force
+from sideslip.estimators.core.model import _compute_axle_force
 from tests.estimators.dense import WITH_TYRES
 
 assert sideslip.__version__

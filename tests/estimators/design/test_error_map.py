@@ -1,6 +1,5 @@
 """What diverges is refused with its number; what cannot be seen is named."""
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,51 +10,10 @@ from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
-from sideslip.estimators import UnobservableWarning, make_estimator
-from sideslip.estimators.core.filter import StepRecord
+from sideslip.estimators import make_estimator
 from sideslip.estimators.design.periodic import design_and_map, spectral_radius
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
-
-ALL = [
-    ("bicycle-kf", {}),
-    ("single-rate-kf", {"camera": CAMERA}),
-    ("multirate-kf", {"camera": CAMERA}),
-    ("multirate-residual-kf", {"camera": CAMERA}),
-    ("exact-kf", {"camera": CAMERA}),
-    ("course-kf", {"gps": GPS}),
-    ("multirate-residual-kf", {"gps": GPS}),
-    ("exact-kf", {"gps": SlowSensor(0.1, (0.25,))}),
-]
-
-
-def quiet(drive: Any, sensors: Any) -> Any:
-    return simulate(drive, sensors, 0, disturbed=False, quiet=True)
-
-
-@pytest.mark.parametrize(("name", "sensors"), ALL)
-def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(
-    name: Any, sensors: Any
-) -> None:
-    """The error of a filter that starts wrong on a quiet, exactly known car."""
-    drive = Drive(real=6000.0, duration=12.0)
-    log = quiet(drive, sensors)
-    filter_ = make_estimator(
-        name, vehicle=drive.truth, sensors=sensors, speed=drive.speed, gains=""
-    )
-    assert filter_.spectral_radius < 1.0
-    n = len(filter_.names)
-    filter_.take(StepRecord(log.record.fast, 1, np.zeros((0, PACKET_WIDTH)), 0))
-    wrong = filter_.get_state()
-    wrong["x"][0, :n] += np.where(np.array(filter_.units) == "N", 10.0, 0.05)
-    filter_.set_state(wrong)
-    packets = log.record.packets[log.record.packets[:, 2] > 0]
-    filter_.step(log.record.fast[1:], packets)
-    truth = np.array([log.truth.get(state, np.zeros(1))[-1] for state in filter_.names])
-    cycles = drive.duration / (filter_._schedules[0].cycle * filter_.filters[0].step)
-    left = 2.0 * 0.05 * filter_.spectral_radius**cycles
-    hold = 0.035 if name == "single-rate-kf" else 0.0  # its estimate is up to a frame old
-    assert np.abs(filter_.x - truth)[:2].max() < left + hold + 1e-6
 
 
 def test_the_error_map_is_what_the_compiled_filter_does() -> None:
@@ -99,13 +57,6 @@ def test_one_that_starts_to_diverge_on_the_way_is_refused_there() -> None:
     rows[:, [FAST.wheel_left, FAST.wheel_right]] = 40.0
     with pytest.raises(ValueError, match="error grows"):
         filter_.step(rows, np.zeros((0, PACKET_WIDTH)))
-
-
-def test_the_unobservable_direction_is_named_and_warned_about() -> None:
-    with pytest.warns(UnobservableWarning, match=r"beta 1, psi -1, d1 .*, d2 "):
-        filter_ = make_estimator("dakf", sensors={"gps": GPS}, speed=7.0)
-    assert len(filter_.unobservable) == 1
-    assert re.match(r"beta 1, psi -1", filter_.unobservable[0])
 
 
 @pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -79,38 +79,6 @@ def test_a_changing_speed_rebuilds_the_model_by_half_a_percent() -> None:
     assert steps.min() > 0.005 * 3.0
 
 
-@pytest.mark.parametrize("name", ["multirate-kf", "exact-kf", "single-rate-kf"])
-def test_equal_bits_however_the_ticks_are_chunked(name: Any) -> None:
-    log = simulate(type(FIG7)(duration=1.0), {"camera": CAMERA}, 2)
-    log.record.fast[:, FAST.wheel_left] *= np.linspace(1.0, 1.3, 1001)
-    whole = make_estimator(name, sensors=log.slow).run(log)
-    packets = log.record.packets
-    for n in (1, 10, 33):
-        filter_ = make_estimator(name, sensors=log.slow)
-        for start in range(0, 1001, n):
-            end = min(start + n, 1001)
-            here = (packets[:, 2] >= start) & (packets[:, 2] < end)
-            filter_.step(log.record.fast[start:end], packets[here])
-            np.testing.assert_array_equal(filter_.x, whole.x[end - 1])
-            np.testing.assert_array_equal(np.sqrt(np.diag(filter_.P)), whole.std[end - 1])
-
-
-@pytest.mark.parametrize("name", ["multirate-residual-kf", "exact-kf", "single-rate-kf"])
-def test_predict_and_update_are_the_same_filter(name: Any) -> None:
-    log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 3)
-    whole = make_estimator(name, sensors=log.slow, speed=FIG7.speed).run(log)
-    filter_ = make_estimator(name, sensors=log.slow, speed=FIG7.speed)
-    due: dict[int, Any] = {}
-    for packet in log.record.packets:
-        due.setdefault(int(packet[2]), []).append(packet)
-    for k, row in enumerate(log.record.fast):
-        filter_.predict(row)
-        for packet in due.get(k, []):
-            filter_.update(packet)
-        np.testing.assert_array_equal(filter_.x, whole.x[k])
-    assert filter_.tick == 500
-
-
 def test_a_record_may_start_at_any_tick() -> None:
     sensors = {"camera": SlowSensor(0.033, (0.020, 0.010), phase=0.004)}
     log = simulate(type(FIG7)(duration=0.5), sensors, 5)
@@ -122,17 +90,3 @@ def test_a_record_may_start_at_any_tick() -> None:
         again = filter_.run(Record(log.record.fast, later, 660))
         np.testing.assert_array_equal(once.x, again.x)
         assert again.time[0] == pytest.approx(0.660)
-
-
-def test_a_snapshot_continues_bit_for_bit() -> None:
-    log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 4)
-    filter_ = make_estimator("exact-kf", sensors=log.slow, speed=FIG7.speed)
-    fast, packets = log.record.fast, log.record.packets
-    is_early = packets[:, 2] < 250
-    filter_.run(Record(fast[:250], packets[is_early]))
-    snapshot, ends = filter_.get_state(), []
-    for _ in range(2):
-        filter_.set_state(snapshot)
-        filter_.step(fast[250:], packets[~is_early])
-        ends.append(filter_.x)
-    np.testing.assert_array_equal(ends[0], ends[1])

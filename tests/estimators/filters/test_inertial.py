@@ -163,20 +163,3 @@ def test_a_constant_bias_is_seen_and_no_warning_is_about_it(recwarn: Any) -> Non
     with pytest.warns(UserWarning, match="cannot see: beta 1, psi -1, [^;]*$") as found:
         make_estimator("dakf", sensors=sensors, bias_sd=0.01)
     assert "bias" not in str(found[0].message)
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "error", "message"),
-    [
-        ("exact-kf", {"fast": ["accel_y"]}, ValueError, "fast is 'gyro' and any of accel_y"),
-        ("exact-kf", {"fast": ["gyro", "lidar"]}, ValueError, "got .*'lidar'"),
-        ("exact-kf", {"fast": ["gyro", "gyro"]}, ValueError, "fast is"),
-        ("exact-kf", {"bias_sd": -1.0}, ValueError, "bias_sd is in rad/s and not negative"),
-        ("exact-kf", {"accel_bias_sd": 0.1}, ValueError, "accel_bias_sd needs accel_y among fast"),
-        ("exact-kf", {"bias_sd": 0.1, "gains": "periodic"}, ValueError, "no settled gain"),
-        ("multirate-kf", {"fast": INERTIAL}, TypeError, "unknown option 'fast'"),
-    ],
-)
-def test_options_that_cannot_be(name: str, options: Any, error: Any, message: str) -> None:
-    with pytest.raises(error, match=message):
-        make_estimator(name, sensors={"camera": CAMERA}, **options)

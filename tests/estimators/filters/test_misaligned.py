@@ -11,8 +11,7 @@ from sideslip.envs import COMS, Log
 from sideslip.envs.record import FAST, PACKET, Record
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.core.model import build_model
-from sideslip.estimators.core.predict import _compute_axle_force, linearise
+from sideslip.estimators.core.model import _compute_axle_force, build_model, linearise
 from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.core.test_consistency import within
 from tests.estimators.core.test_wary import CAMERA as CAMERA_PLACE

@@ -124,12 +124,3 @@ def test_slip_from_vision_alone() -> None:
         "vision-only-kf", sensors=log.slow, speed=V, gains="covariance", **Q
     ).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-10)
-
-
-def test_slip_is_observable_from_vision_alone() -> None:
-    """2.3: rank 4 of 4, and a filter whose error shrinks."""
-    A, _ = car(V)
-    rows = np.vstack([C[1:] @ np.linalg.matrix_power(A, i) for i in range(4)])
-    assert np.linalg.matrix_rank(rows) == 4
-    filter_ = make_estimator("vision-only-kf", sensors={"camera": CAMERA}, speed=V, **Q)
-    assert filter_.spectral_radius < 1.0 and not filter_.unobservable

@@ -1,16 +1,13 @@
 """EstimateObservation around the real environments."""
 
-import json
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from sideslip.agents.rollout import rollout
-from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator
 from sideslip.estimators.vector import estimate as vector
 
@@ -132,25 +129,6 @@ def test_several_estimators_stand_side_by_side() -> None:
         hat, std = info[f"{before}beta_hat"], info[f"{before}beta_std"]
         assert values[f"{before}beta_hat"] == np.float32(hat)
         assert env.unwrapped.annotations[title] == (hat, std)
-
-
-@pytest.mark.smoke
-def test_one_json_string_names_env_and_estimator() -> None:
-    env: Any = EstimateObservation(
-        gym.make(VISION, **FIG7), "multirate-kf", outputs=("beta",),
-        vehicle=COMS.scale_stiffness(0.8), options={"q_beta": 1e-3}, name="mine",
-    )  # fmt: skip
-    text = env.spec.to_json()
-    json.loads(text)
-    again: Any = gym.make(EnvSpec.from_json(text))
-    assert again.spec.to_json() == text
-    first: Any = env.reset(seed=5)
-    second: Any = again.reset(seed=5)
-    np.testing.assert_array_equal(first[0], second[0])
-    for _ in range(20):
-        first, second = env.step(still(env)), again.step(still(env))
-    np.testing.assert_array_equal(first[0], second[0])
-    assert first[-1] == second[-1]
 
 
 def test_a_reset_tells_the_filter_the_drawn_clock() -> None:

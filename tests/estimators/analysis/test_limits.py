@@ -1,4 +1,4 @@
-"""What sensors can see: by the definition, by the filter's covariance, and the key statements."""
+"""The bound by Riccati; what sensors can see, by definition and by the filter itself."""
 
 import itertools
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import make_estimator
 from sideslip.estimators.analysis.limits import (
@@ -13,10 +14,38 @@ from sideslip.estimators.analysis.limits import (
     UNKNOWNS,
     WHEELS,
     _find_unobservable_subspace,
+    compute_error_bound,
     make_observability_table,
 )
 from sideslip.estimators.design.gains import transition_matrix
+from tests.estimators.riccati import riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
+
+SETS = {
+    "camera": {"camera": CAMERA},
+    "uneven": {"camera": SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))},
+    "gps": {"gps": GPS},
+    "both": {"camera": CAMERA, "gps": SlowSensor(0.1, (0.25,))},
+}
+
+
+@pytest.mark.parametrize("which", SETS)
+def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which: Any) -> None:
+    sensors = SETS[which]
+    log = simulate(FIG7, sensors, 0)
+    along = compute_error_bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)
+    P, names = riccati(FIG7.truth, sensors=sensors, speed=FIG7.speed, seconds=4.0)
+    assert names[0] == "beta"
+    np.testing.assert_allclose(along[3000:4000], np.sqrt(P[3000:, 0, 0]), rtol=1e-10)
+
+
+def test_lost_frames_raise_the_bound() -> None:
+    log = simulate(FIG7, {"camera": CAMERA}, 0)
+    common: dict[str, Any] = {"sensors": log.slow, "speed": FIG7.speed}
+    full = compute_error_bound(FIG7.truth, record=log.record, **common)
+    log.record.packets = log.record.packets[::3]
+    assert (compute_error_bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
+
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 GYRO, ACCEL = ("gyro",), ("gyro", "accel_y")
