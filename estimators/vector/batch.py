@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ...envs.numerics.jit import compile_call, jit, jit_nrt
 from ...envs.numerics.packed import count_lanes
-from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
+from ...envs.numerics.primitives import Matrix, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
 from ...envs.record import FAST, FAST_WIDTH
@@ -32,6 +32,7 @@ from ..core.record import (
     N_TOTAL,
     X_OFFSET,
     FilterRecord,
+    FilterRecords,
 )
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
@@ -40,6 +41,7 @@ from .lanes import FilterBank, LaneBlock, advance_block, get_gains
 
 Build = Callable[..., AnyEstimator]
 _Mask = npt.NDArray[np.bool_]
+_Shape = tuple[bytes, ...] | None
 
 _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 _MAX_STATES = 16  # states and clones
@@ -64,12 +66,12 @@ _SCALARS = (
     *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
     *("now", "last", "due", "next", "here", "apart", "wild"),
 )
-# of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
-# within the cycle, table of gains, packets done
+# of a lane: whether its filter has the block's shape, tick, step within the cycle, table of gains,
+# packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
-_SHAPE = (
+_SHAPE = (  # what the filters of a block share
     *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
-    *("store_predictions", "tyres", "robust"),
+    *("store_predictions", "tyres", "robust", "u_column", "y_column"),
 )
 _FIELDS = (
     [
@@ -78,75 +80,42 @@ _FIELDS = (
         for name in names
     ]
     + [(name, np.int64, (LANES,)) for name in _INTS]
-    + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
-    + [("u_column", np.int64, (N_INPUTS, 2)), ("y_column", np.int64, (N_FAST, 2))]
+    + [(name, FILTER[name]) for name in _SHAPE]
     + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
 )
 BLOCK = pad_to_cache_line(_FIELDS)
 
 
-def _make_blocks(count: int) -> Any:
-    """Allocate empty blocks of the dtype `BLOCK` with `count` lanes or more."""
-    return allocate_aligned((-(-count // LANES),), BLOCK)
-
-
-@jit
-def _is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
-    """Return whether a filter's ticks are computed in its lane now; the first shapes the block."""
+def _read_shape(layers: FilterRecords) -> _Shape:
+    """Read what the filters of a block share; None for a filter whose ticks are computed alone."""
     # lanes compute models that change by speed alone, of which every tick predicts and corrects
     # without rules between samples, and store nothing of the past but predictions
-    if b.shaped[lane] == 0:
-        is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
-        is_plain = f.stride == 1 and f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
-        has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
-        is_supported = f.delay_rule != BUFFER and f.delay_rule != LARSEN and f.total <= _MAX_STATES
-        is_supported = is_supported and is_steady and is_plain and has_fixed_noise
-        if is_supported and b.n == 0:
-            _set_shape(b, f)
-        b.shaped[lane] = 1 if is_supported and _is_same_shape(b, f) else -1
-    return b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
+    f = layers[0]
+    is_steady = f.tyres == 0 and f.kind not in (KINEMATIC, VELOCITY_ROLL)
+    is_plain = f.stride == f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
+    has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
+    is_small = f.delay_rule not in (BUFFER, LARSEN) and f.total <= _MAX_STATES
+    if len(layers) == 1 and is_steady and is_plain and has_fixed_noise and is_small:
+        return tuple(f[name].tobytes() for name in _SHAPE)
+    return None
 
 
-@jit
-def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Scalar:
-    is_same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
-    is_same = is_same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
-    is_same = is_same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
-    is_same = is_same and f.store_predictions == b.store_predictions
-    for k in range(2):
-        for i in range(f.inputs):
-            is_same = is_same and f.u_column[i, k] == b.u_column[i, k]
-        for i in range(f.fasts):
-            is_same = is_same and f.y_column[i, k] == b.y_column[i, k]
-    return is_same
-
-
-@jit
-def _set_shape(b: LaneBlock, f: FilterRecord) -> None:
-    """Write into the block what all its filters share."""
-    b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
-    b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
-    b.store_predictions, b.tyres, b.robust = f.store_predictions, f.tyres, f.robust
-    b.columns = 0
-    if f.measured == 1:
-        _add_column(b, FAST.wheel_left)
-        _add_column(b, FAST.wheel_right)
-    for k in range(2):
-        for i in range(f.inputs):
-            b.u_column[i, k] = f.u_column[i, k]
-            _add_column(b, f.u_column[i, k])
-        for i in range(f.fasts):
-            b.y_column[i, k] = f.y_column[i, k]
-            _add_column(b, f.y_column[i, k])
-
-
-@jit
-def _add_column(b: LaneBlock, column: int) -> None:
-    for i in range(b.columns):
-        if b.column[i] == column:
-            return
-    b.column[b.columns] = column
-    b.columns += 1
+def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
+    """Make the blocks of filters (N, layers), each of its first shape."""
+    blocks = allocate_aligned((-(-len(filters) // LANES),), BLOCK)
+    for b, first in zip(blocks, range(0, len(filters), LANES), strict=True):
+        group = shapes[first : first + LANES]
+        shape = next(filter(None, group), None)
+        if shape is not None:
+            f = filters[first + group.index(shape), 0]
+            for name in _SHAPE:
+                b[name] = f[name]
+            columns = {*f["u_column"][: f["inputs"]].flat, *f["y_column"][: f["fasts"]].flat}
+            columns |= {FAST.wheel_left, FAST.wheel_right} if f["measured"] else set()
+            b["columns"] = len(columns)
+            b["column"][: len(columns)] = sorted(columns)
+            b["shaped"][: len(group)] = [each == shape for each in group]
+    return blocks
 
 
 @jit
@@ -176,8 +145,9 @@ def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows:
         i = first + lane
         b.here[lane] = 0.0
         if i < len(filters) and done[i] == -1 and rows[i] > 0:
-            is_same = count == 0 or rows[i] == n_rows
-            if is_same and len(filters[i]) == 1 and _is_lane_compatible(b, lane, filters[i, 0]):
+            f = filters[i, 0]
+            is_ready = b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
+            if is_ready and (count == 0 or rows[i] == n_rows):
                 b.here[lane], n_rows = 1.0, rows[i]
                 count += 1
     return n_rows if count >= _MIN_LANES else 0
@@ -219,9 +189,10 @@ def _compile_observe_batch() -> Callable[..., int]:
     counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
     bank = FilterBank(np.zeros((1, 1), FILTER), numbers, np.zeros((1, 4), np.int64))
     record, obs = StepRecord(cube, counts, cube, counts), np.zeros((1, 0), np.float32)
+    blocks = allocate_aligned((1,), BLOCK)
     table = OutputTable(0, np.zeros((0, 3), np.int64), numbers)
     observed = Observed(obs, table, numbers, numbers, obs, np.zeros((1, 4)))
-    return compile_call(_observe_batch, bank, counts, _make_blocks(1), record, observed)
+    return compile_call(_observe_batch, bank, counts, blocks, record, observed)
 
 
 class BatchEstimator:
@@ -243,6 +214,7 @@ class BatchEstimator:
         self._specs: list[EstimatorSpec] = list(specs)
         self._designs: list[Hashable] = [None] * len(specs)
         self._shared: dict[Hashable, Estimator] = {}  # by design
+        self._shapes: dict[Hashable, _Shape] = {}
         first = self._get_estimator(specs[0])
         self.names, self.units = first.names, first.units
         self.filters = allocate_aligned((len(specs), len(first.filters)), FILTER)
@@ -265,11 +237,13 @@ class BatchEstimator:
                 text = "a batch is of filters of ours or of none"
                 raise TypeError(f"{text}, got {estimator!r} as well")
             self._shared[spec.design] = estimator
+            self._shapes[spec.design] = _read_shape(estimator.filters)
         return self._shared[spec.design]
 
     def _pool_gains(self) -> None:
-        """Lay the gains of all designs in use side by side in a new pool; empty the lanes."""
+        """Lay the gains of all designs in use side by side in a new pool, and make empty lanes."""
         self._shared = {design: self._shared[design] for design in self._designs}
+        self._shapes = {design: self._shapes[design] for design in self._designs}
         self._pool = np.concatenate([each.gains.ravel() for each in self._shared.values()])
         places, start = dict[Hashable, tuple[int, ...]](), 0
         for design, estimator in self._shared.items():
@@ -277,7 +251,7 @@ class BatchEstimator:
             places[design], estimator.gains = (start, *shape), self._pool[start:end].reshape(shape)
             start = end
         self._places = np.array([places[design] for design in self._designs], np.int64)
-        self._lanes = _make_blocks(len(self.filters))  # they hold models
+        self._lanes = _make_blocks(self.filters, [self._shapes[each] for each in self._designs])
 
     def __len__(self) -> int:
         return len(self.filters)

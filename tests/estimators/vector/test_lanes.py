@@ -14,7 +14,7 @@ from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
-from sideslip.estimators.vector.batch import _MIN_LANES, BLOCK, _make_blocks
+from sideslip.estimators.vector.batch import _MIN_LANES, BLOCK
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.fleets import make_batch, states, step
@@ -155,10 +155,11 @@ def test_which_filters_are_in_lanes() -> None:
 
 def test_blocks_and_records_lie_on_cache_lines() -> None:
     """A copy's, too, and next to each other what is fetched together."""
-    made, batch = _make_blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
-    assert len(made) == -(-33 // LANES) and made.dtype == BLOCK
+    batch = make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
+    many = make_batch("exact-kf", 33, sensors={"camera": CAMERA}, speed=7.0)._lanes
+    assert len(many) == -(-33 // LANES) and many.dtype == BLOCK
     copies = [batch, copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
-    for array in (made, *(each.filters for each in copies), *(each._lanes for each in copies)):
+    for array in (many, *(each.filters for each in copies), *(each._lanes for each in copies)):
         assert array.dtype.itemsize % 64 == 0 and array.ctypes.data % 64 == 0
     for kind, names in ((BLOCK, ("x", "P", "GT", "row")), (FILTER, ("x", "P"))):
         assert kind.fields is not None
