@@ -146,7 +146,7 @@ class _NativeVecEnv(VecEnv):
 
     @property
     def spec(self) -> Any:
-        """Spec of the vector env, wrappers included."""
+        """Spec of the vector env, without its wrappers."""
         return self.vector_env.spec
 
     def reset(self) -> Observations:

@@ -15,7 +15,6 @@ from ..filters import FILTERS
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
-from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, Observed
 from ..wrappers.truth import (
     STIFFNESSES,
@@ -25,7 +24,6 @@ from ..wrappers.truth import (
     refuse_stacked,
     set_stiffness,
 )
-from ..wrappers.truth import TruthObservation as SingleTruth
 from .batch import BatchEstimator, ForeignBatch
 from .records import AnyVectorEnv, Mask, Observations, Snapshot, VectorObservation
 
@@ -149,7 +147,7 @@ class EstimateObservation(VectorObservation):
         if self._arguments.is_object:
             text = f"one {self._arguments.label} cannot estimate {env.num_envs} rows"
             raise TypeError(f"{text}: pass its class, another factory or a name")
-        super().__init__(env, Single, self._arguments.recorded)
+        super().__init__(env)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
@@ -308,8 +306,7 @@ class TruthObservation(VectorObservation):
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
-        recorded = {"parameters": list(parameters), "states": list(states)}
-        super().__init__(env, SingleTruth, recorded)
+        super().__init__(env)
         refuse_stacked(env, type(self))
         if not hasattr(env, "layout"):
             text = f"{type(env).__name__} has no layout; wrap it in"

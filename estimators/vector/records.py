@@ -1,15 +1,11 @@
 """The base of the wrappers of vector environments."""
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
@@ -22,29 +18,20 @@ Snapshot = dict[str, Any]
 AnyVectorEnv = VectorEnv[Any, Any, Any]
 
 
-class VectorObservation(
-    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
-):
+class VectorObservation(VectorWrapper[Observations, Any, Observations, Any, Any]):
     """A wrapper that appends entries of its own to the observations of all rows.
 
     A row whose episode ended begins anew in the next step or, where the env resets it within the
-    step that ends it, in that one. `spec` names the single wrapper: `gym.make_vec(spec)` builds
-    environments that are wrapped one by one.
+    step that ends it, in that one. `spec` is the env's, without this wrapper.
 
     Args:
         env: Vector environment of N rows.
-        single: Class of the single wrapper.
-        recorded: Its arguments, for the spec.
     """
 
     layout: tuple[ObservationEntry, ...]
 
-    def __init__(
-        self, env: AnyVectorEnv, single: type[gym.Wrapper], recorded: Mapping[str, Any]
-    ) -> None:
-        RecordConstructorArgs.__init__(self, **recorded)
-        VectorWrapper.__init__(self, env)
-        self._single = single
+    def __init__(self, env: AnyVectorEnv) -> None:
+        super().__init__(env)
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         self._ended: Mask | None = None  # rows that the next step resets; None: all are to be
 
@@ -68,27 +55,6 @@ class VectorObservation(
     def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
         """Restore the flags after an error of the env, unless it may have moved some rows."""
         self._ended = ended_before
-
-    @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
-        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
-        if self.env.spec is None:
-            return None
-        # `gym.make_vec` puts no wrappers around an env that is a vector by itself: it is told to
-        # make single environments
-        spec, single = copy.deepcopy(self.env.spec), self._single
-        entry = f"{single.__module__}:{single.__name__}"
-        wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(self._saved_kwargs)))
-        spec.additional_wrappers += (wrapper,)
-        if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
-            spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
-            spec.kwargs.pop("info", None)
-            if "autoreset_mode" in spec.kwargs:
-                spec.kwargs["vector_kwargs"] = {"autoreset_mode": spec.kwargs.pop("autoreset_mode")}
-        vector_kwargs = spec.kwargs.get("vector_kwargs", {})
-        if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
-            vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
-        return spec
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

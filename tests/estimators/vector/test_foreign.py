@@ -2,14 +2,12 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from sideslip.envs import COMS
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
-from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs import batches
 from tests.estimators.vector.fleets import (
     BAD,
@@ -90,16 +88,6 @@ def test_a_nan_of_one_row_ends_its_episode_alone() -> None:
     assert np.isnan(obs).any(axis=1).tolist() == [False, True, False]
     _, _, terminated, _, _ = env.step(obs[:, -2:-1])
     assert terminated.tolist() == [False, True, False]
-
-
-def test_the_spec_builds_rows_with_their_own() -> None:
-    together = EstimateObservation(native("NextStep"), Constant, options={"value": (1.0, 2.0, 3.0)})
-    assert together.spec is not None
-    text = together.spec.to_json()
-    again: Any = gym.make_vec(gym.envs.registration.EnvSpec.from_json(text))
-    same_bits(again.reset(seed=4), together.reset(seed=4))
-    singles = [each.get_wrapper_attr("estimator").inner for each in again.envs]
-    assert isinstance(again.envs[0], Single) and len(set(map(id, singles))) == 3
 
 
 @pytest.mark.parametrize("mode", MODES)

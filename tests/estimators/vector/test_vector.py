@@ -2,19 +2,16 @@
 
 import copy
 import itertools
-import json
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from sideslip.envs import COMS
 from sideslip.estimators import FILTERS
-from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
+from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs import batches
 from tests.envs.helpers import IDS
@@ -25,7 +22,6 @@ from tests.estimators.vector.fleets import (
     VISION,
     actions,
     drive_both,
-    fleet,
     home,
     outputs,
     pair,
@@ -135,26 +131,6 @@ def test_layout_and_spaces_describe_the_observations() -> None:
     np.testing.assert_array_equal(obs, held)  # what was returned is the caller's
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_spec_builds_environments_wrapped_one_by_one(count: Any) -> None:
-    how = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    made = gym.make_vec(VISION, num_envs=count, vectorization_mode="sync", vector_kwargs=how)
-    options = {"q_beta": 1e-3}
-    together: Any = EstimateObservation(
-        made, "multirate-kf", outputs=("beta",), vehicle=COMS.scale_stiffness(0.8), options=options
-    )
-    text = together.spec.to_json()
-    json.loads(text)
-    again: Any = gym.make_vec(EnvSpec.from_json(text))
-    assert again.num_envs == count and again.metadata["autoreset_mode"] == how["autoreset_mode"]
-    assert again.spec.to_json() == text
-    same_bits(again.reset(seed=5), together.reset(seed=5))
-    for step in range(10):
-        told = np.full((count, 1), 0.1 * step, np.float32)
-        same_bits(again.step(told), together.step(told))
-    assert EstimateObservation(fleet(VISION, 2, "NextStep"), "bicycle-kf").spec is None
-
-
 @pytest.mark.parametrize("options", [{}, {"latency": {"gyro": 0.005}}])
 def test_copies_continue_bit_for_bit(options: dict[str, Any]) -> None:
     _, env = pair(UNEVEN, 3, "SameStep", [{"estimator": "exact-kf", "options": options}])
@@ -258,16 +234,3 @@ def test_nees_is_told_where_the_truth_is(mode: str) -> None:
             assert not other[4]["nees"][~ended].any()
         else:
             assert "nees" not in other[4]
-
-
-def test_the_spec_tells_of_the_truth_too() -> None:
-    told: dict[str, Any] = {"autoreset_mode": "SameStep", "on_bad_action": "fail"}
-    env = gym.make_vec(VISION, num_envs=2, **told)
-    together = TruthObservation(EstimateObservation(env, "multirate-kf"), ["mass", "friction"])
-    assert together.spec is not None
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
-    assert again.single_observation_space == together.single_observation_space
-    assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
-    assert drive_both(again, together, 8, seed=4) == 1
-    env.spec = None
-    assert together.spec is None
