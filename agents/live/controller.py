@@ -26,11 +26,10 @@ from ...envs.numerics.packed import read
 from ...envs.record import FAST, FAST_WIDTH, Array
 from ...envs.task import REPORT, compute_reference, filter_reference
 from ...envs.ticks import NEVER
-from ...estimators.core.filter import NO_OUTPUTS, StepRecord
+from ...estimators.core.filter import NO_OUTPUTS, Observed, StepRecord
 from ...estimators.estimator import Estimator
 from ...estimators.protocol import compute_std
-from ...estimators.wrappers.estimate import EstimateObservation
-from ...estimators.wrappers.outputs import Observed, compile_observe, write_outputs
+from ...estimators.wrappers.estimate import EstimateObservation, compile_observe, write_outputs
 from ..env_info import get_env_facts
 from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
 

@@ -1,4 +1,4 @@
-"""The filter itself, compiled: fast rows and packets in, states out.
+"""The filter itself, compiled: fast rows and packets in; states, or an observation, out.
 
 Layers are the records of an estimator: one filter, or the two of double-layer-gps. A tick stores
 what was captured at the last one and predicts from there; then fast sensors correct, then packets.
@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.numerics.functions import sincos
+from ...envs.numerics.functions import sincos, wrap
 from ...envs.numerics.jit import copy_into, jit, noinline
-from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, sqrt
 from ...envs.record import PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import BETA, CURVATURE, LATERAL, build_model, is_finite, linearise
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
-from .update import FIRST_VARIANCE, compute_excess, correct_fast
+from .update import FIRST_VARIANCE, compute_excess, correct_fast, is_healthy
 
 
 class StepRecord(NamedTuple):
@@ -37,6 +37,33 @@ class FilterOutputs(NamedTuple):
     X: Matrix  # states, shape (rows, n)
     S: Matrix  # their standard deviations, shape (rows, n)
     nis: Vector  # normalised innovation squared of each packet, shape (count,)
+
+
+class OutputTable(NamedTuple):
+    """What `observe` writes behind an observation."""
+
+    inner: int  # entries of the env's observation to copy
+    # a row for each output, shape (m, 3): its state's index over all layers; 1 if it is an angle to
+    # wrap; whose truth the NEES takes (1 beta, 2 gamma, 0 none)
+    plan: Matrix
+    limits: Vector  # bounds of the outputs in their units, shape (m,)
+
+
+class Observed(NamedTuple):
+    """What an observation is made of, and where it is written.
+
+    Of N cars, all but `table` have them as the first axis.
+    """
+
+    obs: Vector  # observation of the env, float32, shape (at least inner,)
+    table: OutputTable
+    beta: Scalar  # true sideslip angle (rad)
+    gamma: Scalar  # true yaw rate (rad/s)
+    out: Vector  # float32, filled, shape (inner + m,), or (inner + 2 m,) with standard deviations
+    # filled, shape (4,): beta (the first state where there is no beta), its standard deviation, and
+    # the normalised estimation error squared of the outputs beta and gamma per state,
+    # e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular; 0 for a filter that is lost
+    summary: Vector
 
 
 NO_OUTPUTS = FilterOutputs(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
@@ -146,15 +173,8 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 
 @jit
-def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
-    """Read P[i, j], a present covariance; with periodic gains that of the settled cycle.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        i: Index of a state.
-        j: Index of a state, i <= j.
-    """
+def _read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
+    """Read P[i, j], i <= j; with periodic gains that of the settled cycle."""
     if f.periodic == 1:
         row = 1 + f.at * maximum(f.fasts, 1)  # that of this step
         return gains[f.cell, row, f.total + i * f.n - i * (i - 1) // 2 + j - i]
@@ -162,16 +182,10 @@ def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scala
 
 
 @jit
-def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
-    """Compute a state's present standard deviation; of a lost filter, larger by its surprise.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        i: Index of the state.
-    """
+def _compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
+    """Compute a state's present standard deviation; of a lost filter, larger by its surprise."""
     growth = maximum(compute_excess(f), 1.0)
-    return sqrt(maximum(read_covariance(f, gains, i, i), 0.0) * growth)
+    return sqrt(maximum(_read_covariance(f, gains, i, i), 0.0) * growth)
 
 
 @jit
@@ -221,7 +235,7 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
         f = layers[layer]
         for i in range(f.n):
             X[j, column] = f.x[i]
-            S[j, column] = compute_deviation(f, gains, i)
+            S[j, column] = _compute_deviation(f, gains, i)
             column += 1
 
 
@@ -243,12 +257,12 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
         return False
     for layer in range(len(layers)):
         f = layers[layer]
-        growth = maximum(compute_excess(f), 1.0)  # as `compute_deviation`: lost, it is less sure
+        growth = maximum(compute_excess(f), 1.0)  # as `_compute_deviation`: lost, it is less sure
         for i in range(f.n):
             x[offset + i] = f.x[i]
             for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
                 row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
-                P[offset + i, offset + j] = growth * read_covariance(f, gains, row, column)
+                P[offset + i, offset + j] = growth * _read_covariance(f, gains, row, column)
         offset += f.n
     return True
 
@@ -304,3 +318,73 @@ def reset_filters(layers: FilterRecords, first: int) -> None:
     """
     for i in range(len(layers)):
         _reset_filter(layers[i], first)
+
+
+@jit
+def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
+    """Clip the value to +-limit; NaN stays, so that a filter that failed is seen."""
+    return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
+
+
+@jit
+def _compute_nees(
+    f: FilterRecord, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
+) -> Scalar:
+    """Compute e' P_e^-1 e / len(e) of the states i (beta) and j (gamma; -1: none), or 0."""
+    if i >= 0 and j >= 0:
+        a, b = f.x[i] - beta, f.x[j] - gamma
+        p, q = _read_covariance(f, gains, i, i), _read_covariance(f, gains, j, j)
+        r = _read_covariance(f, gains, i, j)
+        det = p * q - r * r
+        return 0.5 * (a * a * q - 2.0 * a * b * r + b * b * p) / det if det > 0.0 else 0.0
+    k = maximum(i, j)
+    if k < 0:
+        return 0.0
+    a = f.x[k] - (beta if i >= 0 else gamma)
+    p = _read_covariance(f, gains, k, k)
+    return a * a / p if p > 0.0 else 0.0
+
+
+@noinline
+def observe(
+    filters: Vector, gains: Matrix, record: StepRecord, start: int, observed: Observed
+) -> int:
+    """Advance the filter and write the observation; return the rows done as `advance` does.
+
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        record: Record to process.
+        start: Number of fast rows that are done already.
+        observed: Observation and outputs.
+    """
+    obs, (inner, plan, limits), beta, gamma, out, summary = observed
+    nothing = FilterOutputs(record.fast[:0], record.fast[:0], summary[:0])
+    done = advance(filters, gains, record, start, nothing)
+    if done < record.rows:
+        return done
+    for i in range(inner):
+        out[i] = obs[i]
+    m, beta_at, gamma_at = len(plan), -1, -1
+    for i in range(m):
+        layer, state = 0, plan[i, 0]
+        while state >= filters[layer].n:
+            state -= filters[layer].n
+            layer += 1
+        f = filters[layer]
+        value = f.x[state]
+        if plan[i, 1] == 1:
+            value = wrap(value)
+        out[inner + i] = _clip_symmetric(value, limits[i])
+        if len(out) > inner + m:
+            out[inner + m + i] = _clip_symmetric(_compute_deviation(f, gains, state), limits[i])
+        if plan[i, 2] == 1:
+            beta_at = state
+        elif plan[i, 2] == 2:
+            gamma_at = state
+    f = filters[0]
+    summary[0], summary[1] = f.x[0], _compute_deviation(f, gains, 0)
+    nees = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
+    summary[2] = nees / maximum(compute_excess(f), 1.0)  # lost, it is less sure
+    summary[3] = 1.0 if is_healthy(f) else 0.0
+    return done

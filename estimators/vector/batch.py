@@ -20,7 +20,7 @@ from ...envs.numerics.primitives import Matrix, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.filter import StepRecord
+from ..core.filter import Observed, OutputTable, StepRecord, observe
 from ..core.innovation import BUFFER, LARSEN, NONE
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import (
@@ -35,8 +35,7 @@ from ..core.record import (
     FilterRecords,
 )
 from ..estimator import Estimator
-from ..wrappers.estimate import AnyEstimator, EstimatorSpec
-from ..wrappers.outputs import Observed, OutputTable, observe, write_outputs
+from ..wrappers.estimate import AnyEstimator, EstimatorSpec, write_outputs
 from .lanes import FilterBank, LaneBlock, advance_block, get_gains
 
 Build = Callable[..., AnyEstimator]

@@ -10,12 +10,20 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import Infos, ObservationEntry
 from ...envs.vehicle.parameters import VehicleSource
-from ..core.filter import StepRecord
+from ..core.filter import Observed, StepRecord
 from ..filters import FILTERS
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
-from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec, find_base_env, make_spec
-from ..wrappers.outputs import BETA, NEES, STD, Observed
+from ..wrappers.estimate import (
+    BETA,
+    NEES,
+    STD,
+    Arguments,
+    EstimatorSource,
+    EstimatorSpec,
+    find_base_env,
+    make_spec,
+)
 from ..wrappers.truth import (
     STIFFNESSES,
     TruthEntries,

@@ -11,27 +11,20 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
+from ...envs.numerics.functions import wrap
+from ...envs.numerics.jit import as_python, compile_call
+from ...envs.numerics.primitives import ARRAYS
 from ...envs.sensors.link import SlowSensor
 from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
-from ..core.filter import StepRecord
+from ..core.filter import Observed, OutputTable, StepRecord, observe
+from ..core.record import FILTER
 from ..design.models import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import find_entry_point, make_estimator
-from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
-from .outputs import (
-    BETA,
-    HEALTHY,
-    NEES,
-    STD,
-    Observed,
-    Outputs,
-    OutputTable,
-    compile_observe,
-    write_outputs,
-)
+from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, compute_std, get_label
 from .truth import TRUTH, calibrate, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
@@ -48,6 +41,20 @@ _BASE_MEMBERS = (
     *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
     "annotate",
 )
+
+
+BETA, STD, NEES, HEALTHY = range(4)  # places in the summary of a step
+_wrap = as_python(wrap, ARRAYS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outputs:
+    """The entries of a wrapped observation."""
+
+    title: str  # of the estimator, for pictures
+    layout: tuple[ObservationEntry, ...]
+    table: OutputTable
+    keys: tuple[tuple[str, int], ...]  # keys of `info`, with their places in the summary
 
 
 class EstimatorSpec(NamedTuple):
@@ -188,6 +195,42 @@ def _refuse_rebuild(label: str, **_: object) -> NoReturn:
     """Raise the reason why a spec with an object cannot be built, in the place of a factory."""
     text = f"a spec cannot build {label} once more: it was passed as an object"
     raise TypeError(f"{text}; pass its class, a factory or a name")
+
+
+@functools.cache
+def compile_observe() -> Any:
+    """Return `observe` as a plain call with the same positional arguments."""
+    small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
+    memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), StepRecord(matrix, 0, matrix, 0)
+    table = OutputTable(0, np.zeros((1, 3), np.int64), wide)
+    observed = Observed(small, table, 0.0, 0.0, small, wide)
+    return compile_call(observe, *memory, record, 0, observed)
+
+
+def write_outputs(estimator: EstimatorLike, observed: Observed) -> None:
+    """Write a user's estimates as `observe` writes those of a compiled filter.
+
+    Raises what `ForeignEstimator.x` raises.
+
+    Args:
+        estimator: The user's estimator.
+        observed: Observation and outputs.
+    """
+    obs, (inner, plan, limits), beta, gamma, out, summary = observed
+    x, P = np.asarray(estimator.x), np.asarray(estimator.P)
+    std, states, m = compute_std(P), plan[:, 0], len(plan)
+    out[:inner] = obs[:inner]
+    with np.errstate(invalid="ignore"):
+        values = np.where(plan[:, 1] == 1, _wrap(x[states]), x[states])
+    out[inner : inner + m] = np.clip(values, -limits, limits)
+    if len(out) > inner + m:
+        out[inner + m :] = np.clip(std[states], -limits, limits)
+    first = estimator.names.index("beta") if "beta" in estimator.names else 0
+    truth_plan = plan[plan[:, 2] > 0]
+    e = x[truth_plan[:, 0]] - np.where(truth_plan[:, 2] == 1, beta, gamma)
+    P_e = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
+    nees = e @ np.linalg.solve(P_e, e) / len(e) if len(e) and np.linalg.det(P_e) > 0.0 else 0.0
+    summary[:] = x[first], std[first], nees, float(getattr(estimator, "is_healthy", True))
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:

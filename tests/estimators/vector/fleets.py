@@ -13,11 +13,10 @@ from sideslip.envs import COMS
 from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
 from sideslip.envs.ticks import TICK
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.filter import StepRecord
+from sideslip.estimators.core.filter import Observed, OutputTable, StepRecord
 from sideslip.estimators.vector.estimate import EstimateObservation, _build_batch
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from sideslip.estimators.wrappers.estimate import EstimatorSpec
-from sideslip.estimators.wrappers.outputs import Observed, OutputTable
 from tests.envs import batches
 from tests.envs.helpers import bits
 
