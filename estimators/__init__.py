@@ -3,7 +3,7 @@
 Where to start reading: `filters` has the table of filters; `make` turns a row into an `Estimator`:
 `design.config` parses its options, `design.assemble` writes its record. `core.record` names every
 number of a filter, `core.filter` is what happens at every tick. `wrappers` and `vector` put filters
-around environments; `protocol` and `registry` are for users' own.
+around environments, `joint` one around a user's signals. `protocol` is for users' own.
 """
 
 from .analysis.linear_system import DualRate

@@ -1,6 +1,7 @@
 """A filter at work: the compiled memory of a Kalman filter or observer as a Python object."""
 
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,17 +15,10 @@ from ..envs.numerics.jit import compile_call
 from ..envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.filter import (
-    NO_OUTPUTS,
-    FilterOutputs,
-    StepRecord,
-    advance,
-    reset_filters,
-    write_estimate,
-)
+from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord, advance, reset_filters
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
-from .core.update import is_healthy
+from .core.update import compute_excess, is_healthy
 from .design import periodic
 from .design.models import STATES
 from .design.options import FilterConfig
@@ -32,22 +26,14 @@ from .design.periodic import MARGINAL, Schedule, allocate_gains, count_ticks, sp
 from .protocol import Estimates, UnobservableWarning
 
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-_FILTERS, _GAINS, _MATRIX = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
 
 
 @cache
 def compile_advance() -> Callable[..., int]:
     """Return `core.filter.advance` as a plain call with the same positional arguments."""
-    record, outputs = (
-        StepRecord(_MATRIX, 0, _MATRIX, 0),
-        FilterOutputs(_MATRIX, _MATRIX, _MATRIX[0]),
-    )
-    return compile_call(advance, _FILTERS, _GAINS, record, 0, outputs)
-
-
-@cache
-def _compile_write_estimate() -> Callable[..., bool]:
-    return compile_call(write_estimate, _FILTERS, _GAINS, _MATRIX[0], _MATRIX)
+    filters, gains, matrix = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
+    record, outputs = StepRecord(matrix, 0, matrix, 0), FilterOutputs(matrix, matrix, matrix[0])
+    return compile_call(advance, filters, gains, record, 0, outputs)
 
 
 class Estimator:
@@ -214,37 +200,30 @@ class Estimator:
         Args:
             source: Record, or a log that has one.
         """
-        record = self.prepare_record(source)
-        fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
-        X, S = np.empty((2, len(fast), len(self.names)))
-        nis = np.full(len(packets), np.nan)
-        self.take(StepRecord(fast, len(fast), packets, len(packets)), FilterOutputs(X, S, nis))
-        return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
+        return self.run_with_health(source, math.inf)[0]
 
     def run_with_health(
         self, source: Log | Record, seconds: float
     ) -> tuple[Estimates, npt.NDArray[np.bool_]]:
-        """Run as `run` does, and look at `is_healthy` now and then.
+        """Run as `run` does; return also at every row whether it is healthy at the next look.
 
         Args:
             source: Record, or a log that has one.
-            seconds: Time between two looks (s).
-
-        Returns:
-            States and standard deviations, without NIS, and the health at every row's next look.
+            seconds: Time between two looks (s), the last one at the end.
         """
         record = self.prepare_record(source)
         fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
         X, S = np.empty((2, len(fast), len(self.names)))
-        healthy, block = np.empty(len(fast), np.bool_), max(round(seconds / self.dt), 1)
-        for start in range(0, len(fast), block):
-            now, rows = slice(start, start + block), fast[start : start + block]
-            ends = record.first + np.array([start, start + len(rows)])
-            first, last = np.searchsorted(packets[:, PACKET.arrived], ends)
-            part = StepRecord(rows, len(rows), packets[first:last], last - first)
-            self.take(part, NO_OUTPUTS._replace(X=X[now], S=S[now]))
+        healthy, nis = np.empty(len(fast), np.bool_), np.full(len(packets), np.nan)
+        block = max(round(min(seconds, len(fast) * self.dt) / self.dt), 1)
+        starts = np.arange(0, len(fast), block)
+        places = np.searchsorted(packets[:, PACKET.arrived], record.first + starts[1:])
+        for start, first, last in zip(starts, [0, *places], [*places, len(packets)], strict=True):
+            now, due = slice(start, start + block), slice(first, last)
+            part = StepRecord(fast[now], len(fast[now]), packets[due], len(packets[due]))
+            self.take(part, FilterOutputs(X[now], S[now], nis[due]))
             healthy[now] = self.is_healthy
-        time, nis = np.asarray(record.ticks * record.dt, np.float64), np.full(len(packets), np.nan)
+        time = np.asarray(record.ticks * record.dt, np.float64)
         return Estimates(time, X, S, self.names, nis), healthy
 
     def prepare_record(self, source: Log | Record) -> Record:
@@ -280,19 +259,27 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The present states, shape (n,)."""
-        return self._read_estimate(0)[0]
+        return np.concatenate([f["x"][: f["n"]] for f in self.filters])
 
     @property
     def P(self) -> Array:
-        """Their present covariance, shape (n, n); with periodic gains that of the settled cycle."""
-        return self._read_estimate(len(self.names))[1]
+        """Their present covariance, shape (n, n); with periodic gains that of the settled cycle.
 
-    def _read_estimate(self, width: int) -> tuple[Array, Array]:
-        """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
-        x, P = np.empty(len(self.names)), np.zeros((width, width))
-        while not _compile_write_estimate()(self.filters, self.gains, x, P):
-            self._design_cell(int(self._f.cell))
-        return x, P
+        Of a filter that is lost it is larger by its surprise.
+        """
+        P, first = np.zeros((len(self.names),) * 2), 0
+        for f in self.filters:
+            n, growth = int(f.n), max(float(compute_excess(f)), 1.0)
+            block = f.P[:n, :n]
+            if f.periodic:  # a table holds one triangle
+                if self.gains[f.cell, 0, 0] == 0.0:
+                    self._design_cell(int(f.cell))
+                row, upper = 1 + f.at * max(f.fasts, 1), np.triu_indices(n)
+                block = np.empty((n, n))
+                block[upper] = block.T[upper] = self.gains[f.cell, row, f.total :]
+            P[first : first + n, first : first + n] = growth * block
+            first += n
+        return P
 
     @property
     def tick(self) -> int:

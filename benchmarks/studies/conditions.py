@@ -216,7 +216,7 @@ def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     deviation, n_watch = run.std[:, run.names.index("beta")], round(_WATCH / dt)
     gyro = make_estimator(GYRO_ALONE, vehicle=base.nominal, dt=dt).run(wrong)["beta"]
     runs = run["beta"], _run_informed_filter(condition, seed)["beta"], gyro
-    square, informed, by_gyro = (float(np.mean((each - beta)[rows] ** 2)) for each in runs)
+    square, informed, by_gyro = (float(np.mean((estimate - beta)[rows] ** 2)) for estimate in runs)
     nees, coverage, _ = compute_honesty((run["beta"] - beta)[rows], deviation[rows])
     healthy = healthy[::n_watch][: int(driven.sum() * dt / _WATCH)]
     time = _WATCH * np.arange(1, len(healthy) + 1)

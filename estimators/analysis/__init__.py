@@ -1,1 +1,1 @@
-"""What is computed of a whole drive or system: the bound, the smoother, dual-rate on any system."""
+"""What is computed of a whole drive or system: limits, the smoother, dual-rate on any system."""

@@ -113,7 +113,7 @@ def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
             columns |= {FAST.wheel_left, FAST.wheel_right} if f["measured"] else set()
             b["columns"] = len(columns)
             b["column"][: len(columns)] = sorted(columns)
-            b["shaped"][: len(group)] = [each == shape for each in group]
+            b["shaped"][: len(group)] = [lane_shape == shape for lane_shape in group]
     return blocks
 
 
@@ -243,14 +243,16 @@ class BatchEstimator:
         """Lay the gains of all designs in use side by side in a new pool, and make empty lanes."""
         self._shared = {design: self._shared[design] for design in self._designs}
         self._shapes = {design: self._shapes[design] for design in self._designs}
-        self._pool = np.concatenate([each.gains.ravel() for each in self._shared.values()])
+        self._pool = np.concatenate(
+            [estimator.gains.ravel() for estimator in self._shared.values()]
+        )
         places, start = dict[Hashable, tuple[int, ...]](), 0
         for design, estimator in self._shared.items():
             shape, end = estimator.gains.shape, start + estimator.gains.size
             places[design], estimator.gains = (start, *shape), self._pool[start:end].reshape(shape)
             start = end
         self._places = np.array([places[design] for design in self._designs], np.int64)
-        self._lanes = _make_blocks(self.filters, [self._shapes[each] for each in self._designs])
+        self._lanes = _make_blocks(self.filters, [self._shapes[design] for design in self._designs])
 
     def __len__(self) -> int:
         return len(self.filters)

@@ -94,20 +94,19 @@ class Arguments:
     recorded: dict[str, Any] = dataclasses.field(init=False, default_factory=dict)  # for a spec
 
     @classmethod
-    def read(cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **named: Any) -> Self:
+    def read(cls, slow_sensors: Mapping[str, SlowSensor], *values: Any, **misplaced: Any) -> Self:
         """Read and check arguments, choose an estimator where there is none, make the vehicle.
 
         Args:
             slow_sensors: Slow sensors of the env by name.
             *values: Arguments of the wrapper.
-            **named: Arguments by name; TypeError for a misplaced one has the nearest name.
+            **misplaced: Unknown arguments; TypeError for them has the nearest name.
 
         Returns:
             The arguments; ValueError where a vehicle or options would not reach an object.
         """
         names = [field.name for field in dataclasses.fields(cls) if field.init]
-        misplaced = {name: named.pop(name) for name in list(named) if name not in names}
-        self = cls(*values, **named)
+        self = cls(*values)
         if self.estimator is None:
             self.estimator = choose_estimator(slow_sensors)
         if misplaced:
