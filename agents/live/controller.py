@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,7 @@ from ...envs.engine.layout import FLAGS, STATE_WIDTH, EpisodeArrays, P, Z
 from ...envs.engine.outputs import observe, update_newest
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
-from ...envs.record import FAST, FAST_WIDTH, Array
+from ...envs.record import FAST, FAST_WIDTH
 from ...envs.task import REPORT, compute_reference, filter_reference
 from ...envs.ticks import NEVER
 from ...estimators.core.filter import NO_OUTPUTS, Observed, StepRecord
@@ -59,9 +59,6 @@ class OnboardController:
         env: `EstimateObservation` with sensors' clocks, nominal car, references; it is not driven.
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
-
-    Raises:
-        TypeError: The env is not an `EstimateObservation`.
     """
 
     def __init__(
@@ -236,15 +233,6 @@ def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     return batches if offset == len(data) else None
 
 
-class _SessionReplay(NamedTuple):
-    """The result of a replay."""
-
-    ticks: npt.NDArray[np.int64]  # numbers of the ticks, shape (T,)
-    x: Array  # estimates, shape (T, n)
-    std: Array  # standard deviations, shape (T, n)
-    same: bool  # whether every block's checksum of the estimates is the session's
-
-
 @dataclass(frozen=True)
 class Session:
     """A recorded session on disk; ValueError for a file that is none."""
@@ -286,25 +274,18 @@ class Session:
                     return
                 yield batches, digest
 
-    def replay(self, onboard: OnboardController, patience: int | None) -> _SessionReplay:
-        """Replay the session.
+    def replay(self, onboard: OnboardController, patience: int | None) -> tuple[int, bool]:
+        """Replay the session; the number of ticks, and whether its checksums are the estimates'.
 
         Args:
             onboard: On-board controller made from the session's setup.
             patience: Batches without a fast row before the last row is held; None: no limit.
-
-        Returns:
-            Ticks, estimates and deviations, and whether they agree with the session's checksums.
         """
-        synchroniser, digest, same = StreamSynchroniser(patience), 0, True
-        ticks: list[int] = []
-        estimates: list[Array] = []
+        synchroniser, digest, ticks, same = StreamSynchroniser(patience), 0, 0, True
         for batches, block_digest in self.blocks:
             for tick in chain.from_iterable(map(synchroniser.take, batches)):
                 onboard.take(tick)
                 digest = _update_digest(onboard, digest)
-                ticks.append(tick.number)
-                estimates.append(np.stack([onboard.x, onboard.std]))
+                ticks += 1
             same = same and digest == block_digest
-        x, std = np.array(estimates).reshape(-1, 2, len(onboard.names)).swapaxes(0, 1)
-        return _SessionReplay(np.array(ticks, np.int64), x, std, same)
+        return ticks, same

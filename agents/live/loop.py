@@ -1,4 +1,4 @@
-"""The loop of an on-board controller: UDP port, a tick every millisecond, missed deadlines."""
+"""The car's end of the wires: a UDP port, a relay of NMEA, and a tick every millisecond."""
 
 import bisect
 import errno
@@ -7,13 +7,17 @@ import math
 import select
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from itertools import accumulate
+from typing import TYPE_CHECKING, Any
 
+from ...envs.recordings.dialect import to_metres
+from ...envs.recordings.sources import make_source
 from .controller import OnboardController, Recorder
 from .messages import (
+    MAX_AGE,
     MAX_BYTES,
     TICK_US,
     Address,
@@ -26,9 +30,14 @@ from .messages import (
     Tick,
 )
 
+if TYPE_CHECKING:
+    from ...envs.recordings.nmea import Counts, Epoch
+
 LOOPBACK = "127.0.0.1"
 _BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
 MAX_BATCH = 512  # datagrams of a batch: a flood of them does not stop the loop
+MAX_HDOP = 99.0  # what receivers give without a fix
+_MAX_PAUSE = 10.0  # s between two epochs of a file
 _SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
 clock = time.monotonic_ns  # time of the monotonic clock, which is never set (ns)
@@ -99,13 +108,10 @@ class Port(AbstractContextManager["Port"]):
         return batch
 
     def wait(self, seconds: float) -> list[Arrival]:
-        """Wait for the first datagrams.
+        """Wait for the first datagrams, in the order of their arrival; none after a timeout.
 
         Args:
             seconds: Timeout (s).
-
-        Returns:
-            Datagrams in the order of their arrival, none after a timeout.
         """
         select.select([self._socket], [], [], max(seconds, 0.0))
         return self._receive_available([])
@@ -123,12 +129,71 @@ class Port(AbstractContextManager["Port"]):
             self._receive_available(batch)
         return self._receive_available(batch)
 
-    def close(self) -> None:
-        """Close the port."""
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+
+@dataclass
+class Relay:
+    """Sends the epochs of a source as datagrams; a lost line is opened again."""
+
+    source: str  # as for `envs.recordings.sources.make_source`, whose errors it raises
+    port: Port  # sends
+    to: Address  # of the receiver
+    latency: float = 0.0  # s from an epoch to its sentences, added to the age
+    speed: float = 1.0  # of a file's clock, 1 for real time
+    sent: int = 0  # number of datagrams
+    error: str = ""  # reason of the end, "" at a file's end
+    counts: "Counts" = field(init=False)  # of the decoder
+    _origin: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        from ...envs.recordings.nmea import Decoder
+
+        self._chunks, self._decoder = make_source(self.source), Decoder()
+        self.counts = self._decoder.counts
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Relay until the source ends or is lost.
+
+        Args:
+            stop: Function that returns whether to stop.
+        """
+        is_file = not self.source.startswith(("serial:", "tcp:"))
+        last_time, due = math.nan, time.monotonic()
+        try:
+            for epoch in self._iterate_epochs():
+                if epoch is not None and is_file and epoch.t > last_time:
+                    due += min(epoch.t - last_time, _MAX_PAUSE) / self.speed
+                while not stop() and is_file and (left := due - time.monotonic()) > 0.0:
+                    time.sleep(min(left, 0.1))
+                if stop():
+                    return
+                if epoch is not None:
+                    last_time = epoch.t
+                    self.port.send(self.to, DatagramKind.GPS, 0, self._make_values(epoch))
+                    self.sent += 1
+        except OSError as error:
+            self.error = str(error)
+
+    def _iterate_epochs(self) -> Iterator["Epoch | None"]:
+        """Iterate over the epochs, with None after each chunk of bytes."""
+        for chunk in self._chunks:
+            yield from self._decoder.decode_chunk(chunk)
+            yield None
+        yield from self._decoder.finish()
+
+    def _make_values(self, epoch: Any) -> list[float]:
+        """Make the doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
+        X, Y = 0.0, 0.0  # m east and north of the first fix
+        if epoch.has_fix:
+            self._origin = self._origin or (epoch.latitude, epoch.longitude)
+            X, Y = map(float, to_metres(epoch.latitude, epoch.longitude, self._origin))
+        hdop = epoch.hdop if math.isfinite(epoch.hdop) else MAX_HDOP
+        course, speed = (value if math.isfinite(value) else 0.0 for value in epoch[3:5])
+        age = epoch.age + self.latency
+        age = min(max(age, 0.0), MAX_AGE) if math.isfinite(age) else MAX_AGE
+        return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
 
 
 PERIOD = 1_000_000  # ns, a tick of the loop
@@ -196,7 +261,6 @@ class Loop:
     viewer: Address | None = None  # which gets every tenth estimate and the status
     step: bool = False  # whether time is that of the stamps: datagrams are processed as they arrive
     recorder: Recorder | None = None  # of the session
-    watch: Callable[[Tick], None] | None = None  # called after each tick
     patience: float = 30.0  # s without a fast row after which `run` ends
     statistics: _Statistics = field(default_factory=_Statistics)
     ended: str = ""  # reason of the end
@@ -270,8 +334,6 @@ class Loop:
             self._send(tick)
             if self.recorder is not None:
                 self.recorder.note(onboard)
-            if self.watch is not None:
-                self.watch(tick)
         if self.recorder is not None:
             self.recorder.take(self.assembler.accepted)
         return ticks
@@ -293,29 +355,26 @@ class Loop:
 
     def _make_status(self) -> LoopStatus:
         """Collect the counts so far."""
-        statistics, counts = self.statistics, self.assembler.counts
+        m, counts = self.statistics, self.assembler.counts
         bad = sum(counts[reason] for reason in RejectReason)
-        numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
-        times = (x.newest for x in (statistics.jitter, statistics.latency, statistics.work))
-        health = statistics.deadlines, self.onboard.is_healthy
+        numbers = m.ticks, m.misses, counts["held"], bad, counts["lost"]
+        times = m.jitter.newest, m.latency.newest, m.work.newest
+        health = m.deadlines, self.onboard.is_healthy
         return LoopStatus._make(map(float, (*numbers, *times, *health)))
 
     def numbers(self) -> dict[str, object]:
         """Collect all measurements, in JSON types."""
-        m, counts = self.statistics, ("ticks", "deadlines", "misses", "per_million", "suspensions")
-        numbers = {name: getattr(m, name) for name in (*counts, "actions", "seconds")}
-        times = {"jitter_us": m.jitter, "latency_us": m.latency, "work_us": m.work}
-        numbers |= {name: histogram.summarise() for name, histogram in times.items()}
+        numbers: dict[str, object] = {"per_million": self.statistics.per_million}
+        for name, value in vars(self.statistics).items():
+            is_time = isinstance(value, _Histogram)
+            numbers |= {f"{name}_us": value.summarise()} if is_time else {name: value}
         return numbers | {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
 
     def lines(self, name: str) -> list[str]:
-        """Format the first lines of a verdict on the loop.
+        """Format the first two or three lines of a verdict on the loop.
 
         Args:
             name: Name of the estimator.
-
-        Returns:
-            Two lines, three where there were deadlines.
         """
         m, tables = self.statistics, (self.assembler.counts, self.onboard.refused)
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"

@@ -106,13 +106,10 @@ class Message(NamedTuple):
 
 
 def decode(data: bytes) -> Message | RejectReason:
-    """Decode a datagram; it raises nothing.
+    """Decode a datagram, or say why to ignore it; it raises nothing.
 
     Args:
         data: Bytes of the datagram.
-
-    Returns:
-        Message, or the reason to ignore it.
     """
     if len(data) > MAX_BYTES:
         return RejectReason.OVERSIZED

@@ -86,10 +86,9 @@ class _Live:
     def _run_loop(self, setup: dict[str, Any], publish: list[Any]) -> None:
         """Run the loop with its connections, and print and write what it measured."""
         from ...agents.live.controller import OnboardController, Recorder
-        from ...agents.live.loop import Loop, Port
+        from ...agents.live.loop import Loop, Port, Relay
         from ...agents.live.messages import PATIENCE, StreamSynchroniser
-        from ...agents.live.simulate import Relay, SimulatedCarProcess
-        from ...agents.live.viewer import Viewer
+        from ...agents.live.peers import SimulatedCarProcess, Viewer
 
         patience = None if self.step else round(PATIENCE / min(self.speed, 1.0))
         with ExitStack() as stack:
@@ -134,7 +133,7 @@ class _Live:
 
     def _simulate(self, setup: dict[str, Any], target: Any) -> None:
         from ...agents.live.loop import Port
-        from ...agents.live.simulate import simulate
+        from ...agents.live.peers import simulate
 
         env_id = self.env or "sideslip/YawVision-v0"
         check_env(env_id)
@@ -146,8 +145,7 @@ class _Live:
 
     def _relay(self, source: str, target: Any) -> None:
         """Send a receiver's sentences on, until the time is over."""
-        from ...agents.live.loop import Port
-        from ...agents.live.simulate import Relay
+        from ...agents.live.loop import Port, Relay
 
         signals, end = _watch_signals(), monotonic() + self.duration
         with Port() as port:
@@ -178,10 +176,10 @@ class _Live:
         unasked = "" if setup["env"] == requested["env"] else setup["env"]
         check_names_no_code(unasked, "", setup["estimator_options"])
         onboard = OnboardController(*make_driver(requested | setup, self.trust), setup["seed"])
-        session = recorded.replay(onboard, setup["patience"])
-        same = "those of the session bit for bit" if session.same else "NOT those of the session"
-        console.print(f"{len(session.ticks)} ticks; the estimates are {same}")
-        self._write(setup | {"ticks": len(session.ticks), "same": session.same})
+        ticks, same = recorded.replay(onboard, setup["patience"])
+        text = "those of the session bit for bit" if same else "NOT those of the session"
+        console.print(f"{ticks} ticks; the estimates are {text}")
+        self._write(setup | {"ticks": ticks, "same": same})
 
     def _write(self, numbers: Mapping[str, Any]) -> None:
         if self.json is not None:

@@ -19,7 +19,7 @@ from sideslip.agents.live.messages import (
     StreamSynchroniser,
     Tick,
 )
-from sideslip.agents.live.simulate import _WireAgent, simulate
+from sideslip.agents.live.peers import _WireAgent, simulate
 from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation
 
@@ -32,6 +32,17 @@ def contestant(env_id: str, estimator: Any, agent: Any, **options: Any) -> tuple
     """(env with its estimator, agent)."""
     env = EstimateObservation(gym.make(env_id, scenario=SHORT, **options), estimator)
     return env, make_agent(agent, env)
+
+
+def watch_ticks(onboard: OnboardController, watch: Callable[[Tick], None]) -> None:
+    """Call a function after each tick that the controller takes."""
+    take = onboard.take
+
+    def take_and_watch(tick: Tick) -> None:
+        take(tick)
+        watch(tick)
+
+    onboard.take = take_and_watch  # type: ignore[method-assign]
 
 
 def drive(
@@ -48,7 +59,9 @@ def drive(
         loop = Loop(
             onboard, StreamSynchroniser(None if step else round(PATIENCE / speed)), car, step=step
         )
-        loop.recorder, loop.watch = recorder, watch
+        loop.recorder = recorder
+        if watch is not None:
+            watch_ticks(onboard, watch)
         thread = Thread(target=loop.run)
         thread.start()
         env = gym.make(env_id, scenario=SHORT, **options)

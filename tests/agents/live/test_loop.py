@@ -26,7 +26,7 @@ from sideslip.agents.live.messages import (
     decode,
 )
 from sideslip.benchmarks.cli.live import _parse_address
-from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial
+from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial, watch_ticks
 
 ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
 
@@ -98,7 +98,7 @@ def test_controls_follow_a_sender_that_begins_anew() -> None:
 def test_a_busy_loop_counts_the_deadlines_it_missed_and_catches_none_up() -> None:
     with Port() as port, Port() as car:
         loop = Loop(onboard(), StreamSynchroniser(), port)
-        loop.watch = lambda tick: time.sleep(0.0205) if tick.number == 1 else None
+        watch_ticks(loop.onboard, lambda x: time.sleep(0.0205) if x.number == 1 else None)
         car.send(port.address, DatagramKind.INERTIAL, 0, ROW)
         assert loop._take(port.wait(1.0)) == 1
         car.send(port.address, DatagramKind.INERTIAL, TICK_US, ROW)

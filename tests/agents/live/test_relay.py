@@ -9,9 +9,8 @@ import pytest
 
 pytest.importorskip("pynmeagps")
 
-from sideslip.agents.live.loop import Port
+from sideslip.agents.live.loop import MAX_HDOP, Port, Relay
 from sideslip.agents.live.messages import FIELDS, DatagramKind, Message, decode
-from sideslip.agents.live.simulate import MAX_HDOP, Relay
 
 
 def sentence(text: str) -> bytes:

@@ -19,7 +19,7 @@ pytest.importorskip("aiohttp")
 
 from sideslip.agents.live.loop import LOOPBACK, Port
 from sideslip.agents.live.messages import DatagramKind, LoopStatus
-from sideslip.agents.live.viewer import Viewer, _make_event, _make_table, _ViewerProtocol
+from sideslip.agents.live.peers import Viewer, _make_event, _make_table, _ViewerProtocol
 from tests.agents.live.both_ends import encode
 
 NAMES = ("beta", "gamma", "F_d")

@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.agents.live.controller import OnboardController
 from sideslip.agents.live.loop import Port
-from sideslip.agents.live.simulate import MAX_TICKS, simulate
+from sideslip.agents.live.peers import MAX_TICKS, simulate
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.envs.record import FAST
 from tests.agents.live.both_ends import SEED, SHORT, STEERING, VISION, contestant, drive
@@ -138,7 +138,7 @@ def test_garbage_between_the_datagrams_changes_nothing() -> None:
 
 def test_nobody_at_the_other_end_is_an_error() -> None:
     with Port() as port, Port() as nobody, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sideslip.agents.live.simulate.CONTROL_TIMEOUT", 0.2)
+        patch.setattr("sideslip.agents.live.peers.CONTROL_TIMEOUT", 0.2)
         with pytest.raises(TimeoutError, match=r"no control came .* --step"):
             simulate(gym.make(VISION, scenario=SHORT), port, nobody.address, step=True)
         period = MAX_TICKS + 1
