@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +15,7 @@ from ..envs.task import ObservationEntry, make_space
 from ..envs.validation import short_repr
 from ..envs.vehicle.parameters import Vehicle
 
+_Value = TypeVar("_Value")
 CarEnv = gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 CarVectorEnv = VectorEnv[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[Any]]
 
@@ -122,14 +123,11 @@ class EnvView:
 
 
 def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
-    """Make the env of an id, with the env's own short message for a missing or unknown argument.
+    """Make the env of an id; a missing or unknown argument is a TypeError with a short message.
 
     Args:
         env_id: Id of a registered env.
         options: Arguments of `gym.make`.
-
-    Raises:
-        TypeError: An argument is missing or unknown.
     """
     try:
         return gym.make(env_id, **options)
@@ -151,37 +149,27 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
         ValueError: Another wrapper, or rows with different nominal cars or limits.
     """
     try:
-        return _collect_facts(env)
+        return env.facts if isinstance(env, EnvView) else _collect_facts(env)
     except AttributeError as error:
         made_by = "an agent is built for an env as of gym.make('sideslip/YawVision-v0')"
         raise TypeError(f"{made_by}, got {short_repr(env)}") from error
 
 
 def _collect_facts(env: Any) -> EnvFacts:
-    if isinstance(env, EnvView):
-        return env.facts
     base: Any = env.unwrapped
-    if isinstance(env, gym.Env):
-        layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
-        _check_wrappers(env, layout)
-    elif isinstance(env, VectorEnv):
+    if isinstance(env, VectorEnv):
         layout, width = get_layout(env), base.single_action_space.shape[0]
     else:
-        layout, width = _get_common_value(base, "layout"), base.action_space.shape[0]
+        has_layout = isinstance(env, gym.Env)
+        layout = env.get_wrapper_attr("layout") if has_layout else _get_common(base, "layout")
+        width = base.action_space.shape[0]
         _check_wrappers(env, layout)
     cars = zip(*(_get_row_values(base, name) for name in ("nominal", "vehicle")), strict=True)
-    period, kind = (_get_common_value(base, name) for name in ("control_period", "reference"))
     designs = [(nominal, car.yaw_moment_limit, car.steering_authority) for nominal, car in cars]
-    for i, design in enumerate(designs):
-        if design != designs[0]:
-            raise ValueError(
-                f"the rows of a vector env share one design, but row {i} has another nominal "
-                "vehicle or other limits than row 0: make an agent for each kind of car"
-            )
-    rates = {config.world.moment_rate for config in list_configs(env)}
-    if len(rates) != 1:
-        raise ValueError("the rows of a vector env share one design, but not one moment_rate")
-    return EnvFacts(layout, *designs[0], period, kind, width, *rates)
+    design = _check_common("nominal vehicle, or other limits", designs)
+    period, kind = (_get_common(base, name) for name in ("control_period", "reference"))
+    rates = [config.world.moment_rate for config in list_configs(env)]
+    return EnvFacts(layout, *design, period, kind, width, _check_common("moment_rate", rates))
 
 
 def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
@@ -189,9 +177,6 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
 
     Args:
         env: Env, vector env, `VecEnv` or `EnvView`.
-
-    Returns:
-        Kinds, each once.
     """
     if isinstance(env, EnvView):
         return env.plants
@@ -263,14 +248,11 @@ def get_layout(env: CarVectorEnv) -> tuple[ObservationEntry, ...]:
 
     Args:
         env: Vector env with its wrappers.
-
-    Returns:
-        Entries of the observation, in order.
     """
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
         layer = layer.env
-    layout = tuple(_get_common_value(layer, "layout"))
+    layout = tuple(_get_common(layer, "layout"))
     _check_wrappers(env, layout)
     return layout
 
@@ -282,12 +264,19 @@ def _get_row_values(base: Any, name: str) -> Sequence[Any]:
     return list(getattr(base, name) if hasattr(base, name) else base.get_attr(name))
 
 
-def _get_common_value(base: Any, name: str) -> Any:
-    """Return an attribute that all rows share; ValueError where they do not."""
+def _get_common(base: Any, name: str) -> Any:
+    """Return an attribute that all rows share."""
     if hasattr(base, name):
         return getattr(base, name)
-    rows = base.get_attr(name)
+    return _check_common(name, base.get_attr(name))
+
+
+def _check_common(what: str, rows: Sequence[_Value]) -> _Value:
+    """Return what all rows have; ValueError where they differ."""
     for i, row in enumerate(rows):
         if row != rows[0]:
-            raise ValueError(f"row {i} of the vector env has another {name} than row 0")
+            raise ValueError(
+                f"row {i} of the vector env has another {what} than row 0, and rows share one "
+                "design: make an agent for each kind of car"
+            )
     return rows[0]

@@ -1,8 +1,7 @@
 """Stable-baselines3's `VecEnv` over the native vector env: one call for all rows."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -14,9 +13,7 @@ from ..envs.numerics import require_extra
 from ..envs.task import GAMMA_SCALE, STEER_SCALE, ObservationEntry, make_info, make_space
 from ..envs.vector import StabilityVectorEnv
 from ..envs.vehicle.dynamics import Motion
-from ..estimators.vector import estimate as vector_estimate
-from ..estimators.wrappers import estimate as single_estimate
-from ..estimators.wrappers import truth as single_truth
+from ..estimators.vector.estimate import EstimateObservation
 from .env_info import CarVectorEnv, get_layout
 
 with require_extra("train", "training needs torch and stable-baselines3"):
@@ -35,110 +32,32 @@ _SHARED_ATTRIBUTES = (  # each is the same for all rows
     "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
-_OTHER_NAMES = {"config": "row_configs"}  # of what the vector env has one of all rows too
-_METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
+_OTHER_NAMES = {  # of a row, in the vector env, where it has the same name of all rows
+    "config": "row_configs", **{name: f"single_{name}" for name in _SPACES}
+}  # fmt: skip
 _SCALES = {  # by unit, what is much in a drive; other units keep their numbers
     "rad": STEER_SCALE, "rad/s": GAMMA_SCALE, "m/s": 10.0, "m/s2": 1.0, "m": 1.0, "N": 500.0,
     "N m": 100.0, "1/m": 0.01,
 }  # fmt: skip
 _WIDE_SCALES = {"gps_X": 100.0, "gps_Y": 100.0}  # m, positions on a map
-_TWINS: dict[type, type] = {
-    single_estimate.EstimateObservation: vector_estimate.EstimateObservation,
-    single_truth.TruthObservation: vector_estimate.TruthObservation,
-}
-
-
-class _VecEnvRow:
-    """Row i of a vector env: `_ROW_ATTRIBUTES` and the like, and values that are set on it."""
-
-    def __init__(self, env: CarVectorEnv, i: int) -> None:
-        self._env, self._i = env, i
-        self._set: dict[str, object] = {}
-
-        self._layers = [env]  # from the outermost wrapper to the bare vector env
-        while isinstance(self._layers[-1], VectorWrapper):
-            self._layers.append(self._layers[-1].env)
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """Get an attribute of this row from the outermost layer that has it."""
-        if name in self._set:
-            return self._set[name]
-        if name in _METHODS:
-            return getattr(self, name)
-        attribute = f"single_{name}" if name in _SPACES else _OTHER_NAMES.get(name, name)
-        if name in (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES):
-            for layer in self._layers:
-                if attribute in vars(layer) or hasattr(type(layer), attribute):
-                    value = getattr(layer, attribute)
-                    value = value[self._i] if name in _ROW_ATTRIBUTES else value
-                    return Motion(*value.tolist()) if name == "motion" else value
-        known = (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES, *_METHODS, *self._set)
-        raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {name!r}")
-
-    def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether `get_wrapper_attr` finds an attribute."""
-        with suppress(AttributeError):
-            self.get_wrapper_attr(name)
-            return True
-        return False
-
-    def set_wrapper_attr(self, name: str, value: object, **_: object) -> None:
-        """Set a value beside the env, under a name that the env does not have."""
-        if name not in self._set and self.has_wrapper_attr(name):
-            text = "options of reset (`set_options`) change the scenario, vehicle, friction, state"
-            error = f"{name!r} is the environment's and is not set from outside"
-            raise AttributeError(f"{error}; {text} and duration")
-        self._set[name] = value
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Start a new episode in this row alone; return observation (k,) and info."""
-        mask = np.arange(self._env.num_envs) == self._i
-        seeds: Any = [seed if is_row else None for is_row in mask]
-        more = {name: [value] * len(mask) for name, value in (options or {}).items()}
-        obs, infos = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
-        base: Any = self._env.unwrapped
-        (info,) = _split_infos(infos, [self._i])
-        return obs[self._i], make_info(base.engine.arrays.reports[self._i].tolist()) | info
-
-    def is_wrapped(self, wrapper_class: type) -> bool:
-        """Return whether a layer has this class, or is the vector twin of it."""
-        wanted = _TWINS.get(wrapper_class, wrapper_class)
-        return any(isinstance(layer, wanted) for layer in self._layers)
-
-
-class _EmptyInfo(dict[str, object]):
-    """The info of a row where nothing ended: empty, one for all rows, and closed."""
-
-    def _refuse(self, *_: object, **__: object) -> NoReturn:
-        raise TypeError(
-            "the info of a row whose episode goes on is one empty dict that all rows share; put "
-            "another dict in its place in the list instead of writing into it"
-        )
-
-    __setitem__ = update = setdefault = __ior__ = _refuse
-
-    def __reduce__(self) -> tuple[object, ...]:  # a copy is an ordinary dict
-        return dict, ()
-
-
-EMPTY_INFO = _EmptyInfo()
 
 
 class _NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
     It equals its `DummyVecEnv` around single environments with the same seeds, bit for bit, but for
-    `infos`: where no episode ends it holds one empty dict that all rows share (`EMPTY_INFO`).
+    `infos`: where no episode ends they are empty. Rows have no methods, and nothing is set on them.
     `set_options` takes the options of a single env's `reset`, for all rows or a list of them.
     """
 
     def __init__(self, vector_env: CarVectorEnv) -> None:
         mode = vector_env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
-            text = "stable-baselines3 expects rows to be reset in the step that ends them: build"
-            raise ValueError(f"{text} the vector env with autoreset_mode='SameStep', not {mode}")
+            raise ValueError(f"a VecEnv resets its rows: autoreset_mode='SameStep', not {mode}")
         self.vector_env, self._base = vector_env, cast("StabilityVectorEnv", vector_env.unwrapped)
-        self._rows = [_VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
+        self._layers = [vector_env]  # from the outermost wrapper to the bare vector env
+        while isinstance(self._layers[-1], VectorWrapper):
+            self._layers.append(self._layers[-1].env)
         self._actions: Any = None
         spaces = vector_env.single_observation_space, vector_env.single_action_space
         super().__init__(vector_env.num_envs, *spaces)
@@ -169,7 +88,7 @@ class _NativeVecEnv(VecEnv):
         actions, self._actions = self._actions, None
         obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
         dones = terminated | truncated
-        row_infos: list[dict[str, Any]] = [EMPTY_INFO] * self.num_envs
+        row_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if "final_obs" in infos:
             ended = np.flatnonzero(dones).tolist()
             finals = _split_infos(infos["final_info"], ended)
@@ -200,38 +119,41 @@ class _NativeVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: _Indices = None) -> list[Any]:
         """Get what a single env has of each row; AttributeError where rows do not have it."""
-        return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
+        rows = self._get_indices(indices)
+        attribute = _OTHER_NAMES.get(attr_name, attr_name)
+        known = (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES)
+        for layer in self._layers if attr_name in known else ():
+            if attribute in vars(layer) or hasattr(type(layer), attribute):
+                value: Any = getattr(layer, attribute)
+                if attr_name == "motion":
+                    return [Motion(*value[i].tolist()) for i in rows]
+                return [value[i] if attr_name in _ROW_ATTRIBUTES else value for i in rows]
+        raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {attr_name!r}")
 
     def set_attr(self, attr_name: str, value: object, indices: _Indices = None) -> None:
-        """Store a value beside the env for each row; AttributeError where the name is the env's."""
-        for row in self._get_rows(indices):
-            row.set_wrapper_attr(attr_name, value)
+        """Raise AttributeError: options of reset change what may be changed."""
+        text = "options of reset (`set_options`) change the scenario, vehicle, friction, state and"
+        raise AttributeError(f"{attr_name!r} is not set from outside; {text} duration")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a row's `reset` or a method of wrapped attributes; AttributeError without one."""
-        chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
-        return [method(*method_args, **method_kwargs) for method in chosen]
+        """Raise AttributeError: rows of a vector env have no methods."""
+        raise AttributeError(f"a row of a vector env has no method {method_name!r}: see get_attr")
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: _Indices = None
     ) -> list[bool]:
-        """Return for each row whether it has a wrapper's class or its vector twin."""
-        return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
-
-    def _get_rows(self, indices: _Indices) -> list[_VecEnvRow]:
-        return [self._rows[i] for i in self._get_indices(indices)]
+        """Return for each row whether a layer of the vector env has this class."""
+        is_wrapped = any(isinstance(layer, wrapper_class) for layer in self._layers)
+        return [is_wrapped for _ in self._get_indices(indices)]
 
 
 def get_scales(layout: Sequence[ObservationEntry]) -> npt.NDArray[np.float32]:
-    """Get the fixed scale of each entry of an observation.
+    """Get the fixed scale of each entry of an observation, in its unit, shape (k,).
 
     Args:
         layout: Entries of the observation.
-
-    Returns:
-        Scales in the entries' units, shape (k,).
     """
     scales = [_WIDE_SCALES.get(name, _SCALES.get(unit, 1.0)) for name, unit, *_ in layout]
     return np.array(scales, np.float32)
@@ -284,8 +206,8 @@ def make_vec_env(
     """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
     Observations and rewards are those of `ScaledVecEnv`. With `scaled=False` it has the bits of a
-    `DummyVecEnv` of single environments with the same seeds. Its `infos` hold one empty dict for
-    all rows but those whose episode ends.
+    `DummyVecEnv` of single environments with the same seeds. Its `infos` are empty but for rows
+    whose episode ends.
 
     Args:
         env_id: Id of an env with a native vector env.
@@ -298,9 +220,6 @@ def make_vec_env(
         wrapper_class: Wrapper for the vector env, applied outside the estimator's wrapper; its
             result becomes the `VecEnv`.
         scaled: Whether observations and rewards are scaled; no controller reads such observations.
-
-    Returns:
-        `VecEnv` that monitors episodes.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
     bridge = _NativeVecEnv(wrapper_class(env) if wrapper_class else env)
@@ -328,9 +247,6 @@ def make_native_env(
         estimator: Name of an estimator, or arguments of `EstimateObservation`.
         env_kwargs: Arguments of the environment.
 
-    Returns:
-        Vector env, wrapped if there is an estimator.
-
     Raises:
         ValueError: The id has no native vector env.
     """
@@ -344,7 +260,7 @@ def make_native_env(
     if estimator is None:
         return env
     estimator = estimator if isinstance(estimator, Mapping) else {"estimator": estimator}
-    return vector_estimate.EstimateObservation(env, **estimator)
+    return EstimateObservation(env, **estimator)
 
 
 def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
