@@ -7,7 +7,6 @@ options of `tuned.toml` by class of tasks: car, disturbances and reference, as i
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Mapping
 from functools import cache, partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from ..envs.io import read_document
 from ..envs.scenarios.draws import get_range
 from ..envs.scenarios.manoeuvres import SCENARIOS
 from ..envs.scenarios.scenario import Scenario
@@ -74,9 +74,6 @@ def make_noise_options(
         scenario: Scenario whose noise the filter knows.
         world: Errors of car and sensors, of which it knows the ranges.
         has_tyres: Whether the filter knows the tyres or has states for them.
-
-    Returns:
-        Options by name; `camera_yaw_sd` needs a camera.
     """
     noise, share = scenario.noise, HDOP_LAWS[scenario.hdop_law]
     sd, table = scenario.disturbance_force, [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)]
@@ -120,15 +117,12 @@ def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
 
 
 def compute_range_rms(source: Scenario | World, name: str, ideal: float = 0.0) -> float:
-    """Compute the root mean square of a quantity that is uniform over its range.
+    """Compute the root mean square, in its unit, of a quantity that is uniform over its range.
 
     Args:
         source: Scenario or world that holds the range.
         name: Name of the quantity, whose unit the result has.
         ideal: Value from which it counts.
-
-    Returns:
-        Root mean square, in that unit.
     """
     low, high = (end - ideal for end in get_range(getattr(source, name)))
     return math.sqrt((low * low + low * high + high * high) / 3.0)
@@ -214,22 +208,16 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
 
 @cache
 def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
-    """Read the options of a file, by class and entry.
+    """Read the options of a file, by class, entry and part.
 
     Args:
         path: TOML file.
-
-    Returns:
-        Options by class, entry and part.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file holds something else, or is of another world.
     """
-    try:
-        classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from None
+    classes = read_document(path, "tuning")
     if (version := classes.pop("world_version", 0)) != WORLD_VERSION:
         text = f"{path} was tuned in world {version}, this is {WORLD_VERSION}: tune anew"
         raise ValueError(f"{text}, sideslip tune controller NAME --write")
@@ -238,7 +226,7 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
             is_valid = isinstance(parts, dict) and parts.keys() <= set(PARTS)
             if not (is_valid and all(isinstance(options, dict) for options in parts.values())):
                 raise ValueError(f"{path}: {kind}.{name} is no table of {' and '.join(PARTS)}")
-    return dict(classes)
+    return classes
 
 
 def get_tuned_options(task_class: str, name: str) -> Options:

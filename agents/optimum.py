@@ -91,22 +91,6 @@ class Optimum:
                 X = closed @ known @ closed.T + model.G @ P @ model.G.T + W
         return self.cost + total / len(self.errors)
 
-    def excess(self, read: Array, actions: Array) -> Array:
-        """Compute the expected cost of actions above the optimal ones', by episode.
-
-        It equals the cost less the optimum in expectation, for any agent, and scatters much less.
-
-        Args:
-            read: Entries `Lqg.needs` at the decisions of these episodes, shape (N, steps, 5).
-            actions: Delivered actions, shape (N, steps).
-
-        Returns:
-            Excess cost, shape (N,).
-        """
-        read_gains = _select_gains(self.plant, self.gains)
-        read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts: no guess
-        return np.asarray((actions + np.einsum("nji,ji->nj", read, read_gains)) ** 2 @ self.weights)
-
 
 def _make_linear_plant(env: AnyEnv) -> LinearPlant:
     """Make the linear plant of an env; ValueError where its scenario is not linear."""
@@ -175,9 +159,6 @@ def compute_optimum(env: CarEnv, schedules: int = 1) -> Optimum:
     Args:
         env: Single env.
         schedules: Number of seeds from 0 whose arrivals are averaged; 1 where none are random.
-
-    Returns:
-        Optimum with its gains and the error covariances of each schedule.
     """
     plant = _make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)
@@ -220,13 +201,6 @@ def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Ar
     return covariances
 
 
-def _select_gains(plant: LinearPlant, gains: Array) -> Array:
-    """Select, from gains (..., n) on the state, those (..., 5) on the entries `Lqg.needs`."""
-    selected = gains[..., [plant.model.states.index(name) for name in (*OUTPUTS, "driver")]]
-    selected[..., -1] *= plant.decay
-    return selected
-
-
 class Lqg(Controller):
     """The optimal policy of a linear scenario without end, for the env of `wrap_optimal_estimate`.
 
@@ -244,7 +218,8 @@ class Lqg(Controller):
         super().__init__(env)
         plant = _make_linear_plant(env)
         self.gains = _solve_regulator(plant)[0][0] if gains is None else gains
-        self._answer = _select_gains(plant, self.gains)
+        self._answer = self.gains[[plant.model.states.index(x) for x in (*OUTPUTS, "driver")]]
+        self._answer[-1] *= plant.decay  # the next angle's best guess
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         action[:, 0] = -inputs @ self._answer

@@ -94,15 +94,12 @@ def _check_full_scale(env: CarEnv | CarVectorEnv, agent: Any) -> None:
 
 
 def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tuple[Array, Array]:
-    """Evaluate the cost and length of each seed's first episode.
+    """Evaluate the cost J (N,) and the steps (N,) of each seed's first episode.
 
     Args:
         env: Vector env of N rows.
         agent: Agent, as for `iterate_steps`.
         seeds: N seeds.
-
-    Returns:
-        Costs J, shape (N,), and numbers of steps, shape (N,).
     """
     costs, lengths = np.zeros(env.num_envs), np.full(env.num_envs, -1.0)  # the reset is no step
     for step in iterate_steps(env, agent, list(seeds)):
@@ -112,14 +109,11 @@ def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tu
 
 
 def compute_cost_ratios(costs: Array, others: Array) -> Array:
-    """Compute ratios of costs on the same seeds, each with `COST_FLOOR` added.
+    """Compute ratios (N,) of costs on the same seeds, each with `COST_FLOOR` added.
 
     Args:
         costs: Costs J, shape (N,).
         others: Costs J to compare with, shape (N,).
-
-    Returns:
-        Ratios costs / others, shape (N,).
     """
     return np.asarray((costs + COST_FLOOR) / (others + COST_FLOOR))
 
@@ -249,9 +243,6 @@ def rollout(
         agent: Agent, as for `iterate_steps`.
         seed: Seed of the reset.
         options: Options of the reset.
-
-    Returns:
-        Columns by name, their units, and the log.
 
     Raises:
         TypeError: A vector env, an env of another package, or an agent without `predict`.
