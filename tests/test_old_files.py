@@ -155,12 +155,12 @@ def test_a_training_goes_on_from_its_checkpoint(
 ) -> None:
     pytest.importorskip("stable_baselines3")
     from sideslip.agents.training import trainer
-    from sideslip.agents.training.callbacks import CHECKPOINT, read_state
+    from sideslip.agents.training.callbacks import CHECKPOINT, read_checkpoint
 
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
-    state = read_state(folder / CHECKPOINT)
-    monkeypatch.setattr(trainer, "__version__", state["sideslip"])
+    state = read_checkpoint(folder / CHECKPOINT)
+    monkeypatch.setattr(trainer, "__version__", state.sideslip)
     task = trainer.read_training(folder).task
-    found = trainer.Trainer(task, state["steps"], folder, resume=True).train()
+    found = trainer.Trainer(task, state.steps, folder, resume=True).train()
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

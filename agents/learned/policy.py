@@ -24,9 +24,8 @@ from ...estimators.make import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env
-from .forward import CELL_WEIGHTS, MemoryLayer, MovingAverages, RecurrentCell
+from .network import CELL_WEIGHTS, MemoryLayer, MovingAverages, Network, RecurrentCell, Tensors
 from .network import SUFFIX as SUFFIX
-from .network import Network, Tensors
 
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
 MAX_BYTES = 2**26  # a larger file is not opened, which bounds the tensors' sizes too
@@ -179,13 +178,10 @@ def _make_path(name: str | Path) -> Path:
 
 
 def hash_policy(name: str) -> str:
-    """Compute the hash of a policy's file, "" for a name that is no policy's.
+    """Compute the SHA-256 of a policy's file in hexadecimal digits, "" for no policy's name.
 
     Args:
         name: Shipped name or path.
-
-    Returns:
-        SHA-256 in hexadecimal digits.
     """
     path = _make_path(name)
     exists = is_policy(name) and path.is_file()
@@ -199,9 +195,6 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         path: Path that ends in `.safetensors`.
         network: Network to write.
         card: Card of its training.
-
-    Raises:
-        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -213,8 +206,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
 
 def _check_width(card: Card, network: Network) -> None:
     if (count := len(card.observation)) != network.inputs:
-        taken = f"the network takes {network.inputs}"
-        raise ValueError(f"the card's observation has {count} entries, {taken}")
+        raise ValueError(f"the card has {count} entries, the network takes {network.inputs}")
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -227,7 +219,12 @@ def load_policy(path: str | Path) -> Policy:
         FileNotFoundError: There is no such file.
         ValueError: The file is no policy of a known format, or card and tensors do not fit.
     """
-    file = _find_file(path)
+    file = _make_path(path)
+    if file.is_dir():
+        raise FileNotFoundError(f"policy {path} is a folder")
+    if not file.is_file():
+        unknown = describe_unknown("policy", [str(path)], list_shipped())
+        raise FileNotFoundError(f"there is no such file and {unknown}")
     tensors, metadata = _read_tensors(file)
     try:
         fields = _read_card_fields(metadata)
@@ -237,17 +234,6 @@ def load_policy(path: str | Path) -> Policy:
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     return Policy(file.stem, network, card)
-
-
-def _find_file(path: str | Path) -> Path:
-    """Find the file of a path or of a shipped policy's name."""
-    file = _make_path(path)
-    if file.is_dir():
-        raise FileNotFoundError(f"policy {path} is a folder")
-    if not file.is_file():
-        unknown = describe_unknown("policy", [str(path)], list_shipped())
-        raise FileNotFoundError(f"there is no such file and {unknown}")
-    return file
 
 
 def _read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:

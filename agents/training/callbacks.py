@@ -7,7 +7,7 @@ Where a training starts from a policy, each drive is weighted by 1 over that pol
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,33 +15,31 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ... import __version__
-from ...envs.io import atomic_file, write_atomic
+from ...envs.io import atomic_file, from_json, write_atomic
 from ...envs.numerics import require_extra
 from ...envs.record import Array
-from .. import zoo
-from ..learned.policy import Card, save_policy
+from ..learned.policy import Card, Policy, save_policy
 from ..rollout import compute_cost_ratios, evaluate_episodes
 from ..vec_env import make_native_env
 from .config import TrainingTask
 from .export import convert_sb3_policy
 from .normalise import StandardisedArguments
-from .warm_start import WarmStart
 
 with require_extra("train", "training needs {}"):
     import torch
+    import yaml
     from safetensors import SafetensorError, safe_open
     from safetensors.torch import save
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import KVWriter
-    from stable_baselines3.common.utils import get_device
+    from stable_baselines3.common.utils import get_device, get_latest_run_id
 
-Checkpoint = Mapping[str, Any]  # the state of a checkpoint, in JSON types
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
+EVALUATIONS = "evaluations.npz"  # in a folder of rl-baselines3-zoo
+_ZOO_WRAPPER = "sideslip.estimators.EstimateObservation"
 _FORMAT = 3  # of a checkpoint
 _VARIABLES = "variables"  # tensors of no module, such as the logarithm of an entropy's weight
-# Keys of a resumed training's state, besides the tensors.
-_STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
 _WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
 _MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
 _WEIGHT_SEEDS, _EVALUATION_SEEDS = 2**63, 2**64  # `TrainingTask` has those of its drives
@@ -71,7 +69,7 @@ class Progress(NamedTuple):
 
     steps: int  # so far
     cost: float | None  # mean of the newest episodes with exploration; None before one ends
-    evaluations: tuple[Evaluation, ...]  # so far
+    evaluations: list[Evaluation]  # so far
 
 
 @dataclass(frozen=True)
@@ -112,6 +110,19 @@ class RunRecord:
     begun_with: str = ""  # name of the initial policy, "" for none
 
 
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state of a training beside its tensors, in JSON types."""
+
+    groups: dict[str, Any]  # `param_groups` of each optimiser
+    sideslip: str  # version of the package
+    task: dict[str, Any]  # fields of `TrainingTask`
+    steps: int  # so far
+    aim: dict[str, Any]  # fields of `RunRecord`
+    scaling: list[Any]  # of the observations: `StandardisedArguments`
+    evaluations: list[Any]  # so far
+
+
 class EvalCallback(BaseCallback):
     """Evaluate the policy between rollouts, and save what a resumed training needs.
 
@@ -120,36 +131,43 @@ class EvalCallback(BaseCallback):
         folder: Folder of the training.
         run_options: Options of this run.
         steps: Steps of the whole training.
-        warm_start: What the training starts from; a policy's costs weigh the drives.
+        policy: Policy from which the training starts, whose costs weigh the drives.
         state: State of a checkpoint, None for a new training.
     """
 
+    scaling: StandardisedArguments  # of the model's observations, which `Trainer.build` sets
+
     def __init__(
         self, task: TrainingTask, folder: Path, run_options: RunOptions, steps: int,
-        warm_start: WarmStart | None = None, state: Checkpoint | None = None,
+        policy: Policy | None = None, state: Checkpoint | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.task, self.folder, self.run_options = task, folder, run_options
-        self.warm_start, self.policy = warm_start, warm_start.policy if warm_start else None
-        run = run_options.eval_freq, run_options.command
-        self.run_record = RunRecord(steps, *run, self.policy.name if self.policy else "")
+        self.task, self.folder, self.run_options, self.policy = task, folder, run_options, policy
+        name, frequency = policy.name if policy else "", run_options.eval_freq
+        self.run_record = RunRecord(steps, frequency, run_options.command, name)
         self.seeds = _make_evaluation_seeds(task.n_eval_envs)
-        self.env = warm_start.env if warm_start else task.vector_env(task.n_eval_envs)
+        self.env = task.vector_env(task.n_eval_envs)
         base: Any = self.env.unwrapped
         self.period = float(base.control_period * base.dt)  # of control (s)
-        self.evaluations = [Evaluation(*row) for row in (state or {}).get("evaluations", [])]
-        self.scaling: StandardisedArguments | None = None
+        self.evaluations = [Evaluation(*row) for row in state.evaluations] if state else []
         self.writers: list[KVWriter] = []  # further ones of the log
         uncontrolled = self._average_scenarios(evaluate_episodes(self.env, None, self.seeds)[0])
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
-        self.weights = np.ones(1) if self.policy else _compute_scenario_weights(task)
-        driver = warm_start.driver if warm_start else None
-        self.initial_costs = evaluate_episodes(self.env, driver, self.seeds)[0] if driver else None
+        self.weights, self.initial_costs = np.ones(1), None
+        if policy is None:
+            self.weights = _compute_scenario_weights(task)
+        else:
+            self.initial_costs = evaluate_episodes(self.env, policy.network, self.seeds)[0]
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
+
+    @property
+    def best(self) -> Evaluation:
+        """Evaluation whose model is saved."""
+        return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""
@@ -172,8 +190,7 @@ class EvalCallback(BaseCallback):
         if self.run_options.report is not None:
             rewards = [episode["r"] for episode in self.model.ep_info_buffer or ()]
             cost = -float(np.mean(rewards)) if rewards else None
-            steps, evaluations = self.model.num_timesteps, tuple(self.evaluations)
-            self.run_options.report(Progress(steps, cost, evaluations))
+            self.run_options.report(Progress(self.model.num_timesteps, cost, self.evaluations[:]))
 
     def check(self) -> None:
         """Check that the weights are finite; FloatingPointError otherwise."""
@@ -200,7 +217,8 @@ class EvalCallback(BaseCallback):
         self._save_checkpoint()
         lines = "".join(json.dumps(evaluation._asdict()) + "\n" for evaluation in self.evaluations)
         write_atomic(self.folder / CURVE, lines.encode())
-        zoo.write_evaluation(self.folder, self.task.env_id, self.model, costs, lengths)
+        if (self.folder / _make_zoo_name(self.task.env_id)).is_dir():
+            self._write_zoo_evaluation(costs, lengths)
         self.since = time.process_time()
 
     def _save_best(self, current: Evaluation) -> None:
@@ -223,9 +241,7 @@ class EvalCallback(BaseCallback):
             seeds={"training": task.seed, "from": task.first_seed},
             steps=current.steps, cpu_seconds=current.cpu_seconds,
         )  # fmt: skip
-        network = convert_sb3_policy(self.model)
-        network = self.warm_start.merge_network(network) if self.warm_start else network
-        save_policy(self.folder / POLICY, network, card)
+        save_policy(self.folder / POLICY, convert_sb3_policy(self.model), card)
         with atomic_file(self.folder / BEST) as file:
             self.model.save(file)
 
@@ -240,14 +256,27 @@ class EvalCallback(BaseCallback):
             else:
                 tensors |= {f"{part}/{name}": value for name, value in state.items()}
         tensors |= {f"{_VARIABLES}/{k}": value for k, value in self._get_variables().items()}
-        content = {
-            "format": _FORMAT, "groups": groups, "sideslip": __version__, "task": asdict(self.task),
-            "steps": self.model.num_timesteps, "aim": asdict(self.run_record),
-            "scaling": self.scaling, "evaluations": self.evaluations,
-        }  # fmt: skip
+        records = asdict(self.task), self.model.num_timesteps, asdict(self.run_record)
+        now = Checkpoint(groups, __version__, *records, list(self.scaling), self.evaluations)
         plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
-        text = json.dumps(content, allow_nan=False)
+        text = json.dumps({"format": _FORMAT} | vars(now), allow_nan=False)
         write_atomic(self.folder / CHECKPOINT, save(plain, {"checkpoint": text}))
+
+    def _write_zoo_evaluation(self, costs: Array, lengths: Array) -> None:
+        """Write the last model, and the costs and lengths as stable-baselines3's `EvalCallback`."""
+        # later evaluations in the file, of a training stopped before its checkpoint, are removed
+        with atomic_file(self.folder / f"{_make_zoo_name(self.task.env_id)}.zip") as file:
+            self.model.save(file)
+        evaluation: dict[str, Any] = {"timesteps": np.array([self.model.num_timesteps])}
+        evaluation |= {"results": -costs[None], "ep_lengths": lengths[None].astype(np.int64)}
+        path = self.folder / EVALUATIONS
+        if path.exists():
+            with np.load(path, allow_pickle=False) as saved:
+                before = saved["timesteps"] < self.model.num_timesteps
+                for name, values in evaluation.items():
+                    evaluation[name] = np.concatenate([saved[name][before], values])
+        with atomic_file(path) as file:
+            np.savez(file, **evaluation)
 
     def _get_variables(self) -> dict[str, torch.Tensor]:
         """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
@@ -257,7 +286,7 @@ class EvalCallback(BaseCallback):
         """Load the parameters and optimisers of the folder's checkpoint into the model."""
         path, variables = self.folder / CHECKPOINT, self._get_variables()
         parts: dict[str, Any] = {part: {} for part in self.model.get_parameters()}
-        groups = read_state(path)["groups"]
+        groups = read_checkpoint(path).groups
         parts |= {part: {"param_groups": group, "state": {}} for part, group in groups.items()}
         with safe_open(path, "pt") as file:
             for name in file.keys():  # noqa: SIM118  it is no mapping
@@ -272,27 +301,22 @@ class EvalCallback(BaseCallback):
         self.model.set_parameters(parts, device=self.model.device)
 
 
-def read_state(path: Path) -> Checkpoint:
-    """Read a training's state without the tensors; ValueError for no checkpoint of this format.
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint without the tensors; ValueError for a file that is none of this format.
 
     Args:
         path: Checkpoint.
     """
     try:
         with safe_open(path, "pt") as file:
-            text = (file.metadata() or {}).get("checkpoint")
+            state = json.loads((file.metadata() or {}).get("checkpoint", "null"))
     except SafetensorError as error:
         raise ValueError(f"{path} is no checkpoint, or is cut short: {error}") from None
-    try:
-        state: Any = {} if text is None else json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no checkpoint: its state is no JSON ({error})") from None
-    if not isinstance(state, dict) or state.get("format") != _FORMAT:
+    if not isinstance(state, dict) or state.pop("format", 0) != _FORMAT:
         raise ValueError(f"{path} is no checkpoint of this format ({_FORMAT})")
-    missing = sorted(_STATE - state.keys())
-    if missing:
-        raise ValueError(f"{path}: the checkpoint's state lacks {', '.join(missing)}")
-    return state
+    return from_json(Checkpoint, state, f"{path}: the checkpoint")
 
 
 def _compute_equal_weights(costs: Array) -> Array:
@@ -310,3 +334,47 @@ def _compute_scenario_weights(task: TrainingTask, first: int = _WEIGHT_SEEDS) ->
     costs, steps = evaluate_episodes(env, None, range(first, first + rows))
     rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
     return _compute_equal_weights(np.array(rates))
+
+
+def _make_zoo_name(env_id: str) -> str:
+    """Make the name of an env's files in rl-baselines3-zoo: a dash stands for the slash."""
+    return env_id.replace("/", "-")
+
+
+def find_zoo_folder(logs: Path, task: TrainingTask) -> Path:
+    """Find the next folder LOGS/ALGO/ENV_N in which the `enjoy` of rl-baselines3-zoo looks.
+
+    It will hold `best_model.zip`, `ENV.zip` (the last model), `evaluations.npz` and `ENV/`, which
+    `describe_for_zoo` makes.
+
+    Args:
+        logs: Folder of all trainings.
+        task: Task of the next one.
+    """
+    folder, name = logs / task.algorithm.zoo, _make_zoo_name(task.env_id)
+    return folder / f"{name}_{get_latest_run_id(str(folder), name) + 1}"
+
+
+def describe_for_zoo(task: TrainingTask, folder: Path, steps: int, eval_freq: int) -> None:
+    """Make a training's folder with the files that the zoo's `enjoy` reads before a model.
+
+    Args:
+        task: Task of the training; of a mixture `enjoy` drives the first scenario.
+        folder: Folder of `find_zoo_folder`.
+        steps: Steps of the training.
+        eval_freq: Steps between two evaluations.
+    """
+    first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+    arguments = {
+        "algo": task.algorithm.zoo, "env": task.env_id, "env_kwargs": task.env_options | first,
+        "eval_freq": eval_freq, "n_eval_envs": task.n_eval_envs, "n_timesteps": steps,
+        "seed": task.seed,
+    }  # fmt: skip
+    # the model has the scales: `enjoy` shall look for no VecNormalize
+    config = task.settings | {"n_envs": task.num_envs, "normalize": False}
+    if task.estimator_kwargs is not None:
+        config["env_wrapper"] = [{_ZOO_WRAPPER: task.estimator_kwargs}]
+    place = folder / _make_zoo_name(task.env_id)
+    place.mkdir(parents=True)
+    for file_name, content in (("config.yml", config), ("args.yml", arguments)):
+        write_atomic(place / file_name, yaml.safe_dump(content).encode())

@@ -14,8 +14,9 @@ from typing import Any
 
 from ...envs.numerics import require_extra
 from ...envs.scenarios.manoeuvres import make_scenario
-from ...envs.validation import check_choice, is_finite
+from ...envs.validation import check_choice, check_mapping, is_finite
 from ..env_info import CarVectorEnv
+from ..learned.policy import Policy
 from ..vec_env import make_native_env
 from .export import list_activations
 from .normalise import Standardised, StandardisedArguments
@@ -28,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
+WARM_START_ENTRY = "begun"  # the entry of training a policy further
 PERIOD = 0.01  # s, control period for which the files give `gamma`
 
 # Seeds of tests and of the calibration are below 2^63, those of `distill` beyond.
@@ -74,36 +76,24 @@ def get_algorithm(name: str) -> Algorithm:
     return ALGORITHMS[name]
 
 
-def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
-    """Read an environment's settings, or "default", from a file in rl-baselines3-zoo's format.
-
-    Args:
-        algo: Name of the algorithm.
-        env_id: Id of the env.
-        file: YAML file; None: the package's own.
-
-    Raises:
-        ValueError: The file is no such YAML, or has neither entry.
-    """
+def _read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
+    """Read an env's settings, or "default", of a YAML file, the package's own without one."""
     with require_extra("train", "settings need {}"):
         import yaml
     path = HYPERPARAMS / f"{get_algorithm(algo).zoo}.yml" if file is None else Path(file)
     try:
-        entries = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        entries = check_mapping("the file", yaml.safe_load(path.read_text()))
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path} is no YAML of settings: {text}") from None
-    if not isinstance(entries, dict):
-        raise ValueError(f"{path} is no YAML of settings: {{id: {{name: value}}}} is expected")
     key = env_id if env_id in entries else "default"
     if key not in entries:
         raise ValueError(f"{path} has no settings of {env_id}, and no 'default'")
-    settings = entries[key]
     try:
-        _check_settings(algo, settings)
+        _check_settings(algo, entries[key])
     except ValueError as error:
         raise ValueError(f"{path}, {key}: {error}") from None
-    return dict(settings)
+    return dict(entries[key])
 
 
 def _check_settings(algo: str, settings: object) -> None:
@@ -167,7 +157,7 @@ class TrainingTask:
     reads: list[str] = field(default_factory=list)  # entries that the network reads; empty: all
 
     def __post_init__(self) -> None:
-        settings = self.settings or read_settings(self.algo, self.env_id)
+        settings = self.settings or _read_settings(self.algo, self.env_id)
         _check_settings(self.algo, settings)
         object.__setattr__(self, "settings", settings)
         object.__setattr__(self, "num_envs", self.num_envs or settings["n_envs"])
@@ -181,9 +171,8 @@ class TrainingTask:
             if (count := getattr(self, name)) < 1:
                 raise ValueError(f"{name} is at least 1, got {count}")
             if count < len(self.scenarios):
-                text = f"{len(self.scenarios)} scenarios take as many environments"
-                rule = "an environment has one scenario for all its episodes"
-                raise ValueError(f"{rule}: {text}, got {name} {count}")
+                wanted = f"{len(self.scenarios)} scenarios take as many environments"
+                raise ValueError(f"{wanted}, got {name} {count}")
         if self.scenarios and "scenario" in self.env_options:
             text = f"and env_options have the scenario {self.env_options['scenario']!r}"
             raise ValueError(f"the scenarios of a mixture are {self.scenarios}, {text}")
@@ -266,3 +255,63 @@ class TrainingTask:
         kwargs["features_extractor_kwargs"] = scaling._asdict()
         options |= {"policy_kwargs": kwargs, "stats_window_size": env.num_envs}
         return self.algorithm.load()(self.settings["policy"], env, **options, **rest)
+
+
+def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
+    """Make the task of training a policy further, from its card and its network's form.
+
+    Args:
+        policy: Policy to train further.
+        fields: Fields of `TrainingTask` that replace the card's. `env_options` add to the card's, a
+            scenario there replaces its mixture, and another estimator drops the card's options.
+    """
+    card, changes = policy.card, fields.pop("env_options", {})
+    mixture = [] if "scenario" in changes else card.algorithm_options.get("scenarios", [])
+    options, scenarios = card.env_options | changes, fields.pop("scenarios", mixture)
+    if scenarios:
+        options.pop("scenario", None)
+    task_fields = dict[str, Any](env_id=card.env_id, env_options=options, scenarios=scenarios)
+    if fields.get("estimator", card.estimator) == card.estimator:
+        task_fields["estimator"] = card.estimator
+        task_fields["estimator_options"] = dict(card.estimator_options)
+    task_fields["settings"] = resolve_settings(None, fields.get("algo", "ppo"), card.env_id, policy)
+    return TrainingTask(**task_fields | fields)
+
+
+def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: object) -> Settings:
+    """Resolve the settings of an environment, or of training a policy further.
+
+    Args:
+        file: File of settings; None: the package's own.
+        algo: Name of the algorithm.
+        env_id: Id of the env.
+        start: Policy to train further, or anything else for a new training.
+    """
+    if not isinstance(start, Policy):
+        return _read_settings(algo, env_id, file)
+    settings, form = _read_settings(algo, WARM_START_ENTRY, file), get_policy_form(start, algo)
+    return settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
+
+
+def get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
+    """Get the `policy_kwargs` for a policy's network; ValueError where the algorithm has no such.
+
+    Args:
+        policy: Policy.
+        algo: Name of the algorithm.
+    """
+    network, on_tensors = policy.network, get_algorithm(algo).on_tensors
+    kinds = [cell.kind for cell in network.cells]
+    if algo != "ppo" and not on_tensors:
+        raise ValueError(f"{algo} begins with a zip, not with policy {policy.name}")
+    architecture = network.output, network.history, kinds
+    if architecture != ("linear", 1, ["gru"] if on_tensors else []):
+        needed = "a GRU" if on_tensors else "nothing"
+        text = f"dense layers without tanh at their end, {needed} before them and no older frames"
+        form = f"(output, history, cells) of {policy.name} are {architecture}"
+        raise ValueError(f"{algo} goes on from {text}; {form}")
+    if not on_tensors:
+        return {"net_arch": list(network.hidden), "activation_fn": network.activation}
+    if network.activation != "silu":
+        raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
+    return {"net_arch": list(network.hidden), "cells": network.cells[0].size}

@@ -24,6 +24,7 @@ from .student import Demonstrations, DistillConfig, Scaling, Student, compute_sc
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
+from torch.nn.utils.rnn import pad_sequence  # isort: skip
 
 _Drives = Sequence[Demonstrations]
 _DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`
@@ -59,38 +60,6 @@ class _Batch(NamedTuple):
     weights: torch.Tensor  # (B, T)
     curvatures: torch.Tensor  # (B, m, m)
     begins: bool  # whether the episodes begin with it
-
-
-def _imitate(
-    model: Student, tasks: Sequence[DistillTask], config: DistillConfig,
-    make_policy: Callable[[Scaling, RoundResult], Policy],
-) -> Policy:  # fmt: skip
-    """Let a model drive and learn in rounds; `make_policy` makes the one that drives the next."""
-    layout, needs, num_envs = tasks[0].cars.layout, tasks[0].teacher.needs, tasks[0].cars.num_envs
-    seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, num_envs)
-    policy: Policy | None = None
-    scaling: Scaling | None = None
-    drives, max_costs, steps = list[Demonstrations](), [np.inf] * len(tasks), 0
-    for i in range(config.rounds):
-        new_drives = []
-        for task, max_cost in zip(tasks, max_costs, strict=True):
-            first = next(seeds)
-            numbers, limits = range(first, first + task.cars.num_envs), (config.noise, max_cost)
-            new_drives.append(_collect_demonstrations(task, policy, numbers, *limits))
-        steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
-        if scaling is None:
-            scaling = model.fit_scaling(new_drives, layout, needs)
-            max_costs = [float(np.median(demo.costs)) for demo in new_drives]
-            privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
-            standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))
-        for demo in new_drives:
-            drives.append(demo._replace(privileged=standard.mix_inputs(demo.privileged)))
-        epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
-        loss = _fit_model(model, drives, scaling, config, epochs)
-        mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
-        policy = make_policy(scaling, RoundResult(steps, mean_cost, loss))
-    assert policy is not None
-    return policy
 
 
 def _collect_demonstrations(
@@ -156,9 +125,6 @@ def distill(
         path: Path that ends in `.safetensors`.
         report: Function that is called after each round.
 
-    Returns:
-        Policy of the last round: equal bits for equal arguments.
-
     Raises:
         ValueError: There is no task, or `auxiliary_weight` where the student sees everything.
     """
@@ -171,16 +137,34 @@ def distill(
     torch.manual_seed(config.seed)
     start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
     model = Student(len(cars.layout), cars.single_action_space.shape[0], config, n_privileged)
-
-    def save_round(scaling: Scaling, result: RoundResult) -> Policy:
+    seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, cars.num_envs)
+    policy: Policy | None = None
+    scaling: Scaling | None = None
+    drives, max_costs, steps = list[Demonstrations](), [np.inf] * len(tasks), 0
+    for i in range(config.rounds):
+        new_drives = []
+        for task, max_cost in zip(tasks, max_costs, strict=True):
+            first = next(seeds)
+            numbers, limits = range(first, first + task.cars.num_envs), (config.noise, max_cost)
+            new_drives.append(_collect_demonstrations(task, policy, numbers, *limits))
+        steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
+        if scaling is None:
+            scaling = model.fit_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
+            max_costs = [float(np.median(demo.costs)) for demo in new_drives]
+            privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
+            standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))
+        for demo in new_drives:
+            drives.append(demo._replace(privileged=standard.mix_inputs(demo.privileged)))
+        epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
+        loss = _fit_model(model, drives, scaling, config, epochs)
         cpu_seconds = round(time.process_time() - start_time, 1)
-        numbers = replace(card, steps=result.steps, cpu_seconds=cpu_seconds)
-        policy = Policy(target.stem, model.network(scaling), numbers)
+        new_card = replace(card, steps=steps, cpu_seconds=cpu_seconds)
+        policy = Policy(target.stem, model.network(scaling), new_card)
         save_policy(target, policy.network, policy.card)
-        report(result)
-        return policy
-
-    return _imitate(model, tasks, config, save_round)
+        mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
+        report(RoundResult(steps, mean_cost, loss))
+    assert policy is not None  # there is a round at least
+    return policy
 
 
 class _EpisodeBatches:
@@ -194,20 +178,17 @@ class _EpisodeBatches:
         self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
 
     def __iter__(self) -> Iterator[_Batch]:
-        names = ("obs", "labels", "privileged", "weights")
         for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
             rows = [self.episodes[int(i)] for i in chosen]
-            longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
-            shapes = [getattr(self.drives[0], name).shape[2:] for name in names]
-            arrays = [np.zeros((len(rows), longest, *shape), np.float32) for shape in shapes]
-            for row, (i, j) in enumerate(rows):
-                length = self.drives[i].weights.shape[1]
-                for array, name in zip(arrays, names, strict=True):
-                    array[row, :length] = getattr(self.drives[i], name)[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays[0] = self.scaling.mix_inputs(arrays[0])
-            for start in range(0, longest, self.window):
-                z, y, q, w = (torch.from_numpy(a[:, start : start + self.window]) for a in arrays)
+            columns = [
+                [torch.from_numpy(getattr(self.drives[i], name)[j]) for i, j in rows]
+                for name in ("obs", "labels", "privileged", "weights")
+            ]
+            parts = [pad_sequence(column, batch_first=True) for column in columns]
+            parts[0] = torch.from_numpy(self.scaling.mix_inputs(parts[0].numpy()))
+            for start in range(0, parts[0].shape[1], self.window):
+                z, y, q, w = (part[:, start : start + self.window] for part in parts)
                 yield _Batch(z, y, q, w, S, start == 0)
 
 

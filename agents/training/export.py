@@ -8,7 +8,6 @@ import json
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,8 +21,7 @@ from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_info import AnyEnv, CarEnv, get_env_facts
-from ..learned.forward import ACTIVATIONS, RecurrentCell
-from ..learned.network import SUFFIX, Network
+from ..learned.network import ACTIVATIONS, Network, RecurrentCell
 from ..learned.policy import Card, Policy, save_policy
 from ..vec_env import get_scales, scale_layout
 
@@ -75,9 +73,8 @@ def convert_sb3_policy(
             cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ mixing)
         else:
             weights[0] = weights[0] @ mixing
-    activation = activations[0] if activations else "tanh"
-    output = "tanh" if actor.squashed else output
-    return Network(mean, scale, weights, biases, activation, output, clip, history, cells)
+    kinds = activations[0] if activations else "tanh", "tanh" if actor.squashed else output
+    return Network(mean, scale, weights, biases, *kinds, clip, history, cells)
 
 
 class _Actor(NamedTuple):
@@ -89,14 +86,14 @@ class _Actor(NamedTuple):
     recurrent: "nn.RNNBase | None" = None
 
 
-_POLICIES = (
+_POLICIES = (  # classes; a subclass may compute anything and is none of them
     "stable_baselines3.common.policies.ActorCriticPolicy",
     "stable_baselines3.sac.policies.SACPolicy",
     "stable_baselines3.td3.policies.TD3Policy",
     "sb3_contrib.tqc.policies.TQCPolicy",
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy",
     f"{__package__}.gradient.GruPolicy",
-)  # classes of policies; a subclass may compute anything and is none of them
+)
 
 
 def _check_known(kind: type) -> None:
@@ -130,11 +127,8 @@ def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
         return []
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
         raise ValueError(f"recurrent layers with further arguments are not known: {module}")
-    cells, names = list[RecurrentCell](), ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    for i in range(module.num_layers):
-        arrays = (_to_array(getattr(module, f"{name}_l{i}")) for name in names)
-        cells.append(RecurrentCell(module.mode.lower(), *arrays))
-    return cells
+    layers = [map(_to_array, weights) for weights in module.all_weights]  # as `CELL_WEIGHTS`
+    return [RecurrentCell(module.mode.lower(), *arrays) for arrays in layers]
 
 
 def _to_array(parameter: "Tensor") -> Array:
@@ -219,13 +213,8 @@ def export_zip(
         trust: Whether code in the zip may run.
         normalise: Pickle of VecNormalize, as for `policy_from_zip`.
         **about: Other fields of the policy's `Card`, such as the estimator of the training.
-
-    Raises:
-        ValueError: The target has another ending.
     """
     check_trusted(Path(path), trust)
-    if Path(target).suffix != SUFFIX:
-        raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     about |= {"env_id": env_id, "env_options": dict(env_options or {})}
     env: CarEnv = gym.make(env_id, **about["env_options"])
     if about.get("estimator"):
@@ -237,14 +226,11 @@ def export_zip(
 
 
 def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | None:
-    """Find the pickle of a zip's VecNormalize.
+    """Find the pickle of a zip's VecNormalize; None without one.
 
     Args:
         path: Path of the zip.
         normalise: Path of the pickle; None: one beside the zip, if there is one.
-
-    Returns:
-        Path of the pickle, None without one.
     """
     if normalise is not None:
         return Path(normalise)
@@ -254,14 +240,11 @@ def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | N
 
 
 def check_trusted(file: Path, trust: bool) -> None:
-    """Check that a file is a zip of stable-baselines3, and that it may be unpickled.
+    """Check that a file is a zip of stable-baselines3; PermissionError where it is not trusted.
 
     Args:
         file: Path of the zip.
         trust: Whether code in the zip may run.
-
-    Raises:
-        PermissionError: `trust` is False.
     """
     check_zip(file)
     if not trust:
@@ -307,8 +290,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
     except Exception as error:  # a pickle raises what its maker wrote
         text = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{file} cannot be read: {text}") from error
-    lacking = [name for name in _NEEDED if name not in (content or {})]
-    if lacking:
+    if lacking := [name for name in _NEEDED if name not in (content or {})]:
         raise ValueError(f"{file} is no zip of stable-baselines3: no {', '.join(lacking)} in it")
     return content or {}, (weights or {})["policy"]
 
@@ -380,17 +362,7 @@ def _match_frames(
         if space == make_space(scale_layout(layout), frames):
             return frames, get_scales(layout).astype(np.float64)
     raise ValueError(
-        f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
-        f"observation here has {len(layout)}: {', '.join(entry.name for entry in layout)}. An "
-        "export (`sideslip export`) reads its entries by name and drives a wider observation too"
+        f"{file} was trained on other entries or bounds, {space.shape[0]} numbers; the observation "
+        f"here has {len(layout)}: {', '.join(entry.name for entry in layout)}. Say the id, and the "
+        "estimator, of its training; an export (`sideslip export`) drives a wider observation too"
     )
-
-
-def _describe_matching_env(space: gym.Space[Any]) -> str:
-    """Describe the registered env that has this observation, if there is one."""
-    for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
-        with suppress(ModuleNotFoundError):  # of an extra
-            layout = get_env_facts(gym.make(env_id)).layout
-            if space == make_space(layout):
-                return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
-    return " that no environment here has by itself (with an estimator, say which)"

@@ -5,7 +5,6 @@ propagated back through all of it to the weights: truncated back-propagation thr
 the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from .normalise import RewardScale, Standardised
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
+from stable_baselines3.common.torch_layers import create_mlp  # isort: skip
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # isort: skip
 from torch import nn  # isort: skip
 
@@ -51,10 +51,8 @@ class GruPolicy(BasePolicy):
         super().__init__(observation_space, action_space, **options)
         self.features_extractor = self.make_features_extractor()
         self.cell = nn.GRU(self.features_extractor.features_dim, cells)
-        sizes, layers = (cells, *net_arch, action_space.shape[0]), list[nn.Module]()
-        for inputs, outputs in itertools.pairwise(sizes):
-            layers += [nn.Linear(inputs, outputs), nn.SiLU()]
-        self.layers = nn.Sequential(*layers[:-1])
+        layers = create_mlp(cells, action_space.shape[0], [*net_arch], nn.SiLU)
+        self.layers = nn.Sequential(*layers)
         with torch.no_grad():
             list(self.layers.parameters())[-2].mul_(0.1)  # small first actions: others teach little
         # betas as in Xu et al.: a shorter memory than Adam's defaults
@@ -80,16 +78,13 @@ class GruPolicy(BasePolicy):
         self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:  # fmt: skip
-        """Compute deterministic actions within [-1, 1] and the next state.
+        """Compute deterministic actions (m,) or (N, m) within [-1, 1], and the next state.
 
         Args:
             observation: Observation, shape (k,) or (N, k).
             state: State from the last call; None at the start.
             episode_start: Rows whose state is cleared, shape (N,).
             deterministic: Without effect.
-
-        Returns:
-            Actions, shape (m,) or (N, m), and the next state for the next call.
         """
         obs_tensor, is_single = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
         before = self._begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
@@ -103,14 +98,6 @@ class GruPolicy(BasePolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
         return self(observation, self._begin(len(observation)))[0]
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
-        parameters: dict[str, Any] = super()._get_constructor_parameters()
-        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
-        for name in ("features_extractor_class", "features_extractor_kwargs"):
-            parameters[name] = getattr(self, name)
-        return parameters | {"lr_schedule": self._dummy_schedule}
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
@@ -126,9 +113,6 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         policy_kwargs: Arguments of the policy.
         _init_setup_model: As in stable-baselines3.
         **options: Arguments of `BaseAlgorithm`, such as the seed of the weights.
-
-    Raises:
-        ValueError: `n_steps` is below 1.
     """
 
     policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3

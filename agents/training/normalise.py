@@ -69,13 +69,10 @@ class Standardised(FlattenExtractor):
         return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Standardise observations.
+        """Standardise and mix observations, shape (N, k).
 
         Args:
             observations: Observations, shape (N, k).
-
-        Returns:
-            Standardised and mixed observations, shape (N, k).
         """
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
@@ -115,14 +112,13 @@ class RewardScale:
     """
 
     def __init__(self, drive_scales: Sequence[Sequence[float]]) -> None:
-        self._drive_scales, self._drive = drive_scales, np.zeros(len(drive_scales), np.intp)
-        self.now = np.zeros(len(drive_scales), np.float32)  # present factors
+        self._drive_scales = drive_scales
         self.begin()
 
     def begin(self) -> None:
         """Start every car's first drive."""
-        self._drive[:] = -1
-        self.start_next_drives(np.ones(len(self._drive), np.bool_))
+        self._drive = [0] * len(self._drive_scales)
+        self.now = np.array([scales[0] for scales in self._drive_scales], np.float32)  # factors
 
     def start_next_drives(self, rows: npt.NDArray[np.bool_]) -> None:
         """Start the next drive of some cars.
@@ -132,8 +128,7 @@ class RewardScale:
         """
         for i in np.flatnonzero(rows).tolist():
             self._drive[i] += 1
-            scales = self._drive_scales[i]
-            self.now[i] = scales[min(self._drive[i], len(scales) - 1)]
+            self.now[i] = self._drive_scales[i][: self._drive[i] + 1][-1]
 
 
 class RewardScaleWrapper(VecEnvWrapper):

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry
-from ..learned.forward import MemoryLayer, MovingAverages, RecurrentCell
-from ..learned.network import Network
+from ..learned.network import MemoryLayer, MovingAverages, Network, RecurrentCell
 
 with require_extra("train", "distillation needs torch"):
     import torch
@@ -29,36 +28,30 @@ _UNREAD = ("gps_X", "gps_Y", "gps_satellites")  # without information for contro
 # Beginnings of entries that a filter has read: behind it they would only shake the action.
 _FILTERED = ("gyro", "accel_", "roll_rate", "camera_", "gps_")
 _MIN_SPREAD = 1e-9  # standard deviation below which an input counts as constant
-_MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
+_MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs
 _MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
 _TIMES = (3, 10, 30, 100, 300)  # steps, of 10 ms each: from the motors' lag to half a drive
-SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
+_SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
 _BLOCK = 50  # steps whose means are one product of matrices
 _MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
 
 
 def compute_scale(spread: Array) -> Array:
-    """Compute the inverse of each standard deviation, zero where nothing varies.
+    """Compute the inverse of each standard deviation, shape (k,), zero where nothing varies.
 
     Args:
         spread: Standard deviations, shape (k,).
-
-    Returns:
-        Factors, shape (k,).
     """
     return np.where(spread > _MIN_SPREAD, 1.0 / np.maximum(spread, _MIN_SPREAD), 0.0)
 
 
-def compute_whitening(z: npt.NDArray[np.floating], minimum: float) -> Array:
-    """Compute the symmetric whitening of samples, ZCA (Bell and Sejnowski 1997).
+def compute_whitening(z: npt.NDArray[np.floating], minimum: float = _MIN_VARIANCE) -> Array:
+    """Compute the symmetric whitening (k, k) of samples, ZCA (Bell and Sejnowski 1997).
 
     Args:
         z: Samples, shape (n, k).
         minimum: Value that the covariance's lower eigenvalues count as.
-
-    Returns:
-        Matrix, shape (k, k).
     """
     sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
     return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)
@@ -88,13 +81,10 @@ class Scaling(NamedTuple):
     mixing: Array | None = None  # whitening, shape (k, k), which scales up small differences
 
     def mix_inputs(self, obs: Single) -> Single:
-        """Compute the inputs of a network.
+        """Compute the inputs of a network, shape (..., k).
 
         Args:
             obs: Observations, shape (..., k).
-
-        Returns:
-            Inputs, shape (..., k).
         """
         mean, scale = self.mean.astype(np.float32), self.scale.astype(np.float32)
         z: Single = np.clip((obs - mean) * scale, -_CLIP, _CLIP)
@@ -120,7 +110,7 @@ def _compute_scaling(
             if median > early:
                 mean[i], spread[i] = median, median - early
     plain = Scaling(mean, np.where(is_read, compute_scale(spread), 0.0))
-    return plain._replace(mixing=compute_whitening(plain.mix_inputs(x), _MIN_VARIANCE))
+    return plain._replace(mixing=compute_whitening(plain.mix_inputs(x)))
 
 
 @dataclass(frozen=True)
@@ -213,7 +203,7 @@ class _TraceLayer(nn.Module):
         with torch.no_grad():
             for demo in drives:
                 linear_part = self(torch.from_numpy(scaling.mix_inputs(demo.obs)))[0][..., :size]
-                outputs.append(linear_part[torch.from_numpy(demo.is_valid)][::SAMPLE_STRIDE])
+                outputs.append(linear_part[torch.from_numpy(demo.is_valid)][::_SAMPLE_STRIDE])
         linear = torch.cat(outputs).numpy()
         self.mean.copy_(torch.from_numpy(linear.mean(0)))
         self.mixing.copy_(torch.from_numpy(compute_whitening(linear, _MIN_TRACE_VARIANCE)))
@@ -315,9 +305,6 @@ class Student(nn.Module):
 
         Args:
             scaling: Scaling of the inputs.
-
-        Returns:
-            Network of the actions, by NumPy.
         """
         mean, scale, mixing = scaling
         mixing = np.eye(len(mean)) if mixing is None else mixing

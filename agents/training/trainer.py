@@ -5,67 +5,64 @@ its card), `best_model.zip` (the same model in stable-baselines3's format), `cur
 evaluations), and `begun_with.safetensors` where it started from a policy.
 """
 
+import json
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 
 from ... import __version__
 from ...envs.io import from_json
 from ...envs.record import Array
+from ...envs.task import ObservationEntry, make_space
 from ..env_info import CarVectorEnv, get_layout
-from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
+from ..learned.network import CELL_WEIGHTS
+from ..learned.policy import Policy, check_names_no_code, load_policy, save_policy
 from ..rollout import COST_FLOOR
-from ..vec_env import make_vec_env
+from ..vec_env import get_scales, make_vec_env, scale_layout
 from .callbacks import (
     CHECKPOINT,
     WARM_START_FILE,
     Checkpoint,
     EvalCallback,
-    Evaluation,
     RunOptions,
     RunRecord,
-    read_state,
+    read_checkpoint,
 )
-from .config import TrainingTask
-from .export import check_zip
-from .normalise import CLIP, RewardScale, RewardScaleWrapper, StandardisedArguments
-from .student import compute_whitening
-from .warm_start import WarmStart
+from .config import TrainingTask, get_policy_form
+from .export import check_zip, load_normaliser
+from .normalise import (
+    CLIP,
+    RewardScale,
+    RewardScaleWrapper,
+    StandardisedArguments,
+    read_normalisation,
+)
+from .student import compute_scale, compute_whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 if TYPE_CHECKING:
     from .. import Agent
     from .gradient import TrainingSource
 
+_GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
-_MIN_VARIANCE = 1e-3  # least variance of a mixture of standardised entries
-_CONSTANT = 1e-9  # standard deviation, in an entry's unit, up to which it is not read
 _UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
-
-
-class TrainResult(NamedTuple):
-    """The last model, and all evaluations."""
-
-    model: BaseAlgorithm
-    evaluations: tuple[Evaluation, ...]
-
-    @property
-    def best(self) -> Evaluation:
-        """Evaluation whose model is saved."""
-        return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
 
 class SavedTraining(NamedTuple):
@@ -74,7 +71,7 @@ class SavedTraining(NamedTuple):
     folder: Path
     task: TrainingTask
     record: RunRecord
-    state: Checkpoint  # of its checkpoint
+    state: Checkpoint
 
     def load_initial_policy(self) -> Policy | None:
         """Load the policy that it started from, under its own name; None for another training."""
@@ -100,16 +97,11 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
-    state = read_state(path)
-    saved, version = state["task"], state["sideslip"]
-    if version != __version__:
-        text = f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs"
-        raise ValueError(f"{text} may be others: train anew, in another folder")
-    names = [item.name for item in fields(TrainingTask)]  # a default for none of them
-    missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
-    if missing:
-        raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
-    task = from_json(TrainingTask, saved, f"{path}: the task")
+    state = read_checkpoint(path)
+    if state.sideslip != __version__:
+        text = f"{path} was made by sideslip {state.sideslip}, this is {__version__}, whose cars"
+        raise ValueError(f"{text} and costs may be others: train anew, in another folder")
+    task = from_json(TrainingTask, state.task, f"{path}: the task")
     try:
         check_names_no_code(task.env_id, task.estimator, task.estimator_options)
     except ValueError as error:
@@ -118,8 +110,86 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         if value != getattr(task, name):
             text = f"{path} is of {name} {getattr(task, name)!r}, not {value!r}"
             raise ValueError(f"{text}: train that in another folder")
-    record = from_json(RunRecord, state["aim"], f"{path}: the aim")
+    record = from_json(RunRecord, state.aim, f"{path}: the aim")
     return SavedTraining(Path(folder), task, record, state)
+
+
+def _is_scaled(file: Path, layout: Sequence[ObservationEntry]) -> bool:
+    """Return whether a zip was trained on `ScaledVecEnv`, by its space as JSON has it."""
+    with ZipFile(file) as archive:
+        space = json.loads(archive.read("data")).get("observation_space", {})
+    return bool(space.get("low") == str(make_space(scale_layout(layout)).low))
+
+
+class _WarmStart(NamedTuple):
+    """The tensors with which a model begins."""
+
+    name: str  # of the zip or the policy
+    parameters: dict[str, Any]  # as of `get_parameters`; of a policy the actor's alone
+    scaling: StandardisedArguments  # of the model's observations
+    variables: dict[str, Any] = {}  # noqa: RUF012  a zip's tensors of no module
+
+    @classmethod
+    def from_zip(cls, file: Path, task: TrainingTask, trust: bool) -> "_WarmStart":
+        """Read a zip without running code from it; ValueError where it cannot be read."""
+        try:
+            _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
+            parameters = dict[str, Any](loaded)
+            policy = parameters["policy"]
+        except Exception as error:  # torch raises many for one that is cut short
+            raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+        inner = [name for name in policy if "features_extractor." in name]
+        buffers = {name.rpartition(".")[2]: policy[name].tolist() for name in inner}
+        if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
+            clip = buffers["clip"] if buffers["clip"] < math.inf else None
+            numbers = buffers["mean"], buffers["scale"], clip, buffers.get("mixing")
+        else:
+            layout = get_layout(task.vector_env(1))
+            mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
+            scales = get_scales(layout) if _is_scaled(file, layout) else np.ones(len(layout))
+            numbers = (mean * scales).tolist(), (scale / scales).tolist(), clip, None
+        return cls(str(file), parameters, StandardisedArguments(*numbers), variables or {})
+
+    @classmethod
+    def from_policy(cls, policy: Policy, task: TrainingTask) -> "_WarmStart":
+        """Read a policy's actor; ValueError where the task's observation or form is another."""
+        network, entries = policy.network, [name for name, _ in policy.card.observation]
+        names = [entry.name for entry in get_layout(task.vector_env(1))]
+        if entries != names:
+            known, here = ", ".join(entries), ", ".join(names)
+            raise ValueError(f"{policy.name} reads {known}; here there is {here}")
+        form, kwargs = get_policy_form(policy, task.algo), task.settings.get("policy_kwargs", {})
+        if kwargs != kwargs | form:
+            text = f"{policy.name} is a network of {form}"
+            raise ValueError(f"{text}, and the settings say {kwargs}")
+        if task.algorithm.on_tensors:
+            cell = network.cells[0]
+            arrays = dict(zip(_GRU, (getattr(cell, part) for part in CELL_WEIGHTS), strict=True))
+            layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
+        else:
+            arrays, hidden = {}, range(len(network.hidden))
+            layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in hidden), "action_net"]
+        for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
+            arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
+        tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
+        numbers = network.mean.tolist(), network.scale.tolist(), network.clip
+        return cls(policy.name, {"policy": tensors}, StandardisedArguments(*numbers))
+
+    def load(self, model: BaseAlgorithm) -> None:
+        """Load the tensors into a model; ValueError where it has other ones."""
+        before = model.get_parameters()
+        policy = before["policy"]
+        if len(self.parameters) > 1:  # a zip, which from elsewhere has its extractor outside
+            policy = {name: x for name, x in policy.items() if "features_extractor." in name}
+        parameters = before | self.parameters | {"policy": policy | self.parameters["policy"]}
+        try:
+            model.set_parameters(parameters, device=model.device)
+            for name, tensor in self.variables.items():
+                getattr(model, name).data.copy_(tensor)
+        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+            text = f"{self.name} holds other networks than this training's {type(model).__name__}"
+            reason = " ".join(str(error).split())[:300]
+            raise ValueError(f"{text} (its settings say which): {reason}") from error
 
 
 @dataclass
@@ -140,9 +210,9 @@ class Trainer:
     folder: str | Path
     resume: bool = False  # whether to resume from the folder's checkpoint
     run_options: RunOptions = field(default_factory=RunOptions)
-    # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy` or
-    # its name, whose costs weigh the drives
-    trained_agent: str | Path | Policy | None = None
+    # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy`,
+    # whose costs weigh the drives
+    trained_agent: Path | Policy | None = None
     trust: bool = False  # whether a pickle of VecNormalize beside the zip may be read
 
     def __post_init__(self) -> None:
@@ -153,11 +223,8 @@ class Trainer:
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if agent is not None and self.task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if agent is not None and not isinstance(agent, Policy):
-            if is_policy(str(agent)):
-                self.trained_agent = load_policy(agent)
-            else:
-                check_zip(Path(agent))
+        if isinstance(agent, Path):
+            check_zip(agent)
         if self.run_options.tensorboard_log is not None and find_spec("tensorboard") is None:
             raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
         try:
@@ -175,8 +242,8 @@ class Trainer:
         else:
             self._folder.mkdir(parents=True, exist_ok=True)
 
-    def train(self) -> TrainResult:
-        """Train up to the number of steps; the model and its evaluations."""
+    def train(self) -> EvalCallback:
+        """Train up to the number of steps; the callback has the model and its evaluations."""
         callback, file = self.build(), self._folder / WARM_START_FILE
         policy, model, run = callback.policy, callback.model, None
         if self._state is None:
@@ -199,25 +266,28 @@ class Trainer:
             finally:
                 if run is not None:
                     run.finish()
-        return TrainResult(model, tuple(callback.evaluations))
+        return callback
 
     def build(self) -> EvalCallback:
         """Build the callback with its model, new or from a checkpoint, a zip or a policy."""
         task, agent, state = self.task, self.trained_agent, self._state
-        start = None if agent is None else WarmStart(agent, task, self.trust)
-        callback = EvalCallback(task, self._folder, self.run_options, self.steps, start, state)
-        steps = int(state["steps"]) if state else 0
-        if state and state["scaling"] is not None:
-            callback.scaling = StandardisedArguments(*state["scaling"])
+        policy, start = None, None
+        if isinstance(agent, Policy):
+            policy, start = agent, _WarmStart.from_policy(agent, task)
+        elif agent is not None:
+            start = _WarmStart.from_zip(agent, task, self.trust)
+        callback = EvalCallback(task, self._folder, self.run_options, self.steps, policy, state)
+        steps = state.steps if state else 0
+        if state:
+            callback.scaling = StandardisedArguments(*state.scaling)
         else:
-            callback.scaling = start.scaling if start and not state else _measure_scaling(task)
-        options = dict[str, Any](wrapper_class=start.wrap_env if start else None, scaled=False)
-        options |= {"estimator": task.estimator_kwargs, "env_kwargs": task.options(task.num_envs)}
-        env = make_vec_env(task.env_id, task.num_envs, **options)
+            callback.scaling = start.scaling if start else _measure_scaling(task)
+        options = dict[str, Any](env_kwargs=task.options(task.num_envs), scaled=False)
+        env = make_vec_env(task.env_id, task.num_envs, None, task.estimator_kwargs, **options)
         first, period = task.first_seed + steps, callback.period
-        if start and start.driver:
+        if policy:
             n_steps = -(-(self.steps - steps) // env.num_envs)
-            scales = _measure_reward_scale(start.driver, env, first, n_steps)
+            scales = _measure_reward_scale(policy.network, env, first, n_steps)
         else:
             scales = (np.resize(callback.weights, env.num_envs) / period)[:, None].tolist()
         scaled_env = RewardScaleWrapper(env, RewardScale(scales))
@@ -261,18 +331,16 @@ def _measure_scaling(task: TrainingTask) -> StandardisedArguments:
         lacking, available = ", ".join(unknown), ", ".join(names)
         raise ValueError(f"the observation has no {lacking} to read; it has {available}")
     samples = _collect_observations(env, spread, task.scaling_seed)
-    deviation = samples.std(axis=0)
-    varies = deviation > _CONSTANT
+    scale = compute_scale(samples.std(axis=0))
     if task.reads:
-        varies &= np.isin(names, task.reads)
-    if not varies.any():
+        scale[~np.isin(names, task.reads)] = 0.0
+    if not scale.any():
         raise ValueError(f"nothing of what the network reads varies within {_DURATION:g} s")
-    scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
     mean, mixing = samples.mean(axis=0), None
     if task.algorithm.on_tensors:
         correlated = _collect_observations(env, spread, task.scaling_seed, _CORRELATION_TIME)
         standard = np.clip((correlated - mean) * scale, -CLIP, CLIP)
-        mixing = compute_whitening(standard, _MIN_VARIANCE).tolist()
+        mixing = compute_whitening(standard).tolist()
     return StandardisedArguments(mean.tolist(), scale.tolist(), CLIP, mixing)
 
 

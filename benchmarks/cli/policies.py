@@ -5,7 +5,7 @@ import shutil
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -21,9 +21,9 @@ from .options import File, Text, Texts, check_file, parse_options, register, tak
 if TYPE_CHECKING:
     from ...agents.learned.network import Network
     from ...agents.learned.policy import Policy
+    from ...agents.training.callbacks import EvalCallback
     from ...agents.training.callbacks import Progress as TrainingProgress
     from ...agents.training.config import TrainingTask
-    from ...agents.training.trainer import TrainResult
 
 EPISODES = 256  # of a policy's test
 
@@ -247,11 +247,16 @@ class _Train:
 
     def run(self) -> None:
         announce_torch()
-        from ...agents.learned.policy import Policy, load_policy
+        from ...agents.learned.policy import load_policy
         from ...agents.training import trainer
-        from ...agents.training.callbacks import CURVE, POLICY, RunOptions, RunRecord
-        from ...agents.training.config import TrainingTask
-        from ...agents.training.warm_start import resolve_settings
+        from ...agents.training.callbacks import (
+            CURVE,
+            POLICY,
+            RunOptions,
+            RunRecord,
+            describe_for_zoo,
+        )
+        from ...agents.training.config import TrainingTask, resolve_settings
         from ..studies.policies import prepare_start, record_evaluation
 
         chosen = {item.name: getattr(self, item.name, None) for item in fields(TrainingTask)}
@@ -266,8 +271,6 @@ class _Train:
         if varied and resume:
             raise ValueError(f"--varied {varied} is for a new training: an old one keeps its tasks")
         agent, new = prepare_start(self.trained_agent, varied)
-        if logs is not None and isinstance(agent, Policy) and agent.network.memory:
-            raise ValueError(f"the zoo's `enjoy` drives nothing with memory as {agent.name}: --out")
         task = trainer.read_training(out).task if resume and out else new(**options)
         start = self.trained_agent.stem if self.trained_agent else ""
         folder = _choose_folder(task, start, out, logs)
@@ -291,7 +294,7 @@ class _Train:
             logged = self.tensorboard_log, show, command, project
             run_options = RunOptions(eval_freq, self.device, *logged)
             if logs is not None:
-                _describe_for_zoo(task, folder, steps, eval_freq)
+                describe_for_zoo(task, folder, steps, eval_freq)
             try:
                 training = task, steps, folder, resume, run_options, agent, self.trust
                 trained = trainer.Trainer(*training).train()
@@ -312,7 +315,7 @@ class _Train:
         print_written(console, folder / POLICY, folder / CURVE)
 
 
-def _make_table(trained: "TrainResult") -> Table:
+def _make_table(trained: "EvalCallback") -> Table:
     table = Table("steps", "CPU-s", "cost", "of none's", "of its start's")
     for evaluation in trained.evaluations:
         mark = " best" if evaluation is trained.best else ""
@@ -338,26 +341,14 @@ def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Pat
     if logs is not None:
         if out is not None:
             raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")
-        from ...agents import zoo
+        from ...agents.training.callbacks import find_zoo_folder
 
         if task.algorithm.on_tensors:
             raise ValueError(f"rl-baselines3-zoo has no {task.algo}: its folder is no use")
-        return zoo.find_next_folder(logs, task.algorithm.zoo, task.env_id)
+        return find_zoo_folder(logs, task)
     if out is not None:
         return out
     options = [x if isinstance(x, str) else name for name, x in task.env_options.items()]
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
-
-
-def _describe_for_zoo(task: "TrainingTask", folder: Path, steps: int, eval_freq: int) -> None:
-    """Make a folder of `_choose_folder` with the files of the zoo's `enjoy`."""
-    from ...agents import zoo
-
-    first = {"scenario": task.scenarios[0]} if task.scenarios else {}
-    arguments = dict[str, Any](algo=task.algorithm.zoo, env=task.env_id)
-    arguments |= {"env_kwargs": task.env_options | first, "eval_freq": eval_freq}
-    arguments |= {"n_eval_envs": task.n_eval_envs, "n_timesteps": steps, "seed": task.seed}
-    settings = task.settings | {"n_envs": task.num_envs}
-    zoo.describe(folder, settings, task.estimator_kwargs, arguments)

@@ -302,8 +302,7 @@ def prepare_start(
     Raises:
         ValueError: Tasks vary, but the policy is of no class.
     """
-    from ...agents.training.config import TrainingTask, get_algorithm
-    from ...agents.training.warm_start import make_finetune_task
+    from ...agents.training.config import TrainingTask, get_algorithm, make_finetune_task
 
     policy = load_policy(agent) if agent is not None and is_policy(str(agent)) else None
     kind = policy.card.algorithm_options.get("class") if policy else None

@@ -23,7 +23,7 @@ from sideslip.benchmarks.studies.policies import (
     prepare_start,
 )
 from sideslip.envs.vehicle.parameters import VEHICLES
-from tests.policies import GRU, TRACES
+from tests.policies import GRU
 
 
 def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
@@ -168,7 +168,7 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
 
 def test_where_it_is_said_contests_are_varied_too() -> None:
     """Each so often, by the training's seed, and not as a distillation's lessons are."""
-    _, task = prepare_start(Path(TRACES), 2)
+    _, task = prepare_start(Path("distill-coms-yaw"), 2)
     names = [each.scenario for each in _list_tasks("coms-zero-slip")]
     found = task().scenarios
     varied = [each for each in found if not isinstance(each, str)]
@@ -187,8 +187,8 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     for agent, fields, said in (
         (None, {}, "for a policy of a class of tasks, got None"),
         (Path("here/best_model.zip"), {}, "got here/best_model.zip"),
-        (Path(TRACES), {"scenarios": ["coms-step"]}, "without other scenarios"),
-        (Path(TRACES), {"env_options": {"scenario": "coms-step"}}, "without other"),
+        (Path("distill-coms-yaw"), {"scenarios": ["coms-step"]}, "without other scenarios"),
+        (Path("distill-coms-yaw"), {"env_options": {"scenario": "coms-step"}}, "without other"),
     ):
         with pytest.raises(ValueError, match=said):
             prepare_start(agent, 2)[1](**fields)

@@ -163,8 +163,8 @@ BAD: dict[str, tuple[Edit, str]] = {
     "extra tensor": (lambda t, m, c: t.update(more=t["bias_0"]), "unexpected tensors: more"),
     "wrong shape": (lambda t, m, c: t.update(weight_0=np.zeros((8, 4), np.float32)), SHAPE),
     "wrong type": (lambda t, m, c: t.update(bias_0=np.zeros(8)), TYPE),
-    "NaN": (lambda t, m, c: t["weight_1"].put(0, np.nan), "weights of layer 1: 1 are not finite"),
-    "infinite bias": (lambda t, m, c: t["bias_2"].fill(np.inf), "biases of layer 2: 1 are not"),
+    "NaN": (lambda t, m, c: t["weight_1"].put(0, np.nan), "weight_1: 1 are not finite"),
+    "infinite bias": (lambda t, m, c: t["bias_2"].fill(np.inf), "bias_2: 1 are not"),
     "NaN mean": (lambda t, m, c: t["mean"].fill(np.nan), "mean: 3 are not finite"),
     "negative scale": (lambda t, m, c: t["scale"].fill(-1.0), "scale is below zero"),
     "no network": (lambda t, m, c: c.pop("network"), "card's network holds action_width"),
@@ -257,7 +257,10 @@ REFUSALS: dict[str, tuple[Call, type[Exception]]] = {
         lambda _: replace(a_network(), biases=[np.zeros(9), np.zeros(5), np.zeros(1)]),
         ValueError,
     ),
-    "known: tanh, relu": (lambda _: replace(a_network(), activation="gelu"), ValueError),
+    "unknown activation .gelu.; did you mean": (
+        lambda _: replace(a_network(), activation="gelu"),
+        ValueError,
+    ),
     "clip is above zero": (lambda _: replace(a_network(), clip=0.0), ValueError),
 }
 

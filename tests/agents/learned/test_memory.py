@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController
-from sideslip.agents.learned.forward import (
+from sideslip.agents.learned.network import (
     ACTIVATIONS,
     CELL_WEIGHTS,
     GATES,
     MovingAverages,
+    Network,
     RecurrentCell,
 )
-from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
 
 torch = pytest.importorskip("torch")
@@ -242,13 +242,14 @@ def network(cell: MovingAverages) -> Network:
 
 def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
     """Of a unit that is plain and of one that is bent, with weights written out again."""
-    cell = traces()
-    net, x = network(cell), RNG.normal(size=(60, 3, WIDE))
+    cell, x = traces(), RNG.normal(size=(60, 3, WIDE))
+    plain = np.zeros(WIDE), np.ones(WIDE), [np.eye(cell.size)], [np.zeros(cell.size)]
+    net = Network(*plain, cells=[cell])
     state = np.zeros((3, net.memory))
     u = x @ cell.weight_in.T + cell.bias_in
     u[..., 3:] = u[..., 3:] / (1.0 + np.exp(-u[..., 3:]))
     for step in range(60):
-        seen = net.compute_features(x[step], state)
+        seen = net(x[step], state)
         assert seen.shape == (3, cell.size) and seen[:, :5] == pytest.approx(u[step], abs=1e-12)
         for j, time in enumerate(TIMES):
             means, share = np.zeros((3, 5)), 1.0 - np.exp(-1.0 / time)
@@ -259,15 +260,7 @@ def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
             if step + 1 < 1.0 / share:
                 assert own == pytest.approx(u[: step + 1].mean(0), abs=1e-12)
     state[1] = 0.0  # an episode begins: its first units are its means
-    assert np.ptp(net.compute_features(x[0], state)[1].reshape(3, 5), axis=0) == pytest.approx(0.0)
-
-
-def test_dense_layers_alone_act_on_what_is_remembered() -> None:
-    net, x = network(traces()), RNG.normal(size=(4, WIDE))
-    state, same = np.zeros((4, net.memory)), np.zeros((4, net.memory))
-    assert net.dense(net.compute_features(x, state)) == pytest.approx(net(x, same), abs=1e-12)
-    alone = net.dense
-    assert np.array_equal(state, same) and alone.dense is alone
+    assert np.ptp(net(x[0], state)[1].reshape(3, 5), axis=0) == pytest.approx(0.0)
 
 
 def test_averages_of_what_is_not_read_are_left_out() -> None:
@@ -379,7 +372,7 @@ REFUSALS: dict[str, tuple[Any, dict[str, Any]]] = {
     "each above 0 steps": (TRACES, {"times": (3.0, 0.0)}),
     "each above 0 steps and": (TRACES, {"times": (float("nan"),)}),
     "1e\\+09 at most": (TRACES, {"times": (3, 10**400)}),
-    "weight_state of cell 0: 147 are not finite": (
+    "cell_0_weight_state: 147 are not finite": (
         dense(WIDE, cells=[GRU]),
         {"cells": [replace(GRU, weight_state=np.full_like(GRU.weight_state, np.nan))]},
     ),

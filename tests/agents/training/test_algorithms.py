@@ -20,17 +20,17 @@ from sideslip.agents.training.callbacks import (
     POLICY,
     Progress,
     RunOptions,
-    read_state,
+    read_checkpoint,
 )
 from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
+    WARM_START_ENTRY,
     TrainingTask,
     _check_settings,
+    _read_settings,
     get_algorithm,
-    read_settings,
 )
-from sideslip.agents.training.warm_start import WARM_START_ENTRY, WARM_START_TRACES_ENTRY
 
 SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
 ROLLOUT, VISION = 128, "sideslip/YawVision-v0"
@@ -39,7 +39,7 @@ EACH = RunOptions(eval_freq=ROLLOUT)
 
 def tiny(algo: str) -> TrainingTask:
     """Rollouts of 128 steps or fewer that divide them, of few environments, and small buffers."""
-    settings, n_envs = read_settings(algo, VISION), 8
+    settings, n_envs = _read_settings(algo, VISION), 8
     settings |= {name: value for name, value in SMALL.items() if name in settings}
     settings |= {"train_freq": 16, "gradient_steps": 4} if "train_freq" in settings else {}
     scenario: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
@@ -141,7 +141,7 @@ def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.M
     means = RunOptions(eval_freq=ROLLOUT, report=spoil)
     with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
         trainer.Trainer(tiny(algo), 3 * ROLLOUT, tmp_path, run_options=means).train()
-    assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT
+    assert read_checkpoint(tmp_path / CHECKPOINT).steps == ROLLOUT
 
 
 @pytest.mark.parametrize("algo", ["tqc", "recurrent-ppo"])
@@ -158,11 +158,11 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
 
     for name, algorithm in ALGORITHMS.items():
         entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
-        ours = {"default", WARM_START_ENTRY, WARM_START_TRACES_ENTRY}
+        ours = {"default", WARM_START_ENTRY}
         assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
             _check_settings(name, entries[key])
-            assert read_settings(name, key) == entries[key]
+            assert _read_settings(name, key) == entries[key]
     assert len(list(HYPERPARAMS.iterdir())) == len(ALGORITHMS)
 
 
@@ -182,7 +182,7 @@ MEANT = "default: {policy: MlpPolicy, n_timesteps: 9, n_envs: 1"
         ("default: {n_envs: 1}", "default: no n_timesteps, policy"),
         ("default: 3", "settings are {name: value}, got 3"),
         ("other: {n_envs: 1}", f"has no settings of {VISION}, and no 'default'"),
-        ("[1]", "is no YAML of settings: {id"),
+        ("[1]", "is no YAML of settings: the file is a mapping, got"),
         ("{", "is no YAML of settings: while parsing"),
     ],
 )
@@ -190,7 +190,7 @@ def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: 
     path = tmp_path / "mine.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=said) as caught:
-        read_settings("ppo", VISION, path)
+        _read_settings("ppo", VISION, path)
     assert str(caught.value).startswith(str(path))
 
 

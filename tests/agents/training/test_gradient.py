@@ -57,16 +57,6 @@ def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     return _unroll_window(policy, cars, obs, policy._begin(cars.num_envs).double(), rates, steps)
 
 
-@pytest.mark.parametrize("normalize_images", [True, False])
-def test_a_policys_own_file_is_loaded(tmp_path: Any, normalize_images: bool) -> None:
-    policy = policy_of(cars_of(1), normalize_images=normalize_images)
-    policy.save(tmp_path / "policy.pth")
-    loaded: Any = GruPolicy.load(tmp_path / "policy.pth", "cpu")
-    assert loaded.normalize_images is normalize_images
-    before, after = policy.state_dict(), loaded.state_dict()
-    assert all(torch.equal(before[name].float(), after[name]) for name in before | after)
-
-
 def test_the_slope_is_that_of_the_cost() -> None:
     """Along random directions of all weights, by central differences, over episodes' ends."""
     cars, weights = cars_of(3), torch.tensor([1e3, 2e3, 500.0], dtype=torch.float64)

@@ -13,12 +13,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.training.callbacks import CHECKPOINT
-from sideslip.agents.training.config import TrainingTask
+from sideslip.agents.training.config import TrainingTask, make_finetune_task
 from sideslip.agents.training.distill import DistillTask, distill
 from sideslip.agents.training.export import convert_sb3_policy
 from sideslip.agents.training.student import DistillConfig
 from sideslip.agents.training.trainer import Trainer, _measure_scaling
-from sideslip.agents.training.warm_start import make_finetune_task
 from sideslip.agents.vec_env import make_vec_env
 from tests.agents.training.test_distill import COURSE, ID, OPTIONS
 from tests.agents.training.test_distill import lesson as distilled

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -17,31 +16,26 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.env_info import get_layout
-from sideslip.agents.learned.policy import Card, Policy, load_policy
+from sideslip.agents.learned.policy import Policy, load_policy
 from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.agents.training.callbacks import (
     BEST,
     CHECKPOINT,
     WARM_START_FILE,
+    Checkpoint,
     EvalCallback,
     Evaluation,
     RunOptions,
     _make_evaluation_seeds,
 )
-from sideslip.agents.training.config import HYPERPARAMS, TrainingTask
-from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.normalise import CLIP, RewardScale, RewardScaleWrapper
-from sideslip.agents.training.student import DistillConfig, Scaling, Student
-from sideslip.agents.training.trainer import Trainer, _measure_reward_scale, read_training
-from sideslip.agents.training.warm_start import (
-    WarmStart,
-    _measure_whitening,
-    _MemoryObservation,
-    _NetworkAgent,
-    _replace_first_layer,
+from sideslip.agents.training.config import (
+    HYPERPARAMS,
+    TrainingTask,
     make_finetune_task,
     resolve_settings,
 )
+from sideslip.agents.training.normalise import CLIP, RewardScale, RewardScaleWrapper
+from sideslip.agents.training.trainer import Trainer, _measure_reward_scale, read_training
 from sideslip.agents.vec_env import get_scales, make_vec_env
 from sideslip.envs.device import make_device_env
 from tests.policies import GRU
@@ -87,7 +81,7 @@ def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
     model, env = started(task, tmp_path).model, task.vector_env(4)
     obs, _ = env.reset(seed=0)
     for _ in range(20):
-        actions, _ = _NetworkAgent(POLICY.network).predict(obs)
+        actions, _ = POLICY.network.predict(obs)
         assert np.abs(model.predict(obs, deterministic=True)[0] - actions).max() < 1e-5
         obs, *_ = env.step(actions)
     assert np.ptp(actions) > 1e-4
@@ -105,7 +99,7 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
     """Driven by the policy itself, each whole drive is paid -1 a step in the mean, but for the
     floor."""
     task = make_finetune_task(POLICY, **FEW)
-    driver = _NetworkAgent(POLICY.network)
+    driver = POLICY.network
 
     def cars() -> Any:
         options = task.options(4)
@@ -152,9 +146,9 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     if steps:
         monkeypatch.setattr(EvalCallback, "load_parameters", lambda _: None)
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-        training._state = {"steps": steps, "scaling": scaling, "evaluations": []}
+        training._state = Checkpoint({}, "", {}, steps, {}, list(scaling), [])
     model: Any = training.build().model
-    driver, cars = _NetworkAgent(network), model.get_env()
+    driver, cars = network, model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
     if algo == "gradient":
         tensors, seeds, rates = model.source(device="cpu", compile=False)
@@ -214,10 +208,7 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
         load_policy(tmp_path / WARM_START_FILE).network.scale, POLICY.network.scale
     )
     env, seeds = task.vector_env(4), _make_evaluation_seeds(4)
-    start, now = (
-        evaluate_episodes(env, each, seeds)[0]
-        for each in (_NetworkAgent(POLICY.network), found.model)
-    )
+    start, now = (evaluate_episodes(env, each, seeds)[0] for each in (POLICY.network, found.model))
     ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
     assert ratio != 1.0 and read_training(tmp_path).task == task
@@ -319,116 +310,3 @@ def test_a_zip_from_elsewhere_acts_as_it_did(
             scale == 0.0
         ]
     assert model.predict(x, deterministic=True)[0] == pytest.approx(acts(x), abs=1e-6)
-
-
-ID = "sideslip/YawFusion-v0"
-OPTIONS: dict[str, Any] = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
-OPTIONS |= {"scenario": {"base": "coms-slalom", "duration": 0.3}}
-STEPS = 30  # of an episode
-
-
-def cars(count: int) -> Any:
-    return gym.make_vec(ID, num_envs=count, autoreset_mode="SameStep", info="ends", **OPTIONS)
-
-
-@pytest.fixture(scope="module")
-def policy() -> Policy:
-    """Random weights: it acts in some way that what is remembered decides."""
-    torch.manual_seed(0)
-    card, rng = Card.from_env_id(ID, OPTIONS), np.random.default_rng(0)
-    wide = len(card.observation)
-    scaling = Scaling(rng.normal(size=wide), np.full(wide, 0.3), np.eye(wide))
-    student = Student(wide, 1, DistillConfig(traces=6, hidden=(8, 4)))
-    return Policy("traced", student.network(scaling), card)
-
-
-def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) -> None:
-    """The last one of an episode too, which the row's next episode does not see."""
-    bare, env = cars(3), _MemoryObservation(cars(3), policy.network)
-    state = np.zeros((3, policy.network.memory))
-    seen, (obs, _) = bare.reset(seed=5)[0], env.reset(seed=5)
-    ended = 0
-    for step in range(1, 2 * STEPS + 3):
-        assert obs == pytest.approx(
-            policy.network.compute_features(seen.astype(float), state), abs=1e-5
-        )
-        action = np.full((3, 1), 0.1, np.float32)
-        seen, _, _, over, bares = bare.step(action)
-        obs, _, _, same, infos = env.step(action)
-        assert np.array_equal(over, same) and obs in env.observation_space
-        if over.any():
-            last = np.stack(bares["final_obs"][over]).astype(float)
-            theirs = policy.network.compute_features(last, state[over].copy())
-            assert np.stack(infos["final_obs"][over]) == pytest.approx(theirs, abs=1e-5)
-            state[over], ended = 0.0, ended + 1
-            assert step % STEPS == 0
-    assert ended == 2
-    env.reset(seed=5)
-    first = policy.network.compute_features(bare.reset(seed=5)[0].astype(float), 0.0 * state)
-    assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
-
-
-def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None:
-    rows, mask = [_MemoryObservation(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
-    action = np.full((3, 1), 0.1, np.float32)
-    seen = []
-    for env in rows:
-        env.reset(seed=5)
-        env.step(action)
-        seen.append(env.step(action)[0])
-    before = seen[1]
-    seen[0][:] = 9.0  # whoever has an observation may write into it
-    first = rows[0].reset(seed=[None, 8, None], options={"reset_mask": mask})[0]
-    assert np.array_equal(first[~mask], before[~mask])
-    assert np.array_equal(
-        first[mask], _MemoryObservation(cars(3), policy.network).reset(seed=7)[0][mask]
-    )
-    ours, theirs = (env.step(action)[0] for env in rows)
-    assert np.array_equal(ours[~mask], theirs[~mask]) and (ours[mask] != theirs[mask]).any()
-
-
-def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
-    """And what is remembered in its own drives varies alike, mixed."""
-    net = policy.network
-    mean, mixing = _measure_whitening(cars(60), net, 3)
-    first, x = net.weights[0], np.random.default_rng(1).normal(size=(5, net.dense.inputs))
-    mixed = _replace_first_layer(net, first @ np.linalg.inv(mixing), net.biases[0] + first @ mean)
-    theirs = net.dense(x)
-    assert mixed.dense((x - mean) @ mixing) == pytest.approx(theirs, abs=1e-5)
-    assert np.abs(mixed.dense(x) - theirs).max() > 1e-3
-    env = _MemoryObservation(cars(60), net, (mean, mixing))
-    seen, (obs, _) = [], env.reset(seed=3)
-    for _ in range(STEPS):
-        seen.append(obs)
-        obs, *_ = env.step(_NetworkAgent(mixed.dense).predict(obs)[0])
-    found = np.concatenate(seen[::7])
-    assert np.abs(found.mean(0)).max() < 0.05 and np.var(found, axis=0).max() < 1.1
-
-
-def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
-    settings = make_finetune_task(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
-    assert settings["learning_rate"] == "lin_1e-4"  # of the entry for hundreds of inputs
-    task = make_finetune_task(policy, settings=settings, num_envs=4, n_eval_envs=4)
-    options = RunOptions(eval_freq=64)
-    found = Trainer(task, 64, tmp_path, run_options=options, trained_agent=policy).train()
-    assert found.evaluations[0].of_start == pytest.approx(1.0, abs=1e-6)
-    kept = load_policy(tmp_path / "policy.safetensors").network
-    for part in ("weight_in", "bias_in"):
-        assert np.array_equal(*(getattr(each.cells[0], part) for each in (kept, policy.network)))
-    assert np.array_equal(kept.mean, policy.network.mean)
-    begun = WarmStart(policy, task)
-    last = begun.merge_network(convert_sb3_policy(found.model))
-    seeds = _make_evaluation_seeds(4)
-    begins, ours, best = (
-        evaluate_episodes(task.vector_env(4), _NetworkAgent(each), seeds)[0]
-        for each in (policy.network, last, kept)
-    )
-    theirs = evaluate_episodes(begun.wrap_env(task.vector_env(4)), found.model, seeds)[0]
-    assert ours == pytest.approx(theirs, rel=1e-5) and ours != pytest.approx(begins, rel=1e-4)
-    first = found.best is found.evaluations[0]
-    assert best == pytest.approx(begins if first else ours, rel=1e-5)
-    layer: Any = found.model.policy.action_net
-    moved = np.abs(layer.weight.detach().numpy() - policy.network.weights[-1])
-    assert moved.max() > 1e-5 and (tmp_path / WARM_START_FILE).exists()
-    again = Trainer(task, 96, tmp_path, resume=True).train()
-    assert again.evaluations[:2] == found.evaluations and len(again.evaluations) == 3

@@ -19,7 +19,7 @@ from sideslip.agents.training.callbacks import (
     _compute_equal_weights,
     _compute_scenario_weights,
 )
-from sideslip.agents.training.config import TrainingTask, read_settings
+from sideslip.agents.training.config import TrainingTask, _read_settings
 from sideslip.agents.training.normalise import CLIP, Standardised
 from sideslip.agents.training.trainer import _measure_scaling, read_training
 
@@ -181,6 +181,6 @@ def test_a_scenario_beside_a_mixture_is_not_dropped_in_silence() -> None:
 
 @pytest.mark.parametrize("name", ["features_extractor_class", "features_extractor_kwargs"])
 def test_a_features_extractor_in_settings_is_not_dropped_in_silence(name: str) -> None:
-    settings = read_settings("ppo", "default")
+    settings = _read_settings("ppo", "default")
     with pytest.raises(ValueError, match=f"{name} is the training's own"):
         TrainingTask(settings=settings | {"policy_kwargs": {name: {"clip": 1.0}}})

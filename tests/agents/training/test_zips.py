@@ -293,10 +293,9 @@ REFUSED: dict[str, tuple[tuple[Any, Any, Any, dict[str, Any]], str]] = {
     ),
     "another env": (
         offered(env=FUSION),
-        r"trained on 30 numbers, those of sideslip/YawFusion-v0: gyro, .*gps_\w+.*; "
-        "the observation here has 22: gyro, ",
+        "30 numbers; the observation here has 22: gyro, ",
     ),
-    "other bounds": (offered(env=BOX), "trained on 1 numbers that no environment here has"),
+    "other bounds": (offered(env=BOX), "bounds, 1 numbers; the observation here has 22"),
 }
 
 

@@ -11,11 +11,10 @@ import pytest
 pytest.importorskip("rl_zoo3")
 from sideslip.agents.learned.policy import load_policy
 from sideslip.agents.rollout import evaluate_episodes
-from sideslip.agents.training.callbacks import POLICY, RunOptions
+from sideslip.agents.training.callbacks import POLICY, RunOptions, describe_for_zoo
 from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
 from sideslip.agents.training.trainer import Trainer
-from sideslip.agents.training.warm_start import _NetworkAgent
-from sideslip.benchmarks.cli.policies import _choose_folder, _describe_for_zoo
+from sideslip.benchmarks.cli.policies import _choose_folder
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}
@@ -53,9 +52,9 @@ def test_the_zoo_finds_and_drives_what_we_left(algo: str, tmp_path: Path) -> Non
     few: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "estimator": "exact-kf"}
     task = TrainingTask(algo=algo, env_options={"scenario": "sine-with-dwell"}, **few)
     folder = _choose_folder(task, "", None, tmp_path)
-    _describe_for_zoo(task, folder, 64, 64)
+    describe_for_zoo(task, folder, 64, 64)
     Trainer(task, 64, folder, run_options=RunOptions(eval_freq=64)).train()
-    agent = _NetworkAgent(load_policy(folder / POLICY).network)
+    agent = load_policy(folder / POLICY).network
     cost = evaluate_episodes(task.vector_env(1), agent, [0])[0][0]
     out = run_zoo("enjoy", algo, tmp_path, "--no-render", "-n", "1001", "--load-best")
     assert f"Episode Reward: {-cost:.2f}" in out

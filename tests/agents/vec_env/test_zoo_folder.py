@@ -12,13 +12,18 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
-from sideslip.agents import zoo
 from sideslip.agents.rollout import evaluate_episodes
 from sideslip.agents.training import trainer
-from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
+from sideslip.agents.training.callbacks import (
+    EVALUATIONS,
+    RunOptions,
+    _make_evaluation_seeds,
+    describe_for_zoo,
+    find_zoo_folder,
+)
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import Trainer
-from sideslip.benchmarks.cli.policies import _choose_folder, _describe_for_zoo
+from sideslip.benchmarks.cli.policies import _choose_folder
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"
@@ -40,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     patch = pytest.MonkeyPatch()
     patch.setattr(trainer, "_SCALING_ENVS", 8)
     place = _choose_folder(TASK, "", None, tmp_path_factory.mktemp("logs"))
-    _describe_for_zoo(TASK, place, 256, 128)
+    describe_for_zoo(TASK, place, 256, 128)
     Trainer(TASK, 128, place, run_options=RunOptions(eval_freq=128)).train()
     patch.undo()
     return place
@@ -56,12 +61,11 @@ def test_every_file_is_where_the_zoo_has_it(folder: Path) -> None:
 
 
 def test_the_next_number_is_one_above_the_largest(tmp_path: Path) -> None:
-    """As `get_latest_run_id`: other ids' numbers and words count for nothing."""
-    assert zoo.find_next_folder(tmp_path, "sac", ENV) == tmp_path / "sac" / f"{NAME}_1"
+    """Other ids' numbers and words count for nothing."""
+    assert find_zoo_folder(tmp_path, TASK) == tmp_path / "ppo" / f"{NAME}_1"
     for name in (f"{NAME}_2", f"{NAME}_9", f"{NAME}_x", f"{NAME}_11_b", "other_40", f"a{NAME}_50"):
-        (tmp_path / "sac" / name).mkdir(parents=True)
-    assert zoo.find_next_folder(tmp_path, "sac", ENV).name == f"{NAME}_10"
-    assert zoo.find_next_folder(tmp_path, "ppo", ENV).name == f"{NAME}_1"
+        (tmp_path / "ppo" / name).mkdir(parents=True)
+    assert find_zoo_folder(tmp_path, TASK).name == f"{NAME}_10"
 
 
 def enjoyed(folder: Path, model: str) -> tuple[Any, Any]:
@@ -93,13 +97,13 @@ def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model
         evaluate_episodes(TASK.vector_env(4), loaded, _make_evaluation_seeds(4))[0][0]
     )
     if model != "best_model.zip":
-        with np.load(folder / zoo.EVALUATIONS) as found:
+        with np.load(folder / EVALUATIONS) as found:
             assert cost == pytest.approx(-found["results"][-1, 0], rel=1e-4)
 
 
 def test_evaluations_are_as_eval_callback_has_them_and_go_on(folder: Path) -> None:
     def found() -> dict[str, Any]:
-        with np.load(folder / zoo.EVALUATIONS, allow_pickle=False) as file:
+        with np.load(folder / EVALUATIONS, allow_pickle=False) as file:
             return dict(file)
 
     first = found()
@@ -118,7 +122,7 @@ def test_another_folder_gets_none_of_it(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(trainer, "_SCALING_ENVS", 8)
     Trainer(TrainingTask(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain").train()
     assert not list((tmp_path / "plain").glob("sideslip*"))
-    assert not (tmp_path / "plain" / zoo.EVALUATIONS).exists()
+    assert not (tmp_path / "plain" / EVALUATIONS).exists()
 
 
 def test_an_algorithm_of_ours_alone_is_refused(tmp_path: Path) -> None:

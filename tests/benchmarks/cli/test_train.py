@@ -118,7 +118,7 @@ def test_log_folders_are_the_zoos(
     status, _, err = run("--resume", "-f", "logs")
     assert status == 2 and "logs is for a new training: name the old --out" in err
     status, _, err = run("-i", TRACES, "-f", "logs")
-    assert status == 2 and "drives nothing with memory as raw-coms-yaw: --out" in err
+    assert status == 2 and "ppo goes on from dense layers" in err
     for wrong in (("--steps", 0), ("--device", "moon"), ("--eval-freq", 0)):
         status, _, err = run(*TINY, *wrong, "-f", "logs")
         assert status == 2 and "error: " in err
