@@ -21,7 +21,7 @@ from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_info import AnyEnv, CarEnv, get_env_facts
-from ..learned.network import ACTIVATIONS, Network, RecurrentCell
+from ..learned.network import ACTIVATIONS, SUFFIX, Network, RecurrentCell
 from ..learned.policy import Card, Policy, save_policy
 from ..vec_env import get_scales, scale_layout
 
@@ -215,6 +215,8 @@ def export_zip(
         **about: Other fields of the policy's `Card`, such as the estimator of the training.
     """
     check_trusted(Path(path), trust)
+    if Path(target).suffix != SUFFIX:  # before anything is read
+        raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     about |= {"env_id": env_id, "env_options": dict(env_options or {})}
     env: CarEnv = gym.make(env_id, **about["env_options"])
     if about.get("estimator"):
