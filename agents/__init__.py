@@ -8,9 +8,8 @@ from ..envs.validation import check_options
 from ..estimators.make import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.lane_keeping import LaneKeeping
-from .controllers.lqr import Lqr
-from .controllers.mpc import Mpc
-from .controllers.nmpc import AdaptiveLqr, AdaptiveNmpc, Nmpc
+from .controllers.lqr import AdaptiveLqr, Lqr
+from .controllers.mpc import AdaptiveNmpc, Mpc, Nmpc
 from .controllers.two_dof import Feedforward, TwoDof
 from .controllers.yaw_stability import Esc, ModelFollowing, SlidingMode
 from .env_info import AnyEnv

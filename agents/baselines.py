@@ -29,7 +29,7 @@ from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller
 from .controllers.lqr import TRUE_PARAMETERS, Lqr
-from .controllers.nmpc import Nmpc
+from .controllers.mpc import Nmpc
 
 NOMINAL = "nominal"
 PARAMETER_ORACLES = ("oracle-parameters-lqr", "oracle-parameters-nmpc")

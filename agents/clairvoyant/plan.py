@@ -21,8 +21,19 @@ from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
 from ..rollout import iterate_steps
-from .linearisation import N_INPUTS, IlqrProblem, Linearisation, PlanRun, linearise, make_problem
-from .preview import Forecast, PlanParams, PlanState, make_forecast, read_plan_state
+from .forecast import (
+    N_INPUTS,
+    Forecast,
+    IlqrProblem,
+    Linearisation,
+    PlanParams,
+    PlanRun,
+    PlanState,
+    linearise,
+    make_forecast,
+    make_problem,
+    read_plan_state,
+)
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv

@@ -3,7 +3,6 @@
 Uneven-delay's aim (docs/PAPERS.md): sideslip angle, yaw rate, heading and offset serve it.
 """
 
-import math
 from collections import namedtuple
 from typing import Any
 
@@ -140,8 +139,7 @@ class LaneKeeping(Controller):
         super().__init__(env)
         if self.width != 2:
             raise ValueError("LaneKeeping needs an env whose action steers (steering=True)")
-        if not 0.0 <= haste < math.inf:
-            raise ValueError(f"haste is zero or more, got {haste!r}")
+        haste = check_positive("haste", haste, allow_zero=True)
         speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
         design, car = (self.control_period, self.full_scale, haste, inputs), self.nominal
         gains = [_make_lane_model(car, speed, *design).solve()[0] for speed in speeds]

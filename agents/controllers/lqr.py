@@ -1,4 +1,4 @@
-"""LQR: the yaw moment, and steering where there is some, that minimise the env's own cost."""
+"""LQR: yaw moment, and steering where there is some, of least cost; also adapted to the tyres."""
 
 import copy
 import math
@@ -28,6 +28,9 @@ TRUE_PARAMETERS = (
     *("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness"),
     *("friction", "motor_left", "motor_right"),
 )  # parameters of the true car, of which the observation has true_<name>; the last are its motors
+TYRES = ("front_tyres_hat", "rear_tyres_hat")  # of `joint`
+INVERSE_FRICTION = "inverse_friction_hat"
+_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 _MAX_CARS = 1024  # for which the gains are kept
 
 
@@ -254,6 +257,36 @@ class Lqr(Controller):
         load = car.mass * GRAVITY * car.rear_arm / (2.0 * car.wheelbase)  # N, of a front tyre
         # tan(slip angle) = 3 mu F_z / C, small angles
         return np.asarray(3.0 * self._get_friction(inputs) * load / np.maximum(stiffness, 1.0))
+
+
+class AdaptiveLqr(Lqr):
+    """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
+
+    Where the observation has inverse_friction_hat, limits use that friction, within 0.2 to 1.2.
+
+    Args:
+        env: Env of the controller, with both factors in its observation.
+        grip: Grip limit, as for `Controller`.
+        options: Other arguments of `Lqr`.
+    """
+
+    def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
+        super().__init__(env, stiffness=TYRES, grip=grip, **options)
+
+    def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:
+        extra = (INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()
+        return (*super()._list_extra_entries(names), *extra)
+
+    def _get_friction(self, inputs: Array) -> Array:
+        if INVERSE_FRICTION not in self.needs:
+            return super()._get_friction(inputs)
+        estimated = inputs[:, self.needs.index(INVERSE_FRICTION)]
+        return np.asarray(1.0 / np.clip(estimated, 1.0 / _MAX_FRICTION, 1.0 / _MIN_FRICTION))
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        inputs[:, IN.front_stiffness] *= self.vehicle.front_stiffness
+        inputs[:, IN.rear_stiffness] *= self.vehicle.rear_stiffness
+        super()._law(inputs, state, action)
 
 
 @jit

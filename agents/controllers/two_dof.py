@@ -6,7 +6,6 @@ scheduled by the mean of the two front wheel speeds: the PI on a grid of speeds.
 
 import math
 from collections import namedtuple
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
+from ...envs.validation import check_choice
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 from ..env_info import AnyEnv
@@ -63,7 +63,8 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     Raises:
         ValueError: The placement is unknown, or the pole is not positive.
     """
-    _check(pole, placement)
+    check_choice("placement", placement, PLACEMENTS)
+    check_positive("pole", pole)
     model = make_bicycle_model(vehicle, speed)
     # det(sI - A + b c) - det(sI - A) is the numerator of G = c (sI - A)^-1 b with c = [1, 0] and b
     # of the yaw moment: k = a12 b22
@@ -73,56 +74,9 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
     if placement == "radius":
         product = min(pole, p_2) ** 2
-    k_p = _limit_gain(vehicle, product / k) if k != 0.0 else 0.0
-    return PI(k_p, k_p * max(p_1, 0.0))
-
-
-def _check(pole: float, placement: str) -> None:
-    if placement not in PLACEMENTS:
-        raise ValueError(f"placement is one of {', '.join(PLACEMENTS)}, got {placement!r}")
-    if not 0.0 < pole < math.inf:
-        raise ValueError(f"pole is a positive number in rad/s, got {pole!r}")
-
-
-def _limit_gain(vehicle: Vehicle, k_p: float) -> float:
     max_gain = vehicle.yaw_moment_limit / 0.01
-    return min(max(float(k_p), -max_gain), max_gain)
-
-
-def _sample_pi(vehicle: Vehicle, speed: float, period: float, pole: float, placement: str) -> PI:
-    """Design the PI of `design_pi` for a sampled loop, with the moment held between."""
-    # The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
-    # (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product
-    # of the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period.
-    _check(pole, placement)
-    model = make_bicycle_model(vehicle, speed)
-    p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
-    a_1, a_2 = math.exp(-max(p_1, 0.0) * period), math.exp(-p_2 * period)
-    A_d, B_d = model.discretise(period)  # tie-vision's G and H, (9)
-    b_1, b_0 = B_d[0, 1], A_d[0, 1] * B_d[1, 1] - A_d[1, 1] * B_d[0, 1]
-    if b_1 + b_0 == 0.0:
-        return PI(0.0, 0.0)
-    if placement == "real":
-        z = math.exp(-(pole if pole < p_2 else 0.5 * p_2) * period)
-        k_p = -(z - a_2) * (z - 1.0) / (b_1 * z + b_0)
-    else:
-        radius = min(pole, p_2)
-        continuous = radius**2 / float(model.A[0, 1] * model.B[1, 1])
-
-        def compute_excess(factor: float) -> float:
-            k_p = factor * continuous
-            poles = np.roots([1.0, k_p * b_1 - 1.0 - a_2, a_2 + k_p * b_0]).astype(complex)
-            return float(np.prod(np.log(poles)).real - (radius * period) ** 2)
-
-        from scipy.optimize import brentq  # slow to load
-
-        # a grid in steps of 0.05; the smallest root counts: beyond it a pole may leave z > 0
-        factors = np.linspace(0.0, 4.0, 81)
-        upper = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
-        factor = 4.0 if upper is None else brentq(compute_excess, upper - 0.05, upper)
-        k_p = continuous * factor
-    k_p = _limit_gain(vehicle, k_p)
-    return PI(k_p, k_p * (1.0 - a_1) / period)
+    k_p = min(max(product / k, -max_gain), max_gain) if k != 0.0 else 0.0
+    return PI(k_p, k_p * max(p_1, 0.0))
 
 
 @jit
@@ -223,7 +177,6 @@ class TwoDof(Controller):
         gain: Factor on the PI's gains.
         pole: Pole of the closed loop (rad/s), as for `design_pi`.
         placement: Rule of the pole, as for `design_pi`.
-        sampled: Whether to place the poles of the sampled loop.
         grip: Grip limit, as for `Controller`.
         feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
 
@@ -236,24 +189,19 @@ class TwoDof(Controller):
 
     def __init__(
         self, env: AnyEnv, rate: str = "control", gain: float = 1.0, pole: float = POLE,
-        placement: str = PLACEMENTS[0], sampled: bool = False, grip: float | None = None,
+        placement: str = PLACEMENTS[0], grip: float | None = None,
         feedforward: str = FEEDFORWARDS[0],
     ) -> None:  # fmt: skip
         super().__init__(env, grip)
-        if feedforward not in FEEDFORWARDS:
-            known = ", ".join(FEEDFORWARDS)
-            raise ValueError(f"feedforward is one of {known}, got {feedforward!r}")
-        if rate not in ("control", "camera"):
-            raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
+        check_choice("feedforward", feedforward, FEEDFORWARDS)
+        check_choice("rate", rate, ("control", "camera"))
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
-        dt = wait * period
         factor = check_positive("gain", gain, allow_zero=True)
-        design = partial(_sample_pi, period=dt) if sampled else design_pi
-        pis = [design(self.nominal, float(v), pole=pole, placement=placement) for v in SPEEDS]
+        pis = [design_pi(self.nominal, float(v), pole, placement) for v in SPEEDS]
         self.k_p, self.k_i = np.ascontiguousarray((factor * np.array(pis)).T)
         follows, gains = int(feedforward == FEEDFORWARDS[0]), (self.k_p, self.k_i)
-        self._design = follows, self._bicycle, *gains, self.full_scale, wait, dt
+        self._design = follows, self._bicycle, *gains, self.full_scale, wait, wait * period
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -143,14 +143,13 @@ class Esc(Controller):
         self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
         super().__init__(env, grip)
         bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
-        if not 0.0 <= band < math.inf:
-            raise ValueError(f"band is zero or more, in rad/s, got {band!r}")
+        band = check_positive("band", band, allow_zero=True)
         if stiffness is None:
             stiffness = self.full_scale / slip
         bound = slip, check_positive("stiffness", stiffness, allow_zero=True), int(bounded)
         gains = np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS])
         scales, table = (self.full_scale, self.control_period * TICK), (np.array(SPEEDS), gains)
-        self._design = self._target, *table, float(band), *bound, *scales
+        self._design = self._target, *table, band, *bound, *scales
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _esc_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

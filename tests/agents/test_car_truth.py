@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.agents.baselines import make_oracle
 from sideslip.agents.controllers.lqr import TRUE_PARAMETERS, Lqr
-from sideslip.agents.controllers.nmpc import Nmpc
+from sideslip.agents.controllers.mpc import Nmpc
 from sideslip.agents.design.sampled_model import SPEEDS, make_design_model
 from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs.engine import views

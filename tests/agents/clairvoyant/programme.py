@@ -14,14 +14,17 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from sideslip.agents.clairvoyant.linearisation import (
+from sideslip.agents.clairvoyant.forecast import (
+    Forecast,
+    PlanParams,
+    PlanState,
+    PreviewStep,
     _advance,
     _compute_node_cost,
     _compute_node_errors,
     _get_state_scales,
     _list_active_states,
 )
-from sideslip.agents.clairvoyant.preview import Forecast, PlanParams, PlanState, PreviewStep
 
 Array = npt.NDArray[np.float64]
 

@@ -18,14 +18,18 @@ ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
-from sideslip.agents.clairvoyant.linearisation import _advance  # noqa: E402
+from sideslip.agents.clairvoyant.forecast import (  # noqa: E402
+    PlanState,
+    PreviewStep,
+    _advance,
+    make_forecast,
+)
 from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     _simulate_run,
     _solve_ilqr,
     compute_clairvoyant,
     record_actions,
 )
-from sideslip.agents.clairvoyant.preview import PlanState, PreviewStep, make_forecast  # noqa: E402
 from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__

@@ -11,8 +11,8 @@ import sideslip
 
 pytest.importorskip("casadi")
 pytest.importorskip("osqp")
+from sideslip.agents.clairvoyant.forecast import make_forecast
 from sideslip.agents.clairvoyant.plan import _simulate_run, _solve_ilqr
-from sideslip.agents.clairvoyant.preview import make_forecast
 from tests.agents.clairvoyant.programme import Array, solve_linear
 
 assert sideslip.__version__

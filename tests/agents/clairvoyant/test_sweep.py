@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 pytest.importorskip("casadi")
-from sideslip.agents.clairvoyant.linearisation import Linearisation
+from sideslip.agents.clairvoyant.forecast import Linearisation
 from sideslip.agents.clairvoyant.plan import Limits, _run_backward_pass, _solve_input_qp
 
 

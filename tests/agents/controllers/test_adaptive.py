@@ -8,8 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.baselines import make_noise_options
-from sideslip.agents.controllers.lqr import IN, make_design_state
-from sideslip.agents.controllers.nmpc import INVERSE_FRICTION, TYRES
+from sideslip.agents.controllers.lqr import IN, INVERSE_FRICTION, TYRES, make_design_state
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import Chunk, run_chunk
 from sideslip.benchmarks.control.tasks import STEERING, ControlTask

@@ -52,41 +52,42 @@ def agent_of(env: Any, **options: Any) -> Lqr:
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.005])
-@pytest.mark.parametrize("period", [1, 10])
-def test_the_model_is_the_plant_and_its_cost_the_envs(period: int, lag: float) -> None:
-    """Two steps of the env and of x+ = G x + H u, and what they cost, steering and all."""
+@pytest.mark.parametrize(("period", "rate"), [(1, 0.0), (10, 0.0), (10, 0.00025), (25, 0.00025)])
+def test_the_model_is_the_plant_and_its_cost_the_envs(period: int, lag: float, rate: float) -> None:
+    """Steps of the env and of x+ = G x + H u, and what they cost, the moment's rate and all."""
     car = {"base": "coms", "motor_lag": lag, "steering_lag": 6.0 * lag, "steering_rate": 1e6}
     scenario = SMALL | {"steering": "step", "onset": -10.0, "hold": 1e6, "amplitude": 0.01}
     built: dict[str, Any] = {"vehicle": car, "control_period": period, "strict": False}
-    env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=scenario, **built)
+    world = {"moment_rate": rate}
+    env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=scenario, world=world, **built)
     env.reset(seed=0)
     vehicle = env.unwrapped.vehicle
-    model = make_design_model(
-        vehicle, 7.0, DesignSpec(period, vehicle.yaw_moment_limit, True, MODEL)
-    )
+    spec = DesignSpec(period, vehicle.yaw_moment_limit, True, MODEL, moment_rate=rate)
+    model = make_design_model(vehicle, 7.0, spec)
     refs = compute_reference(0.01, 7.0, make_reference_params(vehicle), MODEL)
-    x = np.array([0.0, 0.0, 0.0, 0.01, 0.01, *refs])
-    for action in ([0.1, 0.05], [-0.2, 0.1]):
+    x = np.zeros(len(model.G))
+    x[3:7] = 0.01, 0.01, *refs
+    for action in ([0.1, 0.05], [-0.2, 0.1], [0.3, 0.0], [0.3, 0.0]):
         *_, info = env.step(np.array(action, np.float32))
         u = np.array(action, np.float32) * np.array([1.0, vehicle.steering_authority])
-        assert info["cost"] == pytest.approx(
-            x @ model.Q @ x + u @ model.R @ u + 2 * x @ model.N @ u
-        )
+        wanted = x @ model.Q @ x + u @ model.R @ u + 2 * x @ model.N @ u
+        assert info["cost"] == pytest.approx(wanted, rel=1e-5)
         x = model.G @ x + model.H @ u
         assert (info["beta"], info["gamma"]) == pytest.approx((x[0], x[1]), rel=1e-5)
 
 
+@pytest.mark.parametrize("rate", [0.0, 0.00025])
 @pytest.mark.parametrize("speed", [2.0, 7.0, 30.0])
 @pytest.mark.parametrize("kind", [ZERO_SLIP, MODEL])
 @pytest.mark.parametrize("steers", [False, True])
 def test_gains_are_python_controls_for_all_states_at_once(
-    speed: float, kind: int, steers: bool
+    speed: float, kind: int, steers: bool, rate: float
 ) -> None:
     """`dlqr` itself needs states that can be brought to rest: what is held decays slowly there."""
-    purpose = DesignSpec(10, COMS.yaw_moment_limit, steers, kind, "rates")
+    purpose = DesignSpec(10, COMS.yaw_moment_limit, steers, kind, "rates", moment_rate=rate)
     model = make_design_model(COMS, speed, purpose)
     G = model.G.copy()
-    held = range(len(DYNAMIC), len(G))
+    held = range(len(DYNAMIC), len(G) - (2 if rate else 0))  # the last two are inputs' memory
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import control
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from sideslip.agents import Lqr, Mpc, make_agent
 from sideslip.agents.design.sampled_model import SPEEDS, DesignSpec, make_design_model
 from sideslip.agents.rollout import evaluate_episodes
 from sideslip.envs import COMS
-from sideslip.envs.task import MODEL, compute_reference, make_reference_params
+from sideslip.envs.task import MODEL
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruth
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.agents.controllers.test_lqr import SMALL
@@ -24,40 +23,10 @@ STATES = ("beta", "gamma", "F_d", "N_d")
 V = SPEEDS[18]
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.005])
-@pytest.mark.parametrize("period", [10, 25])
-def test_the_models_cost_is_the_envs(period: int, lag: float) -> None:
-    """Four steps of jumping commands, which nothing but the rate makes dear."""
-    car = {"base": "coms", "motor_lag": lag, "steering_lag": 6.0 * lag, "steering_rate": 1e6}
-    scenario = SMALL | {"steering": "step", "onset": -10.0, "hold": 1e6, "amplitude": 0.01}
-    built: dict[str, Any] = {"vehicle": car, "control_period": period, "strict": False}
-    env: Any = gym.make(AFS, scenario=scenario, world=RATE, **built)
-    env.reset(seed=0)
-    vehicle = env.unwrapped.vehicle
-    spec = DesignSpec(period, vehicle.yaw_moment_limit, True, MODEL, moment_rate=0.00025)
-    model = make_design_model(vehicle, 7.0, spec)
-    refs = compute_reference(0.01, 7.0, make_reference_params(vehicle), MODEL)
-    x = np.array([0.0, 0.0, 0.0, 0.01, 0.01, *refs, 0.0, 0.0])
-    for action in ([0.1, 0.05], [-0.2, 0.1], [0.3, 0.0], [0.3, 0.0]):
-        *_, info = env.step(np.array(action, np.float32))
-        u = np.array(action, np.float32) * np.array([1.0, vehicle.steering_authority])
-        wanted = x @ model.Q @ x + u @ model.R @ u + 2 * x @ model.N @ u
-        assert info["cost"] == pytest.approx(wanted, rel=1e-5)
-        x = model.G @ x + model.H @ u
-
-
 @pytest.mark.parametrize("steers", [False, True])
-def test_gains_are_python_controls_for_all_states_at_once(steers: bool) -> None:
-    """The references and the disturbances decay slowly there, which `dlqr` needs."""
-    spec = DesignSpec(10, COMS.yaw_moment_limit, steers, MODEL, "rates", moment_rate=0.00025)
-    model = make_design_model(COMS, 7.0, spec)
-    assert model.states[-2:] == ("N_z before", "N_z commanded before")
-    G, held = model.G.copy(), range(4, len(model.G) - 2)
-    G[held, held] *= 1.0 - 1e-8
-    wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
-    scale = np.abs(wanted).max()
-    assert model.solve()[0] / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
-    free = make_design_model(COMS, 7.0, dataclasses.replace(spec, moment_rate=0.0)).solve()[0]
+def test_a_slight_weight_changes_the_gains_slightly(steers: bool) -> None:
+    spec = DesignSpec(10, COMS.yaw_moment_limit, steers, MODEL, "rates")
+    free = make_design_model(COMS, 7.0, spec).solve()[0]
     slight = make_design_model(COMS, 7.0, dataclasses.replace(spec, moment_rate=1e-12)).solve()[0]
     np.testing.assert_allclose(slight[:, :-2], free, 1e-4, 1e-4)
 

@@ -10,7 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
-from sideslip.agents.controllers.nmpc import _make_blocks, _prepare_prediction, _shift_plan
+from sideslip.agents.controllers.mpc import _make_blocks, _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
     _DIFFERENCE,
     LIMIT,

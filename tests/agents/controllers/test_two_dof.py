@@ -10,7 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.two_dof import POLE, _compute_static_gain, _sample_pi, design_pi
+from sideslip.agents.controllers.two_dof import POLE, _compute_static_gain, design_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import Bicycle, make_bicycle_model
 from sideslip.estimators import EstimateObservation
@@ -78,39 +78,6 @@ def test_closed_loop_poles_are_where_they_were_placed(kmh: float) -> None:
     # residuals of the characteristic polynomial, which stay well-conditioned at double poles
     assert np.poly(loop.poles()) == pytest.approx(np.poly(cancelled), rel=1e-9)
     assert loop.poles().real.max() < 0
-
-
-@pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
-@pytest.mark.parametrize("period", [0.001, 0.033])
-@pytest.mark.parametrize("placement", ["radius", "real"])
-def test_sampled_poles_are_where_they_were_placed(
-    kmh: float, period: float, placement: str
-) -> None:
-    """The loop with the moment held, its poles taken back to s = ln z / T."""
-    model = make_bicycle_model(COMS, kmh * KMH)
-    slow, fast = np.sort(-np.linalg.eigvals(model.A).real)
-    pi = _sample_pi(COMS, kmh * KMH, period, POLE, placement)
-    G, H = model.discretise(period)
-    # states beta, gamma and the integral, which the moment takes before it grows
-    closed = np.zeros((3, 3))
-    closed[:2, :2] = G - pi.k_p * np.outer(H[:, 1], [1.0, 0.0])
-    closed[:2, 2] = H[:, 1]
-    closed[2] = -pi.k_i * period, 0.0, 1.0
-    s = np.log(np.linalg.eigvals(closed).astype(complex)) / period
-    s = np.delete(s, np.argmin(np.abs(s + slow)))  # cancelled
-    if placement == "radius":
-        assert np.prod(s) == pytest.approx(min(POLE, fast) ** 2, rel=1e-6)
-    else:
-        placed = POLE if fast > POLE else 0.5 * fast
-        assert np.min(np.abs(s + placed)) < 1e-5 * placed
-    assert s.real.max() < 0.0
-
-
-def test_sampling_fast_gives_the_continuous_design() -> None:
-    for placement in ("radius", "real"):
-        one = _sample_pi(COMS, 25.0 * KMH, 1e-5, POLE, placement)
-        other = design_pi(COMS, 25.0 * KMH, POLE, placement)
-        assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
 
 
 @functools.cache
