@@ -61,8 +61,8 @@ class _TuneEstimator:
 
     def run(self) -> None:
         from ...estimators.design import options
-        from ..tuning.estimator import STORAGE, SearchOptions, make_estimator_tuning, update
-        from ..tuning.study import make_entry, run
+        from ..tuning.estimator import make_entry, make_estimator_tuning, run, update
+        from ..tuning.search import STORAGE, SearchOptions
 
         files = [*([self.out] if self.out else []), *([options.FILE] if self.write else [])]
         check_writable(*files)
@@ -107,7 +107,7 @@ class _TuneController:
         from ...agents.baselines import FILE
         from ..control.tasks import make_tuning_seeds
         from ..tuning import controllers
-        from ..tuning.estimator import STORAGE, SearchOptions, write_tuned
+        from ..tuning.search import STORAGE, SearchOptions
 
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
         check_writable(*filter(None, (self.out, shipped[0])))
@@ -127,7 +127,7 @@ class _TuneController:
                 continue
             print_suite(console, controllers.make_suite(task, result))
             for path in filter(None, (self.out, shipped[0])):
-                write_tuned(path, kind, self.name, result["options"])
+                controllers.write_tuned(path, kind, self.name, result["options"])
             for folder in filter(None, (self.log, shipped[1])):
                 folder.mkdir(parents=True, exist_ok=True)
                 controllers.write_log(folder / f"{kind}.{self.name}.json", result)
@@ -137,8 +137,8 @@ class _TuneController:
 class _Calibrate:
     """Find the cost of the clairvoyant, the baseline that knows all, in the scored tasks.
 
-    A stopped run goes on where it was when the same command runs again in the same folder. `bench
-    control --clairvoyant FILE` reads the file.
+    A stopped run goes on with the task it was in when the same command runs again in the same
+    folder. `bench control --clairvoyant FILE` reads the file.
     """
 
     out: Path = take_argument("The file to write.", Path("clairvoyant.json"))
@@ -150,7 +150,7 @@ class _Calibrate:
     address: str
 
     def run(self) -> None:
-        from ..control.calibration import FILE, Calibration, update
+        from ..control.calibration import FILE, calibrate
         from ..control.tasks import list_scored_tasks
 
         path, seeds = FILE if self.write else self.out, self.seeds
@@ -159,16 +159,11 @@ class _Calibrate:
         for name in self.contest or []:
             check_choice("task", name, known)
         tasks = [known[name] for name in self.contest or known]
-        console, folder = Console(), Path(f".{path.name}.cases").absolute()
-        calibration = Calibration(tasks, folder, seeds)
-        total, left = len(calibration.cases), sum(not x.path.exists() for x in calibration.cases)
-        text = f"{left} of {total} episodes are left; the same command goes on if stopped."
-        console.print(text, highlight=False)
+        console = Console()
         how = "run the same command in the same folder"
         with use_engine(self.engine_name, self.address), handle_interrupt(how):
-            records = calibration.run(get_command_line(), self.jobs, console)
-        update(path, records)
-        calibration.remove_cases()
+            chosen = tasks, seeds, get_command_line(), self.jobs, console
+            records = calibrate(path.absolute(), *chosen)
         table = Table("task", "none", "clairvoyant", "a plan wins")
         for record in records:
             none = np.mean([episode.costs["none"] for episode in record.episodes])

@@ -4,21 +4,20 @@ Every controller gets the same number of trials on the same tuning seeds, with a
 objective is minus the mean score r over tasks and seeds.
 """
 
-import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ... import __version__
-from ...agents.baselines import GRIP, STEER_WEIGHT, Options
+from ...agents.baselines import GRIP, STEER_WEIGHT, Options, read_tuned
 from ...agents.controllers.two_dof import POLE
 from ...agents.controllers.yaw_stability import BANDWIDTH
+from ...envs.io import to_toml
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.scenarios.world import WORLD_VERSION
 from ...envs.validation import check_choice
@@ -28,8 +27,7 @@ from ..control.score import PairedDrives
 from ..control.tasks import NOMINAL, QUICK_LEAD_IN, ControlTask, list_scored_tasks
 from ..harness.parallel import count_cores, run_cases
 from ..harness.results import Suite, write_text
-from .estimator import SearchOptions
-from .study import create_study, make_result_table, run_search
+from .search import Range, SearchOptions, make_result_table, make_study_name, run_study
 
 KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")  # classes of tasks
 STEERING = ("coms-model", "car-steering")  # the action steers too
@@ -82,6 +80,7 @@ SPACES: dict[str, tuple[SearchNumber, ...]] = {
 tuning makes of nominal."""
 _SLOW = ("mpc", "nmpc", "adaptive-nmpc")
 _STAGES = (2, 4, 8)  # seeds after which the better half of a slow controller's trials goes on
+_HEAD = "# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.\n"
 LOGS = Path(__file__).with_name("logs")  # studies whose options the package ships
 
 
@@ -97,13 +96,11 @@ class ControllerTuning:
 
     @property
     def study(self) -> str:
-        """Name of the study: one for the same question, asked of the same sources."""
-        stamp = f"{json.dumps(asdict(self), default=str)} {hash_experiment()} {__version__}"
-        digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
-        return f"{self.name} in {self.kind} {digest}"
+        """Name of the study."""
+        return make_study_name(f"{self.name} in {self.kind}", self, hash_experiment())
 
     @property
-    def search(self) -> dict[str, tuple[float, float]]:
+    def search(self) -> dict[str, Range]:
         """Range (low, high) of each number by name."""
         return {number.name: (number.low, number.high) for number in self.numbers}
 
@@ -200,23 +197,19 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
     for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once
         if error := _run_entry(control_task, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {control_task.name}: {error}")
-    study = create_study(task, search.storage, "tpe", search.seed)
-    if not any("seeds" in trial.user_attrs for trial in study.trials):  # none was finished
-        study.enqueue_trial(task.start)
     evaluate = partial(_evaluate_trials, task, search.jobs or count_cores())
-    run_search(study, task, search, evaluate, len(task.seeds))
-    return _make_log(task, study.trials)
+    study = task.study, task.search, replace(search, sampler="tpe")
+    return _make_log(task, run_study(*study, evaluate, len(task.seeds), task.start))
 
 
 def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
-    """Make the log of a study from Optuna's trials."""
+    """Make the log of a study from its finished trials."""
     rows: list[dict[str, Any]] = []
     for item in trials:
-        if "seeds" in item.user_attrs:  # the others were stopped
-            numbers = {name: float(f"{value:.3g}") for name, value in item.params.items()}
-            value, count = item.user_attrs["objective"], item.user_attrs["seeds"]
-            known = round(value, 5) if math.isfinite(value) else None
-            rows.append({"numbers": numbers, "seeds": count, "objective": known})
+        numbers = {name: float(f"{value:.3g}") for name, value in item.params.items()}
+        value, count = item.user_attrs["objective"], item.user_attrs["seeds"]
+        known = round(value, 5) if math.isfinite(value) else None
+        rows.append({"numbers": numbers, "seeds": count, "objective": known})
     complete = [r for r in rows if r["seeds"] == len(task.seeds) and r["objective"] is not None]
     if not complete:
         raise ValueError(f"none of {len(rows)} trials of {task.name} could be driven: {task.kind}")
@@ -247,6 +240,31 @@ def write_log(path: Path, log: dict[str, Any]) -> None:
     lines = ",\n  ".join(json.dumps(trial) for trial in log["trials"])
     head = json.dumps({key: value for key, value in log.items() if key != "trials"}, indent=1)
     write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
+
+
+def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
+    """Replace or add a controller's options in a file of `read_tuned`.
+
+    Args:
+        path: File.
+        kind: Class of tasks.
+        name: Name of the controller.
+        options: Options of filter and controller.
+    """
+    target = Path(path)
+    read_tuned.cache_clear()
+    classes = read_tuned(target) if target.exists() else {}
+    classes = classes | {kind: classes.get(kind, {}) | {name: options}}
+    tables = [
+        f"[{class_name}.{entry}.{part}]\n"
+        + "".join(f"{option} = {to_toml(value)}\n" for option, value in part_options.items())
+        for class_name, names in sorted(classes.items())
+        for entry, parts in sorted(names.items())
+        for part, part_options in parts.items()
+        if part_options
+    ]
+    write_text(target, "\n".join([f"{_HEAD}world_version = {WORLD_VERSION}\n", *tables]))
+    read_tuned.cache_clear()
 
 
 def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:

@@ -1,56 +1,46 @@
-"""Tuning of an estimator: its options and ranges, its drives, and the files of tunings."""
+"""Tuning of an estimator: its options and ranges, its drives and their errors, its entry in files.
 
-import dataclasses
-import hashlib
-import json
+It is searched on training seeds and judged on test seeds.
+"""
+
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from rich.console import Console
 
-from ... import __version__
-from ...agents.baselines import Options, read_tuned
 from ...agents.rollout import rollout
 from ...envs.io import to_toml
 from ...envs.numerics.kernel_cache import hash_sources
-from ...envs.scenarios.world import WORLD_VERSION
-from ...estimators.design.options import read_tunings
+from ...envs.record import Array
+from ...estimators.design.options import TUNINGS, read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
-from ..harness.drives import LoggedEpisode, call_quietly, make_filter_arguments
-from ..harness.parallel import run_cases
-from ..harness.results import write_text
+from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
+from ..harness.parallel import count_cores, run_cases
+from ..harness.results import ResultTable, Suite, write_text
+from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from ..studies.estimation import EXPERIMENTS
-
-Range = tuple[float, float]
+from .search import (
+    BATCH,
+    Range,
+    SearchOptions,
+    load_study,
+    make_result_table,
+    make_study_name,
+    run_study,
+)
 
 _PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
 _NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
-SAMPLERS = ("cma", "tpe")
-STORAGE = "sqlite:///sideslip-tune.db"
 FIRST_SEED = 1000  # of training; the test seeds count from 0
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """How long a study is searched, and by whom; ValueError where there are no trials."""
-
-    trials: int  # of the study, the finished ones included
-    storage: str = STORAGE  # RDB URL or SQLite file
-    sampler: str = SAMPLERS[0]  # name in `SAMPLERS`
-    seed: int = 0  # of the sampler
-    jobs: int | None = None  # processes, None for all processors
-    console: Console | None = None  # where progress is shown
-
-    def __post_init__(self) -> None:
-        if self.trials < 1:
-            raise ValueError(f"trials must be at least 1, got {self.trials}")
 
 
 @dataclass(frozen=True)
@@ -74,23 +64,16 @@ class EstimatorTuning:
 
     @property
     def study(self) -> str:
-        """Name of the study: one for the same question, asked of the same sources."""
-        question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
-        stamp = f"{question} {hash_sources('estimators')} {__version__}"
-        digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
-        return f"{self.estimator} on {self.subject} {digest}"
+        """Name of the study."""
+        title = f"{self.estimator} on {self.subject}"
+        return make_study_name(title, self, hash_sources("estimators"))
 
 
 def make_estimator_tuning(
-    estimator: str,
-    scenarios: str | Sequence[str],
-    env_id: str | None = None,
-    target: str = "beta",
-    options: Mapping[str, Any] | None = None,
-    search: Mapping[str, Range | None] | None = None,
-    noises: Mapping[str, Range | None] | None = None,
-    seeds: int = 12,
-) -> EstimatorTuning:
+    estimator: str, scenarios: str | Sequence[str], env_id: str | None = None, target: str = "beta",
+    options: Mapping[str, Any] | None = None, search: Mapping[str, Range | None] | None = None,
+    noises: Mapping[str, Range | None] | None = None, seeds: int = 12,
+) -> EstimatorTuning:  # fmt: skip
     """Make a tuning of what a user asks for: check it, or ValueError, and fill in the rest.
 
     Args:
@@ -195,12 +178,9 @@ def _simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode
 
 
 def simulate(
-    task: EstimatorTuning,
-    seeds: Sequence[int],
-    title: str,
-    jobs: int | None,
+    task: EstimatorTuning, seeds: Sequence[int], title: str, jobs: int | None,
     console: Console | None,
-) -> list[LoggedEpisode]:
+) -> list[LoggedEpisode]:  # fmt: skip
     """Simulate the drives of some seeds in each scenario in turn, four a case.
 
     Args:
@@ -219,8 +199,144 @@ def simulate(
     return [drive for drives in done for drive in drives]
 
 
+def _compute_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
+    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds)."""
+    options, turn = task.options | dict(values), 2.0 * math.pi
+    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
+    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
+        clocks = [replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
+        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
+        if key not in filters:
+            filters[key] = call_quietly(make_estimator, task.estimator, **facts, **options)
+        late = log.time >= SETTLED - 1e-9
+        with np.errstate(all="ignore"):
+            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
+            if task.unit == "rad":
+                error = np.remainder(error + math.pi, turn) - math.pi
+            errors[i] = np.mean(error**2)
+    finite = np.where(np.isfinite(errors), errors, np.inf)
+    return finite.reshape(len(task.scenarios), -1)
+
+
+def _compute_stable_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
+    """Compute the squared errors, infinite where the estimator diverges."""
+    try:
+        return _compute_squares(task, drives, values)
+    except ValueError:  # a filter that diverges, a covariance that is none
+        return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
+
+
+def _compute_objective(errors: Array) -> float:
+    """Compute the geometric mean of the scenarios' RMSE from squares (scenarios, seeds)."""
+    return float(np.exp(np.mean(np.log(root_mean(errors)))))
+
+
+def _evaluate_trial(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: dict[str, float]
+) -> tuple[float, int]:
+    """Evaluate some numbers: the objective, infinite if unstable, and the drives it is of."""
+    return _compute_objective(_compute_stable_squares(task, drives, values)), len(drives)
+
+
+def _search(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], search: SearchOptions
+) -> dict[str, float]:
+    """Search on training drives until the study has so many trials; the best numbers, 3 digits."""
+    evaluate, jobs = functools.partial(_evaluate_trial, task, drives), search.jobs or count_cores()
+
+    def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+        return run_cases(evaluate, batch, jobs=min(jobs, BATCH))
+
+    trials = run_study(task.study, task.search, search, evaluate_batch, len(drives))
+    best = min(trials, key=lambda trial: float(trial.user_attrs["objective"]))
+    if not math.isfinite(best.user_attrs["objective"]):
+        _compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
+        text = f"none of {search.trials} trials of {task.estimator} gave finite estimates"
+        raise ValueError(text)
+    return {name: float(f"{v:.3g}") for name, v in best.params.items()}
+
+
+def run(
+    task: EstimatorTuning, search: SearchOptions, test_seeds: int = 20
+) -> tuple[Suite, dict[str, float]]:
+    """Search on the task's seeds, and judge on others; ValueError where no filter is stable.
+
+    Args:
+        task: Tuning.
+        search: Options of the search.
+        test_seeds: Number of test seeds, from 0 on.
+
+    Returns:
+        Suite, and the best numbers by name, of three digits.
+    """
+    if not 1 <= test_seeds <= task.seeds[0]:
+        raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
+    load_study(task.study, task.search, search)  # or ValueError, before anything is driven
+    simulate_drives = functools.partial(simulate, task, jobs=search.jobs, console=search.console)
+    training = simulate_drives(task.seeds, title="training drives")
+    numbers = _search(task, training, search)
+    test = simulate_drives(range(test_seeds), title="test drives")
+    text = (
+        f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % intervals; "
+        f"{search.trials} trials. The default is make_estimator with no more than what is held "
+        "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
+        "least."
+    )
+    comparisons = _make_comparisons(task, (training, test), numbers)
+    tables = [*comparisons, make_result_table(numbers, task.search)]
+    return Suite("tune", f"Tuning {task.estimator} on {task.subject}", text, tables=tables), numbers
+
+
+def _make_comparisons(
+    task: EstimatorTuning, groups: Sequence[Sequence[LoggedEpisode]], numbers: dict[str, float]
+) -> list[ResultTable]:
+    """Make a table of errors before and after for each scenario, in training and test drives."""
+    default = [_compute_stable_squares(task, drives, {}) for drives in groups]
+    tuned = [_compute_stable_squares(task, drives, numbers) for drives in groups]
+    tables = []
+    for i, scenario in enumerate(task.scenarios):
+        before, after = [values[i] for values in default], [values[i] for values in tuned]
+        ratio = Estimate(math.nan)
+        if np.isfinite([before[1], after[1]]).all():
+            ratio = interval(after[1], ratio_of_roots, before[1])
+        title = f"{task.estimator} on {scenario} ({task.env_id})"
+        heads = ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds")
+        lines = [["default", *map(_format_spread, before)], ["found", *map(_format_spread, after)]]
+        note = f"Found over default on the test seeds: {ratio.inline(digits='.3f')}."
+        tables.append(ResultTable(title, heads, lines, note))
+    return tables
+
+
+def _format_spread(errors: Array) -> str:
+    if not np.isfinite(errors).all():
+        return "diverges"
+    return interval(errors, root_mean).inline(digits=".4g")
+
+
+def make_entry(
+    task: EstimatorTuning, numbers: dict[str, float], command: str, note: str = ""
+) -> dict[str, object]:
+    """Make the entry of a tunings file from the numbers that a command found.
+
+    Args:
+        task: Tuning.
+        numbers: Value by option.
+        command: Command that found them.
+        note: Remark, "" for none.
+    """
+    used = task.options | numbers
+    q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
+    q = TUNINGS.get((task.estimator, task.sensors), {}) | q
+    noise = {key: value for key, value in numbers.items() if not key.startswith("q_")}
+    known = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
+    return {**known, "q": q, "noise": noise, **({"note": note} if note else {})}
+
+
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
-_TUNED = "# Options of entries as [class.name.part]; found by `sideslip tune controller NAME`.\n"
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
 # searched too. Each entry is the output of its command; `sensors` are the slow ones.
@@ -253,28 +369,3 @@ def _make_key(entry: dict[str, Any]) -> tuple[str, str]:
 def _format_entry(entry: dict[str, Any]) -> str:
     present = [key for key in _KEYS if entry.get(key) not in (None, {})]
     return "[[tuning]]\n" + "".join(f"{key} = {to_toml(entry[key])}\n" for key in present)
-
-
-def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
-    """Replace or add a controller's options in a file of `read_tuned`.
-
-    Args:
-        path: File.
-        kind: Class of tasks.
-        name: Name of the controller.
-        options: Options of filter and controller.
-    """
-    target = Path(path)
-    read_tuned.cache_clear()
-    classes = read_tuned(target) if target.exists() else {}
-    classes = classes | {kind: classes.get(kind, {}) | {name: options}}
-    tables = [
-        f"[{class_name}.{entry}.{part}]\n"
-        + "".join(f"{option} = {to_toml(value)}\n" for option, value in part_options.items())
-        for class_name, names in sorted(classes.items())
-        for entry, parts in sorted(names.items())
-        for part, part_options in parts.items()
-        if part_options
-    ]
-    write_text(target, "\n".join([f"{_TUNED}world_version = {WORLD_VERSION}\n", *tables]))
-    read_tuned.cache_clear()

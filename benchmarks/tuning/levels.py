@@ -1,15 +1,16 @@
-"""Levels of `joint`, found on simulated cars of world v1 by a log score.
+"""Levels of `joint`, found on simulated cars by a log score, and what its parts are worth.
 
-`python -m sideslip.benchmarks.tuning.levels --trials 2000 --out levels.json` goes on from the
-levels in use. Every drive has a car, errors, a road and an event of its own; in 60 % of them the
-ranges of two groups of errors are doubled, since the next car is none of these.
+`python -m sideslip.benchmarks.tuning.levels search --trials 2000 --out levels.json` goes on from
+the levels in use. Every drive has a car, errors, a road and an event of its own; in 60 % of them
+the ranges of two groups of errors are doubled, since the next car is none of these. `... levels
+parts --drives 250 --out docs/next_car.json` runs filters with one part less over other such drives.
 """
 
 import dataclasses
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +19,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from ...envs.numerics.kernel_cache import hash_sources
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.scenarios.world import GROUPS, make_world
 from ...envs.sensors.link import SlowSensor
@@ -34,7 +36,10 @@ from ..harness.drives import (
 )
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
+from ..harness.stats import average, compute_honesty
+from .search import STORAGE, SearchOptions, run_study
 
+app = typer.Typer()
 NAME = "joint"
 _SEARCHED = (
     *("q_front_tyres", "front_tyres_sd", "inverse_friction_sd", "q_inverse_friction"),
@@ -47,7 +52,7 @@ _SEARCHED = (
 )  # options whose factors are searched; how roads and cameras lean is no matter of search
 _KINDS = ("camera", "gps", "camera and gps", "gps, 100 Hz", "nothing, 100 Hz")
 _WORST = 100.0  # squared error over its variance, of which more counts as much
-_POPULATION = 12
+_REACH = 2.5  # times a level, to the ends of its range; CMA-ES begins with a sixth of the range
 
 
 def _draw_event(rng: np.random.Generator, is_small: bool) -> dict[str, object]:
@@ -107,16 +112,8 @@ def _reduce_rate(log: Log, every: int, sensors: Iterable[str]) -> Log:
     return Log(thinned, slow, {name: truth[::every] for name, truth in log.truth.items()})
 
 
-def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
-    """Drive a drawn car of world v1 under drawn steering.
-
-    Args:
-        seed: Seed of everything.
-        duration: Duration (s).
-
-    Returns:
-        Its log with the true sideslip angle, and the arguments of a filter that has a data sheet.
-    """
+def _draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
+    """Drive a drawn car of world v1; the filter's arguments have a data sheet that errs."""
     rng, kind = np.random.default_rng([43, seed]), _KINDS[seed % len(_KINDS)]
     is_small, world = rng.random() < 0.3, make_world("v1")
     if rng.random() < 0.6:
@@ -149,16 +146,8 @@ def draw_drive(seed: int, duration: float = 14.0) -> LoggedEpisode:
     return LoggedEpisode(log, facts)
 
 
-def run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[Array, Array]:
-    """Run `joint` over a drive.
-
-    Args:
-        episode: A drive of `draw_drive`.
-        options: Options of the filter over its defaults.
-
-    Returns:
-        Errors of the sideslip angle and their deviations (rad), once settled, every 10 ms.
-    """
+def _run_filter(episode: LoggedEpisode, options: Mapping[str, object]) -> tuple[Array, Array]:
+    """Run `joint`: errors of the sideslip angle and deviations (rad), settled, every 10 ms."""
     log, dt = episode.log, episode.log.record.dt
     estimates = make_unchecked_filter(NAME, log, episode.facts["vehicle"], options).run(log)
     rows = slice(round(SETTLED / dt), None, max(1, round(0.01 / dt)))
@@ -181,7 +170,7 @@ def _convert_levels(levels: Mapping[str, float], log: Log) -> dict[str, float]:
     return {key: value for key, value in options.items() if key not in left_out}
 
 
-_draw_once = cache(draw_drive)
+_draw_once = cache(_draw_drive)
 
 
 def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
@@ -190,7 +179,7 @@ def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
     scores = []
     for seed in seeds:
         episode = _draw_once(seed)
-        error, deviation = run_filter(episode, _convert_levels(levels, episode.log))
+        error, deviation = _run_filter(episode, _convert_levels(levels, episode.log))
         if not len(error):  # it spun before the filter had settled
             continue
         squares = np.minimum((error / deviation) ** 2, _WORST)
@@ -199,55 +188,103 @@ def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
 
 
 def _search(
-    start: Mapping[str, float], trials: int, drives: int, jobs: int | None, console: Console
+    start: Mapping[str, float], drives: int, search: SearchOptions
 ) -> tuple[dict[str, float], float, float]:
-    """Search by CMA-ES on the logs of factors; best levels, their log score (rad), the start's."""
-    from cmaes import CMA  # of the extra `tune`
+    """Search from some levels on: the best levels, their log score (rad), and the start's."""
+    ranges = {name: (level / _REACH, level * _REACH) for name, level in start.items()}
 
-    names, scores = list(start), list[float]()
-    search_state = CMA(np.zeros(len(names)), 0.3, seed=1, population_size=_POPULATION)
-    best, best_score = dict(start), math.inf
-    while len(scores) < trials:
-        asked = [search_state.ask() for _ in range(_POPULATION)]
-        if not scores:
-            asked[0] = np.zeros(len(names))  # the start itself
-        levels = [{k: start[k] * math.exp(v) for k, v in zip(names, x, strict=True)} for x in asked]
-        cases = [(x, range(i, drives, 2)) for x in levels for i in range(2)]
-        title = f"{len(scores)} of {trials} trials"
-        halves = run_cases(_score, cases, title, jobs, console)
-        results = [float(np.mean([*halves[2 * i], *halves[2 * i + 1]])) for i in range(len(levels))]
-        search_state.tell(list(zip(asked, results, strict=True)))
-        scores += results
-        lowest = int(np.argmin(results))
-        if results[lowest] < best_score:
-            best, best_score = levels[lowest], results[lowest]
-        console.print(f"{title}: {best_score:.3f}", highlight=False)
-    return best, best_score, scores[0]
+    def evaluate(batch: Sequence[Mapping[str, float]]) -> list[tuple[float, int]]:
+        cases = [(levels, range(i, drives, 2)) for levels in batch for i in range(2)]
+        scores = iter(run_cases(_score, cases, jobs=search.jobs))
+        return [(float(np.mean([*next(scores), *next(scores)])), drives) for _ in batch]
+
+    name = f"levels of {NAME} on {drives} drives {hash_sources('estimators')}"
+    trials = run_study(name, ranges, search, evaluate, drives, start)
+    scores = [trial.user_attrs["objective"] for trial in trials]
+    best = int(np.argmin(scores))
+    return trials[best].params, scores[best], scores[0]
 
 
-def get_levels() -> dict[str, float]:
+def _get_levels() -> dict[str, float]:
     """Return the levels in use, of the options that are searched."""
     row = dict(FILTERS[NAME].options)
     return {name: float(row[name]) for name in _SEARCHED}
 
 
-def main(
+@app.command("search")
+def _search_levels(
     trials: Annotated[int, typer.Option(min=1, help="Trials.")] = 1200,
     drives: Annotated[int, typer.Option(min=5, help="Drives, the same for all.")] = 120,
-    start: Annotated[
-        Path | None, typer.Option(help="JSON of levels; default: those in use.")
-    ] = None,
     out: Annotated[Path, typer.Option(help="JSON for the levels.")] = Path("levels.json"),
+    storage: Annotated[str, typer.Option(help="Where a stopped search goes on.")] = STORAGE,
     jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
 ) -> None:
-    """Search the levels of `joint` and write them."""
-    first = get_levels() if start is None else json.loads(start.read_text(encoding="utf-8"))
-    best, score, before = _search(first, trials, drives, jobs, Console())
+    """Search the levels of `joint` from those in use, and write them."""
+    search = SearchOptions(trials, storage, seed=1, jobs=jobs, console=Console())
+    best, score, before = _search(_get_levels(), drives, search)
     levels = {name: float(f"{value:.3g}") for name, value in best.items()}
     write_text(out, json.dumps({"score": score, "before": before, "levels": levels}, indent=1))
+
+
+FIRST_SEED = 100_000  # no drive of the search
+_NO_TYRES = {"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "inverse_friction_sd": 0.0}
+PARTS: dict[str, Mapping[str, object]] = {
+    "joint": {},
+    "without the accelerometer": {"fast": ("gyro",)},
+    "without a time of the moment's own": {"moment_time": 0.0},
+    "without noise found while driving": {"noise_time": 0.0},
+    "without heavy tails": {"robust": 0.0},
+    "without the gyro's bias": {"bias_sd": 0.0},
+    "without the accelerometer's bias": {"accel_bias_sd": 0.0},
+    "without the accelerometer's scale": {"accel_scale_sd": 0.0},
+    "without the steering's offset": {"steer_offset_sd": 0.0},
+    "without the road's bank": {"bank_sd": 0.0},
+    "without the camera's yaw": {"camera_yaw_sd": 0.0},
+    "without the map's heading": {"map_heading_sd": 0.0},
+    "without friction": {"inverse_friction_sd": 0.0},
+    "without tyres": _NO_TYRES | {"accel_scale_sd": 0.0},
+}  # filters by name, as options over the defaults
+
+
+def _judge_parts(seed: int, names: tuple[str, ...]) -> list[tuple[float, ...]]:
+    """Judge all filters on a drive: RMS error (rad), NEES, coverage, log score of each."""
+    episode, judged = _draw_drive(seed), list[tuple[float, ...]]()
+    for name in names:
+        error, deviation = _run_filter(episode, PARTS[name])
+        if len(error):
+            judged.append((float(np.sqrt(np.mean(error**2))), *compute_honesty(error, deviation)))
+    return judged
+
+
+@app.command("parts")
+def _compare_parts(
+    drives: Annotated[int, typer.Option(min=2, help="Drives, the same for all.")] = 250,
+    out: Annotated[Path | None, typer.Option(help="JSON for the table.")] = None,
+    jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
+) -> None:
+    """Compare `joint` with itself, one part less at a time."""
+    console, names = Console(), tuple(PARTS)
+    seeds = range(FIRST_SEED, FIRST_SEED + drives)
+    judged = run_cases(partial(_judge_parts, names=names), seeds, "the next car", jobs, console)
+    numbers = np.array([row for row in judged if row])  # (drives, filters, 4)
+    rows = []
+    for i, name in enumerate(names):
+        rmse, nees, held, score = numbers[:, i].T
+        lead = average(numbers[:, 0, 3] - score)
+        row = {
+            "filter": name,
+            "rms / deg": math.degrees(float(np.sqrt(np.mean(rmse**2)))),
+            "median NEES": float(np.median(nees)),
+            "in 95 % / %": 100.0 * float(np.mean(held)),
+            "log score lost": [float(lead.value), float(lead.low), float(lead.high)],
+        }
+        rows.append(row)
+        console.print(row, highlight=False)
+    if out is not None:
+        write_text(out, json.dumps({"n": len(numbers), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
     from sideslip.benchmarks.tuning import levels  # by its name, so that workers can import it
 
-    typer.run(levels.main)
+    levels.app()

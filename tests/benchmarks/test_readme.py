@@ -105,7 +105,7 @@ def test_a_task_has_a_line_with_intervals() -> None:
 
 
 def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = DriveResult(np.zeros((0, len(NUMBERS))), 0.0, error="no action")
+    wrong = DriveResult(np.zeros((0, len(NUMBERS))), error="no action")
     monkeypatch.setattr(readme, "measure", lambda x, *_, **__: dict.fromkeys(x, wrong))
     with pytest.raises(ValueError, match=r"in .*: no action"):
         readme._measure_entries()

@@ -147,7 +147,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "package").mkdir()
 
     def stand_in(case: Any) -> ClairvoyantEpisode:
-        return ClairvoyantEpisode(case.seed, 1.0, "from none", {"none": 2.0}, {"none": "ok"}, 0.0)
+        return ClairvoyantEpisode(case[1], 1.0, "from none", {"none": 2.0}, {"none": "ok"}, 0.0)
 
     monkeypatch.setattr(calibration, "_solve", stand_in)
     return tmp_path

@@ -150,7 +150,7 @@ CASES = [
          ("--option fast=true", "observation_options", {"fast": True}),
          ("--seed 7", "seed", 7)),
     *_of(DISTIL, f"{CLI}.policies.evaluate_on_tasks", ("--episodes 8", "episodes", 8)),
-    *_of("tune estimator exact-kf --scenario gust", "benchmarks.tuning.study.run",
+    *_of("tune estimator exact-kf --scenario gust", "benchmarks.tuning.estimator.run",
          ("--seed 4", "search.seed", 4)),
     *_of("tune controller lqr", "benchmarks.tuning.controllers.make_controller_tuning",
          ("--class car-yaw", "kind", "car-yaw"),
@@ -161,7 +161,7 @@ CASES = [
          ("--seed 4", "search.seed", 4),
          ("--jobs 3", "search.jobs", 3)),
     *_of(TUNE, f"{CLI}.search.use_engine", *CLUSTER),
-    *_of(TUNE, "benchmarks.tuning.estimator.write_tuned",
+    *_of(TUNE, "benchmarks.tuning.controllers.write_tuned",
          ("--out a.toml", "path", Path("a.toml")),
          ("--write", "path", TUNED)),
     *_of(TUNE, "benchmarks.tuning.controllers.write_log",
@@ -189,7 +189,7 @@ RETURNED: dict[str, dict[str, Any]] = {
              "benchmarks.tuning.controllers.tune": {"options": {}},
              "benchmarks.tuning.controllers.make_suite": None,
              "benchmarks.tuning.controllers.write_log": None,
-             "benchmarks.tuning.estimator.write_tuned": None,
+             "benchmarks.tuning.controllers.write_tuned": None,
              f"{CLI}.search.use_engine": nullcontext(), f"{CLI}.search.print_suite": None},
 }
 """What functions on a command's way give back instead of working."""

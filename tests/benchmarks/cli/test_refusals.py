@@ -1,12 +1,13 @@
 """Each way to type a command wrong: one line that names the mistake, and no file."""
 
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from sideslip.benchmarks.tuning import estimator as tuning
 from tests.benchmarks.conftest import Run
 from tests.policies import VISION
 
@@ -15,7 +16,16 @@ SCENARIO = "tie-vision-fig8"
 TUNE = ("tune", "estimator", "--seeds", 1, "--test-seeds", 2, "--jobs", 1)
 LAW, DISTIL = ("tune", "controller"), ("distill", "mine", "--class")
 FIG8 = (*TUNE, "bicycle-kf", "--scenario", SCENARIO)
-DRIVES = cache(tuning._simulate_case)  # each is driven once for all tests
+
+
+@cache
+def make_cached_simulation() -> Callable[[Any], Any]:
+    """Simulate each drive of a tuning once for all tests."""
+    from sideslip.benchmarks.tuning import estimator
+
+    return cache(estimator._simulate_case)
+
+
 NEEDS = {"distill": "torch", "train": "stable_baselines3", "tune": "optuna"}
 MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
@@ -146,9 +156,11 @@ def test_a_mistake_is_one_line_that_names_it(
     said: str,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tuning, "_simulate_case", DRIVES)
     if (needed := NEEDS.get(str(arguments[0]))) and find_spec(needed) is None:
         pytest.skip(f"needs {needed}")
+    if arguments[0] == "tune":
+        name = "sideslip.benchmarks.tuning.estimator._simulate_case"
+        monkeypatch.setattr(name, make_cached_simulation())
     status, out, err = run(*arguments)
     assert status == 2
     assert said in " ".join(err.split()) and "secret" not in err and "Traceback" not in out + err

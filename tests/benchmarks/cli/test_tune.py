@@ -7,23 +7,22 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("optuna")
 from sideslip.benchmarks.tuning import estimator as tune_file
-from sideslip.benchmarks.tuning import study as tune_study
 from sideslip.estimators.design import options
 from tests.benchmarks.conftest import Run
 
-from .test_refusals import DRIVES, SCENARIO
+from .test_refusals import SCENARIO, make_cached_simulation
 
 FIG8 = ("bicycle-kf", "--scenario", SCENARIO)
 ENTRY = {"estimator": "dakf", "sensors": "gps", "command": "", "q": {"beta": 1e-9}}
-pytest.importorskip("optuna")
 
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip tune estimator` in an empty folder; gives (exit status, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tune_file, "_simulate_case", DRIVES)
+    monkeypatch.setattr(tune_file, "_simulate_case", make_cached_simulation())
     return partial(run, "tune", "estimator")
 
 
@@ -54,7 +53,8 @@ def test_write_changes_ours(run: Run, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_without_the_extra_the_command_names_it(
     run: Run, missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, tune_study.__name__)
+    for module in ("estimator", "search"):
+        monkeypatch.delitem(sys.modules, f"sideslip.benchmarks.tuning.{module}", raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
     status, _, err = run(*FIG8, *FEW)
     assert status == 2 and "pip install 'sideslip[tune]'" in err

@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip("optuna")
 
 import pytest
-from rich.console import Console
 
 from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
 from sideslip.benchmarks.control.entries import ControlCase
@@ -26,16 +25,18 @@ from sideslip.benchmarks.tuning.controllers import (
     _compute_objective,
     _run_entry,
     tune,
+    write_tuned,
 )
-from sideslip.benchmarks.tuning.estimator import SearchOptions, write_tuned
 from sideslip.benchmarks.tuning.levels import (
+    PARTS,
+    _compare_parts,
     _convert_levels,
+    _draw_drive,
+    _get_levels,
+    _run_filter,
     _search,
-    draw_drive,
-    get_levels,
-    run_filter,
 )
-from sideslip.benchmarks.tuning.next_car import PARTS, main
+from sideslip.benchmarks.tuning.search import SearchOptions
 from tests.benchmarks.conftest import Run
 
 SHORT = ControlTask(scenario="sine-with-dwell")
@@ -80,7 +81,7 @@ def test_a_search_stopped_in_its_first_batch_begins_at_the_start_again(
         return 1.0
 
     monkeypatch.setattr(controllers, "_compute_objective", fake)
-    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1)), 0.0))
+    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1))))
     search = task(SearchNumber("gain", 1.0, 0.1, 10.0)), SearchOptions(9, storage(tmp_path), jobs=1)
     with pytest.raises(KeyboardInterrupt):
         tune(*search)
@@ -114,7 +115,7 @@ def test_a_drive_that_is_lost_alone_counts_two(monkeypatch: pytest.MonkeyPatch) 
         numbers = np.zeros((2, len(NUMBERS)))
         numbers[:, NUMBERS.index("cost")] = [0.5, 900.0] if name == "two-dof" else 1.0
         numbers[:, NUMBERS.index("failure")] = [0.0, 1.0] if name == "two-dof" else 0.0
-        return DriveResult(numbers, 0.0)
+        return DriveResult(numbers)
 
     monkeypatch.setattr(controllers, "_run_entry", fake)
     controllers._drive_nominal.cache_clear()
@@ -138,7 +139,7 @@ def test_of_slow_entries_half_stops_early(monkeypatch: pytest.MonkeyPatch, tmp_p
         return abs(math.log(found["grip"] / 0.5)) + float(seeds[0] == first)
 
     monkeypatch.setattr(controllers, "_compute_objective", fake)
-    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1)), 0.0))
+    monkeypatch.setattr(controllers, "_run_entry", lambda *_: DriveResult(np.zeros((1, 1))))
     slow = task(SearchNumber("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(make_tuning_seeds(16)))
     first = slow.seeds[0]
     log = tune(slow, SearchOptions(16, storage(tmp_path), jobs=1))
@@ -230,9 +231,9 @@ def test_the_command_writes_both(run: Run, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
-    first, again = (draw_drive(3, 4.0) for _ in range(2))
+    first, again = (_draw_drive(3, 4.0) for _ in range(2))
     assert np.array_equal(first.log.record.fast, again.log.record.fast)
-    drives = [draw_drive(seed, 4.0) for seed in range(5)]
+    drives = [_draw_drive(seed, 4.0) for seed in range(5)]
     assert [" ".join(sorted(x.log.slow)) for x in drives] == [
         "camera",
         "gps",
@@ -243,25 +244,25 @@ def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
     assert [x.log.record.dt for x in drives] == [0.001] * 3 + [0.01] * 2
     assert all(x.facts["vehicle"] != drives[0].facts["vehicle"] for x in drives[1:])
     for drive in drives:  # the levels in use are the defaults
-        error, deviation = run_filter(drive, _convert_levels(get_levels(), drive.log))
+        error, deviation = _run_filter(drive, _convert_levels(_get_levels(), drive.log))
         assert np.isfinite(error).all() and (deviation > 0.0).all()
 
 
 def test_every_part_can_be_left_out() -> None:
-    drive = draw_drive(2, 3.0)
-    whole = run_filter(drive, {})[0]
+    drive = _draw_drive(2, 3.0)
+    whole = _run_filter(drive, {})[0]
     for name, options in list(PARTS.items())[1:]:
-        assert not np.array_equal(run_filter(drive, options)[0], whole), name
+        assert not np.array_equal(_run_filter(drive, options)[0], whole), name
 
 
 @pytest.mark.long
-def test_levels_that_are_far_off_are_left() -> None:
-    start = get_levels() | {"gyro_noise": 0.1, "force_share": 0.5}
-    _, found, before = _search(start, 36, 10, 1, Console(quiet=True))
+def test_levels_that_are_far_off_are_left(tmp_path: Path) -> None:
+    start = _get_levels() | {"gyro_noise": 0.1, "force_share": 0.5}
+    _, found, before = _search(start, 10, SearchOptions(36, storage(tmp_path), seed=1, jobs=1))
     assert found < before - 0.1
 
 
 @pytest.mark.long
 def test_the_table_of_parts_is_written(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    main(3, tmp_path / "table.json", 1)
+    _compare_parts(3, tmp_path / "table.json", 1)
     assert "without tyres" in (tmp_path / "table.json").read_text()

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.clairvoyant.preview import make_forecast
+from sideslip.agents.clairvoyant.forecast import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device import make_device_env
 from sideslip.envs.record import FAST

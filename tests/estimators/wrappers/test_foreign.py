@@ -13,7 +13,6 @@ from gymnasium.envs.registration import EnvSpec
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.harness.drives import LoggedEpisode, make_filter_arguments
-from sideslip.benchmarks.tuning.estimator import make_estimator_tuning
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, EstimatorFactory, EstimatorLike, make_estimator
 from sideslip.estimators.make import register_estimator
@@ -199,7 +198,7 @@ def test_it_can_be_tuned() -> None:
     """By its own options; a smaller error of the sideslip angle is a smaller number."""
     ukf()
     pytest.importorskip("optuna")
-    from sideslip.benchmarks.tuning.study import _compute_squares
+    from sideslip.benchmarks.tuning.estimator import _compute_squares, make_estimator_tuning
 
     search: dict[str, Any] = {"gyro": None}
     task = make_estimator_tuning(UKF, "tie-vision-fig7", search=search, seeds=1)
