@@ -20,14 +20,14 @@ from gymnasium.envs.registration import EnvSpec
 
 import sideslip.agents.learned.policy
 import sideslip.benchmarks.control.calibration
-import sideslip.benchmarks.entrants.baselines
+import sideslip.benchmarks.entrants.challenge
 from sideslip.agents import make_agent
 from sideslip.agents.baselines import read_tuned
 from sideslip.agents.learned.policy import list_shipped, load_policy
 from sideslip.agents.live import controller, messages
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control.tasks import TaskMeasurement, _read_tasks
-from sideslip.benchmarks.entrants.baselines import _read_baselines
+from sideslip.benchmarks.entrants.challenge import _read_baselines
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
@@ -74,7 +74,7 @@ def names_now() -> dict[str, list[str]]:
             *fields_of(calibration.CalibrationRecord),
             *fields_of(calibration.ClairvoyantEpisode),
         ],
-        "baselines": fields_of(sideslip.benchmarks.entrants.baselines.BaselineRecord),
+        "baselines": fields_of(sideslip.benchmarks.entrants.challenge.BaselineRecord),
         "session": list(controller._SETUP),
         "datagrams": [name for kind in messages.FIELDS.values() for name in kind],
         "info": sorted(info),

@@ -1,71 +1,30 @@
-"""What tasks demand of a car, which decides what is scored, and what delay costs the baselines.
+"""What tasks demand of a car, which decides what is scored.
 
-Tasks are scored where a car without control slips or is lost, never by
-who gains: `python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates on
-tuning seeds and writes the file.
+Tasks are scored where a car without control slips or is lost, never by who gains: `python -m
+sideslip.benchmarks.control.baseline_gaps --write` measures all candidates on tuning seeds and
+writes the file.
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
 from ...envs.scenarios.world import WORLD_VERSION
 from ..harness.results import write_text
-from ..harness.stats import Estimate, geometric_mean
 from . import tasks
-from .entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
+from .entries import Entry
 from .run import Results, measure
-from .score import PairedDrives, compute_log_ratios
+from .score import PairedDrives
 from .tables import compute_gaps
 from .tasks import NOMINAL, ORACLES, PARAMETERS, STATE, ControlTask, TaskMeasurement
 
-DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
-# s between the frames of a late camera: 0.3 s late, 7 are in flight of `link.MAX_IN_FLIGHT`
-_FRAME_PERIOD = 0.05
-DELAY_TASK = ControlTask("small car", tasks.YAW, "coms", "zero-slip", "small-car-random")
-_FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
-DELAY_ENTRIES = (
-    *(Entry(name) for name in (NOMINAL, ORACLES[PARAMETERS][0], ORACLES[STATE][0])),
-    *(Entry(REFERENCE_CONTROLLER, name) for name in _FILTERS),
-)
-
-
-def measure_delay_cost(
-    seeds: Sequence[int], **options: Any
-) -> tuple[dict[Entry, list[Estimate]], list[tuple[float, Results]]]:
-    """Drive `DELAY_ENTRIES` with camera and GPS late by each of `DELAYS`, all on the same seeds.
-
-    Args:
-        seeds: Seeds of the episodes.
-        options: Options of `measure`.
-
-    Returns:
-        Costs over that of nominal with sensors in time, at each delay, by entry; episodes by delay.
-    """
-    late = []
-    for delay in DELAYS:
-        delays = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
-        changes = {"scenario": {"base": DELAY_TASK.scenario, **delays}}
-        task = replace(DELAY_TASK, changes=changes | {"camera": {"period": _FRAME_PERIOD}})
-        late.append((delay, measure([(task, entry) for entry in DELAY_ENTRIES], seeds, **options)))
-    in_time, costs = late[0][1][DELAY_TASK, Entry(NOMINAL)], dict[Entry, list[Estimate]]()
-    for entry in DELAY_ENTRIES:
-        for _, results in late:
-            result, logs = results[DELAY_TASK, entry], np.empty(0)
-            if not (result.error or in_time.error):
-                mask = in_time.survived[: len(result.costs)]
-                logs = -compute_log_ratios(in_time.costs[: len(mask)], result)[mask]
-            costs.setdefault(entry, []).append(geometric_mean(logs))
-    return costs, late
-
-
-EPISODES = 32
+_SHORT = {"lead_in": tasks.QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
 MIN_PEAK = 2.0  # deg, median peak of the slip angle without control; below it nobody needs help
 MIN_LOST = 0.3  # of the cars without control, at the limit
 MAX_SHARE = 0.5  # of these, that the best baseline may lose: what nobody saves separates nobody
@@ -119,12 +78,11 @@ def _describe_verdict(tier: str, peak: float, lost: float, lost_by_best: float) 
 
 
 def _main(
-    write: bool = False, episodes: int = EPISODES, jobs: int | None = None, keep: Path | None = None
+    write: bool = False, episodes: int = 32, jobs: int | None = None, keep: Path | None = None
 ) -> None:
     """Measure which tasks are scored: what they demand of a car, on tuning seeds (2 or more)."""
     console = Console()
-    short = {"lead_in": tasks.QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
-    candidates = [replace(task, changes=short) for task in tasks.list_candidates()]
+    candidates = [replace(task, changes=_SHORT) for task in tasks.list_candidates()]
     cases = [(task, entry) for task in candidates for entry in _BASELINES]
     seeds = tasks.make_tuning_seeds(episodes)
     results = measure(cases, seeds, jobs=jobs, console=console, keep=keep)
@@ -139,6 +97,4 @@ def _main(
 
 
 if __name__ == "__main__":
-    import typer
-
     typer.run(_main)

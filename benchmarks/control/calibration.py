@@ -6,10 +6,8 @@ baselines drive the same seeds when a table is made. An entry is refused that no
 
 import hashlib
 import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +20,10 @@ from ...envs.io import from_json
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.scenarios.world import WORLD_VERSION
-from ...envs.validation import is_finite
 from ..harness.parallel import run_cases
 from ..harness.results import read_objects, write_text
-from .entries import ControlCase, Entry
-from .run import Results, hash_sources, measure
+from .entries import Entry
+from .run import hash_sources, measure
 from .score import compute_log_ratios
 from .tasks import NOMINAL, STATE, ControlTask, TaskRecord, find_oracle
 
@@ -74,104 +71,60 @@ def _derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
-@dataclass(frozen=True)
-class _CalibrationCase:
-    """One episode of a task."""
-
-    task: ControlTask
-    seed: int
-    folder: Path  # of finished cases
-
-    @property
-    def path(self) -> Path:
-        """The file of the finished case; other sources or another question give another name."""
-        oracle = find_oracle(self.task)  # with which the search begins
-        key = [self.task.record, oracle, self.seed, hash_sources(), WORLD_VERSION]
-        digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()
-        return self.folder / f"{digest[:24]}.json"
-
-    def read_finished(self) -> ClairvoyantEpisode | None:
-        """The episode of the file; None where it is absent or damaged."""
-        try:
-            entry = json.loads(self.path.read_text(encoding="utf-8"))
-            episode = from_json(ClairvoyantEpisode, entry, str(self.path))
-        except (OSError, ValueError, RecursionError):
-            return None
-        costs = [episode.cost, episode.costs.get("none", math.nan), episode.seconds]
-        return episode if episode.seed == self.seed and all(map(is_finite, costs)) else None
-
-
-def _solve(case: _CalibrationCase) -> ClairvoyantEpisode:
-    """Solve from nominal's and the oracle's runs, or read the folder of finished cases."""
+def _solve(case: tuple[ControlTask, int]) -> ClairvoyantEpisode:
+    """Solve a task's episode of a seed from nominal's and the oracle's runs."""
     from ...agents.baselines import make_oracle
     from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
 
-    done = case.read_finished()
-    if done is not None:
-        return done
-    task, starts = case.task, {}
+    (task, seed), starts = case, {}
     for name, oracle in ((NOMINAL, NOMINAL), (STATE, find_oracle(task))):
         driver = make_oracle(oracle, task.env_id, **task.env_options)
-        starts[name] = record_actions(*driver, case.seed)
+        starts[name] = record_actions(*driver, seed)
     env: CarEnv = gym.make(task.env_id, **task.env_options)
-    result = compute_clairvoyant(env, case.seed, starts)
+    result = compute_clairvoyant(env, seed, starts)
     plan = (result.cost, result.winner, result.costs, result.statuses, round(result.seconds, 1))
-    episode = ClairvoyantEpisode(case.seed, *plan)
-    write_text(case.path, json.dumps(asdict(episode)))
-    return episode
+    return ClairvoyantEpisode(seed, *plan)
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """The calibration of tasks; a stopped run goes on from the folder of finished cases.
+def calibrate(
+    path: Path, tasks: Sequence[ControlTask], count: int = SEEDS, command: str = "",
+    jobs: int | None = None, console: Console | None = None,
+) -> list[CalibrationRecord]:  # fmt: skip
+    """Solve the episodes of tasks, one task after the other, and write them to a file.
+
+    Finished tasks of a stopped run lie in a file beside it, whose name follows the sources.
+
+    Args:
+        path: File, whose entries of other tasks stay.
+        tasks: Tasks.
+        count: Seeds of a task, two or more.
+        command: Command line, for the records.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
 
     Raises:
+        ModuleNotFoundError: CasADi or OSQP is not installed.
         ValueError: There are fewer than two seeds, so that there is no interval.
     """
-
-    tasks: Sequence[ControlTask]
-    folder: Path  # of finished cases
-    seeds: int = SEEDS  # of a task, two or more
-
-    def __post_init__(self) -> None:
-        if self.seeds < 2:
-            raise ValueError(f"an interval needs two seeds or more, got {self.seeds}")
-
-    @cached_property
-    def cases(self) -> list[_CalibrationCase]:
-        """The case of every episode, task by task."""
-        pairs = ((task, seed) for task in self.tasks for seed in _derive_seeds(task, self.seeds))
-        return [_CalibrationCase(*pair, self.folder) for pair in pairs]
-
-    def run(
-        self, command: str = "", jobs: int | None = None, console: Console | None = None
-    ) -> list[CalibrationRecord]:
-        """Solve every case that is not finished.
-
-        Args:
-            command: Command line, for the records.
-            jobs: Processes, None for all processors.
-            console: Where progress is shown.
-
-        Raises:
-            ModuleNotFoundError: CasADi or OSQP is not installed.
-        """
-        with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
-            import casadi  # noqa: F401
-            import osqp  # noqa: F401
-        self.folder.mkdir(parents=True, exist_ok=True)
-        episodes = run_cases(_solve, self.cases, "calibration", jobs, console)
-        rows = zip(*[iter(episodes)] * self.seeds, strict=True)
-        made: dict[str, Any] = {"world_version": WORLD_VERSION, "command": command}
-        pairs = zip(self.tasks, rows, strict=True)
-        return [CalibrationRecord(**made | task.record, episodes=row) for task, row in pairs]
-
-    def remove_cases(self) -> None:
-        """Remove finished cases once their entries are written; those of other runs stay."""
-        for case in self.cases:
-            case.path.unlink(missing_ok=True)
-        if not any(self.folder.iterdir()):
-            self.folder.rmdir()
+    if count < 2:
+        raise ValueError(f"an interval needs two seeds or more, got {count}")
+    with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
+        import casadi  # noqa: F401
+        import osqp  # noqa: F401
+    part = path.with_name(f".{path.name}.{hash_sources()[:12]}")
+    finished = _read_calibration(part) if part.exists() else {}
+    for i, task in enumerate(tasks, 1):
+        seeds = _derive_seeds(task, count)
+        if task not in finished or finished[task].seeds != seeds:
+            title, cases = f"{task.name}, {i} of {len(tasks)}", [(task, seed) for seed in seeds]
+            episodes = tuple(run_cases(_solve, cases, title, jobs, console))
+            made: dict[str, Any] = task.record | {"world_version": WORLD_VERSION}
+            finished[task] = CalibrationRecord(**made, command=command, episodes=episodes)
+            _update(part, [finished[task]])
+    records = [finished[task] for task in tasks]
+    _update(path, records)
+    part.unlink(missing_ok=True)
+    return records
 
 
 def _read_calibration(
@@ -199,13 +152,8 @@ def _read_calibration(
     return records
 
 
-def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
-    """Replace or add entries of a file, which is made if needed; its stale ones go.
-
-    Args:
-        path: File.
-        new_records: Records.
-    """
+def _update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
+    """Replace or add entries of a file, which is made if needed; its stale ones go."""
     records = _read_calibration(path, stale=True) if Path(path).exists() else {}
     records |= {record.task: record for record in new_records}
     ordered = sorted(records.values(), key=lambda record: record.task.name)
@@ -236,26 +184,23 @@ def read_current(
     return records
 
 
-def measure_regrets(
-    records: Mapping[ControlTask, CalibrationRecord], cases: Iterable[ControlCase], **options: Any
-) -> tuple[dict[tuple[ControlTask, Entry], Array], Results]:
-    """Drive the cases of calibrated tasks on the clairvoyant's seeds.
+def measure_foresight(
+    records: Mapping[ControlTask, CalibrationRecord], **options: Any
+) -> dict[ControlTask, Array]:
+    """Drive oracle-state on the clairvoyant's seeds.
 
     Args:
         records: Records by task.
-        cases: Cases, of other tasks too.
         options: Options of `measure`.
 
     Returns:
-        log(J / J_clairvoyant) on the seeds that an entry survives, shape (n,), by case; episodes.
+        log(J / J_clairvoyant) on the seeds that it survives, shape (n,), by task.
     """
-    # as they were calibrated: tasks are equal whatever their changes are, a short lead-in too
-    selected = [case._replace(task=task) for task in records for case in cases if case.task == task]
-    title = "control, the clairvoyant's seeds"
-    results = measure(selected, lambda task: records[task].seeds, title=title, **options)
-    regrets = {}
-    for (task, entry), result in results.items():
+    cases = [(task, Entry(STATE)) for task in records]
+    title, foresight = "control, the clairvoyant's seeds", dict[ControlTask, Array]()
+    results = measure(cases, lambda task: records[task].seeds, title=title, **options)
+    for (task, _), result in results.items():
         if not result.error and result.survived.any():
             best = records[task].costs[: len(result.costs)]
-            regrets[task, entry] = -compute_log_ratios(best, result)[result.survived]
-    return regrets, results
+            foresight[task] = -compute_log_ratios(best, result)[result.survived]
+    return foresight

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -208,41 +209,31 @@ class ControlCase(NamedTuple):
         return options | self.options["controller"]
 
 
-class _CheckedAgent:
-    """A user's agent, whose `predict` is to return actions and a state; NaN is the env's to see."""
-
-    def __init__(self, agent: Agent, shape: tuple[int, int]) -> None:
-        self.agent, self.shape = agent, shape
-
-    def predict(
-        self, observation: Array, state: object = None, episode_start: Array | None = None,
-        deterministic: bool = True,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        result: object = self.agent.predict(
-            observation, state, episode_start, deterministic=deterministic
-        )
-        if not (isinstance(result, tuple) and len(result) == 2):
-            raise TypeError(f"predict returns (action, state), got {short_repr(result)}")
-        shape = np.shape(result[0])
-        if shape != self.shape:
-            raise ValueError(
-                f"predict of observations {observation.shape} returns actions {self.shape}, a row "
-                f"a car, got shape {shape}"
-            )
-        return result
-
-
 def check_agent(agent: Agent, shape: tuple[int, int]) -> Agent:
-    """Wrap a user's agent: TypeError or ValueError where `predict` returns anything else.
+    """Wrap a user's agent, whose `predict` is to return actions and a state.
+
+    It raises TypeError or ValueError for anything else; NaN is the env's to see.
 
     Args:
         agent: Agent with `predict` as stable-baselines3 has it.
         shape: Number of cars, and length of an action.
-
-    Returns:
-        Agent that is checked at each call.
     """
-    return _CheckedAgent(agent, shape)
+
+    def predict(
+        observation: Array, state: object = None, start: Array | None = None,
+        deterministic: bool = True,
+    ) -> object:  # fmt: skip
+        result: object = agent.predict(observation, state, start, deterministic=deterministic)
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise TypeError(f"predict returns (action, state), got {short_repr(result)}")
+        if np.shape(result[0]) != shape:
+            raise ValueError(
+                f"predict of observations {observation.shape} returns actions {shape}, a row a "
+                f"car, got shape {np.shape(result[0])}"
+            )
+        return result
+
+    return cast(Agent, SimpleNamespace(predict=predict))
 
 
 LEARNED: dict[str, tuple[Entry, ...]] = {

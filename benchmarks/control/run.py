@@ -6,7 +6,7 @@ A chunk drives all its seeds at once in a vector env; a folder keeps finished on
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -61,7 +61,6 @@ class DriveResult:
     """Episodes of an entry in the order of their seeds."""
 
     numbers: Array  # metrics, shape (seeds, NUMBERS); NaN where the entry was not driven
-    seconds: float  # CPU time (s)
     series: Array | None = None  # time and SIGNALS of the first seed, shape (k, 1 + SIGNALS)
     error: str = ""  # why the entry could not be driven
 
@@ -147,7 +146,6 @@ def run_chunk(chunk: Chunk) -> DriveResult:
     Returns:
         Episodes; why an entry cannot be built or driven is its `error`.
     """
-    start_time = time.process_time()
     try:
         env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
         steps = iterate_steps(env, agent, list(chunk.seeds))
@@ -160,9 +158,8 @@ def run_chunk(chunk: Chunk) -> DriveResult:
         env.close()
     except Exception as error:
         empty = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
-        return DriveResult(empty, np.nan, error=describe_error(error))
-    spent = time.process_time() - start_time
-    return DriveResult(tally.numbers(), spent, np.array(series) if chunk.keep else None)
+        return DriveResult(empty, error=describe_error(error))
+    return DriveResult(tally.numbers(), np.array(series) if chunk.keep else None)
 
 
 def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
@@ -175,17 +172,18 @@ def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
 _STEPS = 200  # of a decision's time
 
 
-class _TimedFunction:
-    """A function that notes how long each of its calls takes, in s of wall time."""
+def _time_calls(owner: Any, name: str) -> list[float]:
+    """Let a method note how long each of its calls takes, in the list (s of wall time)."""
+    method, seconds = getattr(owner, name), list[float]()
 
-    def __init__(self, function: Callable[..., object]) -> None:
-        self.function, self.seconds = function, list[float]()
-
-    def __call__(self, *args: object, **kwargs: object) -> object:
+    def call(*args: object, **kwargs: object) -> object:
         start_time = time.perf_counter()
-        result = self.function(*args, **kwargs)
-        self.seconds.append(time.perf_counter() - start_time)
+        result = method(*args, **kwargs)
+        seconds.append(time.perf_counter() - start_time)
         return result
+
+    setattr(owner, name, call)
+    return seconds
 
 
 def measure_decision_time(case: ControlCase) -> float:
@@ -200,12 +198,10 @@ def measure_decision_time(case: ControlCase) -> float:
     env, agent = case.entry.make(case.task, 1)
     bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)
     bare.reset(seed=0)
-    agent.predict, env.step = _TimedFunction(agent.predict), _TimedFunction(env.step)
-    without = _TimedFunction(bare.step)
+    seconds = _time_calls(agent, "predict"), _time_calls(env, "step"), _time_calls(bare, "step")
     for step in islice(iterate_steps(env, agent, 0), 1, _STEPS + 1):
-        without(np.zeros_like(step.action))
-    timers = (agent.predict, env.step, without)
-    predict, with_estimator, without_estimator = (np.median(f.seconds) for f in timers)
+        bare.step(np.zeros_like(step.action))
+    predict, with_estimator, without_estimator = map(np.median, seconds)
     return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))
 
 
@@ -216,15 +212,10 @@ Results = dict[tuple[ControlTask, Entry], DriveResult]  # episodes by task and e
 
 
 def measure(
-    cases: Iterable[tuple[ControlTask, Entry]],
-    seeds: Seeds,
-    *,
-    jobs: int | None = None,
-    console: Console | None = None,
-    keep: Path | None = None,
-    runner: Callable[[Chunk], DriveResult] | None = None,
-    title: str = "control",
-) -> Results:
+    cases: Iterable[tuple[ControlTask, Entry]], seeds: Seeds, *, jobs: int | None = None,
+    console: Console | None = None, keep: Path | None = None,
+    runner: Callable[[Chunk], DriveResult] | None = None, title: str = "control",
+) -> Results:  # fmt: skip
     """Drive every case on its task's seeds, slow entries on the first of them.
 
     Args:
@@ -257,7 +248,6 @@ def measure(
     return {
         case: DriveResult(
             np.concatenate([part.numbers for part in items]),
-            sum(part.seconds for part in items),
             items[0].series,
             next((part.error for part in items if part.error), ""),
         )
@@ -284,12 +274,12 @@ class _StoredDrives:
     def __call__(self, chunk: Chunk) -> DriveResult:
         """Return a chunk's result, from the folder if it is there."""
         path = self.folder / f"{_hash_chunk(chunk)}.npz"
-        # whatever NumPy, zipfile, zlib or `_unpack_result` find wrong: the chunk is run anew
+        # whatever NumPy, zipfile or zlib find wrong: the chunk is run anew
         with suppress(Exception), np.load(path, allow_pickle=False) as archive:
-            return _unpack_result(chunk, dict(archive))
+            return DriveResult(archive["numbers"], archive.get("series"))
         result = self.function(chunk)
         if not result.error:  # which is worth another try
-            arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": result.seconds}
+            arrays: dict[str, Any] = {"numbers": result.numbers}
             arrays |= {} if result.series is None else {"series": result.series}
             with suppress(OSError):  # a full disk loses the file, not the run
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -303,15 +293,3 @@ def _hash_chunk(chunk: Chunk) -> str:
     weights, driver = hash_policy(chunk.entry.agent), chunk.case.driver
     key = json.dumps([hash_sources(), weights, driver, asdict(chunk)], sort_keys=True)
     return hashlib.sha256(key.encode()).hexdigest()[:24]
-
-
-def _unpack_result(chunk: Chunk, arrays: Mapping[str, Array]) -> DriveResult:
-    """Make a chunk's result; ValueError for numbers that are not finite or another's."""
-    shapes = {"numbers": (len(chunk.seeds), len(NUMBERS)), "seconds": ()}
-    if chunk.keep:
-        shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
-    for name, shape in shapes.items():
-        array = arrays[name]
-        if not (np.isfinite(array).all() and array.dtype == np.float64 and array.shape == shape):
-            raise ValueError(f"{name} are not a chunk's")
-    return DriveResult(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))

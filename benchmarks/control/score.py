@@ -143,7 +143,18 @@ class Standing:
     @cached_property
     def by_task(self) -> dict[ControlTask, dict[str, Estimate]]:
         """Every metric of every task that was driven."""
-        return {task: self._measure_task(task) for task in self.drives}
+        measured = {}
+        for task, result in self.drives.items():
+            metrics = {"failure_rate": stats.share(~result.survived)}
+            if task in self.pairs:
+                metrics |= _measure_pairs([self.pairs[task]])
+            for metric in EPISODE:
+                if metric.name != "failure":
+                    metrics[metric.name] = stats.interval(result[metric.name])
+            for failure, name in _RATES.items():
+                metrics[name] = stats.share(result.mark_failures(failure))
+            measured[task] = metrics
+        return measured
 
     @cached_property
     def overall(self) -> dict[str, Estimate]:
@@ -155,7 +166,11 @@ class Standing:
     @cached_property
     def loses_more(self) -> bool:
         """Whether it surely loses more cars than nominal, over all its tasks."""
-        return _check_losses(list(self.pairs.values()))
+        pairs = self.pairs.values()
+        if not pairs:
+            return False
+        finished = np.concatenate([pair.finished for pair in pairs], axis=1)
+        return stats.is_share_larger(*~finished)
 
     @property
     def is_partial(self) -> bool:
@@ -189,18 +204,6 @@ class Standing:
         means = [run[name].mean() for run in counted]
         return float(np.mean(means)) if means else math.nan
 
-    def _measure_task(self, task: ControlTask) -> dict[str, Estimate]:
-        result = self.drives[task]
-        metrics = {"failure_rate": stats.share(~result.survived)}
-        if task in self.pairs:
-            metrics |= _measure_pairs([self.pairs[task]])
-        for metric in EPISODE:
-            if metric.name != "failure":
-                metrics[metric.name] = stats.interval(result[metric.name])
-        for failure, name in _RATES.items():
-            metrics[name] = stats.share(result.mark_failures(failure))
-        return metrics
-
     def add_rows(self, suite: Suite, salt: str) -> None:
         """Add a row for each metric and task, and those of the tier.
 
@@ -216,14 +219,6 @@ class Standing:
         labels["scenario"] = f"tier {self.tier}"
         suite.add_rows([self.overall], n=self.n, **labels)
         suite.add_rows([{"us_per_decision": self.us}], **labels)
-
-
-def _check_losses(pairs: Sequence[PairedDrives]) -> bool:
-    """Check whether an entry surely loses more cars than nominal, paired."""
-    if not pairs:
-        return False
-    finished = np.concatenate([pair.finished for pair in pairs], axis=1)
-    return stats.is_share_larger(*~finished)
 
 
 def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:

@@ -1,8 +1,7 @@
 """What a run of the matrix measured, as tables: standings, baselines, and what went wrong."""
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,28 +11,24 @@ from ...envs.record import Array
 from ...envs.task import FAILURES
 from ..harness.metrics import EPISODE
 from ..harness.results import Column, Line, ResultTable
-from ..harness.stats import Estimate, average, compute_p_value, holm
-from .entries import ORACLE_NAMES, Entry
+from ..harness.stats import average
+from .entries import Entry
 from .run import Results
 from .score import PairedDrives, Standing, rank_entries
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask, find_oracle
 
+_PERIOD = 0.01  # s, between two decisions in every task
 _CAR_OUTCOMES = ("none", "spin", "off-road")  # how an episode ends by the car's own motion
 
 
-@dataclass
+@dataclass(frozen=True)
 class Matrix:
     """The matrix of controllers and estimators, as a run measured it."""
 
     results: Results
-    by_tier: Mapping[str, Sequence[Standing]]  # standings by tier, the best first
     salt: str = ""  # salt of the seeds
-    # log(J / J_clairvoyant) on the clairvoyant's seeds, shape (n,), of the calibrated tasks
-    regrets: Mapping[tuple[ControlTask, Entry], Array] = field(default_factory=dict)
-    # cost over nominal's with sensors in time, at each of `DELAYS`
-    delay_costs: Mapping[Entry, Sequence[Estimate]] = field(default_factory=dict)
-    late: Sequence[tuple[float, Results]] = ()  # episodes by delay of camera and GPS (s)
-    seconds: float = 0.0  # CPU time of all episodes (s)
+    # log of oracle-state's cost over clairvoyant's in each calibrated task, shape (n,)
+    foresight: Mapping[ControlTask, Array] = field(default_factory=dict)
 
     @cached_property
     def tasks(self) -> list[ControlTask]:
@@ -41,20 +36,15 @@ class Matrix:
         return list(dict.fromkeys(task for task, _ in self.results))
 
     @cached_property
-    def series(self) -> dict[tuple[ControlTask, Entry], Array]:
-        """Time and `SIGNALS` of each case's first seed, where they were kept."""
-        drives = self.results.items()
-        return {case: drive.series for case, drive in drives if drive.series is not None}
+    def by_tier(self) -> dict[str, list[Standing]]:
+        """Standings by tier, the best first."""
+        driven = {task.tier for task in self.tasks}
+        return {tier: rank_entries(self.results, tier) for tier in TITLES if tier in driven}
 
     @cached_property
     def overall(self) -> list[Standing]:
         """Standings over all tiers, the best first."""
         return rank_entries(self.results, None)
-
-    @cached_property
-    def foresight(self) -> dict[ControlTask, Array]:
-        """Log of oracle-state's cost over clairvoyant's in each calibrated task, shape (n,)."""
-        return {task: x for (task, entry), x in self.regrets.items() if entry.agent == STATE}
 
 
 _LABEL = Column("label", "controller and estimator")
@@ -85,19 +75,12 @@ _BASELINES = (
     Column("parameters", "r of oracle-parameters", form=".2f"),
     Column("state", "of oracle-state", form=".2f"),
     Column("foresight", "clairvoyant beyond", form=".2f"),
-    "falls",
-)
-_KNOWLEDGE = (
-    "tier",
-    Column("model", "car, friction, biases (model)", form=".2f"),
-    Column("sensing", "state and disturbances (sensing)", form=".2f"),
-    Column("foresight", "what is ahead (foresight)", form=".2f"),
 )
 _MAIN_NOTE = (
-    "score: mean r, 0 as nominal. cost, won: of the drives that nominal finishes too. worst 5 %: "
-    "their mean cost. tasks: driven, with nominal. A decision is the estimator's step and the "
-    "controller's, of one car."
+    "score: mean r, 0 as nominal, an LQG that knows the nominal car. cost, won: of the drives that "
+    "nominal finishes too. worst 5 %: their mean cost. tasks: driven, with nominal."
 )
+_TIME_NOTE = " A decision is the estimator's step and the controller's, of one car."
 _LINE = "surely lose more cars than nominal:"
 _MOTION_NOTE = (
     "Yaw error and path where the reference turns. motors: mechanical work of both. effort: "
@@ -116,30 +99,35 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
     main, detail = [], []
     for tier, ranked in matrix.by_tier.items():
         title = f"Tier {tier}: {TITLES[tier]}"
-        main.append(_make_main_table(title, ranked))
+        main.append(make_main_table(title, ranked))
         tasks = [task for task in matrix.tasks if task.tier == tier]
         detail.append(make_task_table(f"{title}, task by task", ranked, tasks))
         detail.append(_make_motion_table(f"{title}: the motion", ranked))
-    runs = ((0.0, matrix.results), *matrix.late)
-    failures = [line for delay, results in runs for line in list_failures(results, delay)]
-    header = ("tier", "task", "controller and estimator", "what happened")
-    note = "The share of a cell's episodes; the rest of a failed one is charged at the highest "
-    wrong = ResultTable("Cells that went wrong", header, failures, note + "cost.", keyed=False)
-    baselines = [_make_knowledge_table(matrix), _make_oracle_table(matrix)]
-    return [*main, *baselines, *detail, *([wrong] if failures else [])]
+    failures = make_failure_tables(matrix.results)
+    return [*main, _make_oracle_table(matrix), *detail, *failures]
 
 
-def _make_main_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
-    """Make the table of the entries, the best first."""
+def make_main_table(
+    title: str, ranked: Sequence[Standing], marked: Collection[Entry] | None = None
+) -> ResultTable:
+    """Make the table of the entries.
+
+    Args:
+        title: Title of the table.
+        ranked: Standings, the best first.
+        marked: A user's entries, beside which no decision is timed; None: the matrix.
+    """
     lines: list[Line] = [
-        {"label": x.label, "n": x.n, "us": x.us, **x.overall}
+        {"label": f"> {x.label}" if x.entry in (marked or ()) else x.label, "n": x.n, "us": x.us}
+        | x.overall
         | {"tasks": (len(x.pairs), len(x.results))}
         for x in ranked
     ]
     if below := sum(standing.loses_more for standing in ranked):
         lines.insert(len(lines) - below, {"label": _LINE})
-    note = " ".join([_MAIN_NOTE, *_describe_findings(ranked)])
-    return ResultTable(title, _MAIN, lines, note)
+    if marked is not None:
+        return ResultTable(title, _MAIN[:-1], lines, f"> yours. {_MAIN_NOTE}")
+    return ResultTable(title, _MAIN, lines, _MAIN_NOTE + _TIME_NOTE)
 
 
 def make_task_table(
@@ -176,55 +164,21 @@ def _make_cell(standing: Standing, task: ControlTask) -> tuple[float, float] | s
 
 def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
     lines = [
-        {"label": x.label, "part": 1e-4 * x.us / next(iter(x.results)).control_period}
+        {"label": x.label, "part": 1e-4 * x.us / _PERIOD}
         | {metric.name: x.mean(metric.name) for metric in _SHOWN}
         for x in ranked
     ]
     return ResultTable(title, _MOTION, lines, _MOTION_NOTE, detail=True)
 
 
-def _describe_findings(standings: Sequence[Standing]) -> list[str]:
-    """Describe the entries whose score is above oracle-state's over their tier, Holm-corrected."""
-    best = next((item.scores for item in standings if item.entry == Entry(STATE)), {})
-    rivals = [item for item in standings if item.entry.agent not in ORACLE_NAMES]
-    others = [item for item in rivals if item.scores.keys() & best.keys()]
-    excess = [  # below 0 where the entry is better
-        np.concatenate([_subtract(best[task], r) for task, r in x.scores.items() if task in best])
-        for x in others
-    ]
-    sentences = [
-        f"Finding: {item.label} scores more than oracle-state in tier {item.tier} "
-        f"({item.overall['score'].value:.2f})."
-        for item in others
-    ]
-    return _select_cheaper(sentences, excess)
-
-
-def _subtract(values: Array, others: Array) -> Array:
-    """Subtract numbers of the seeds that both have, shape (min(n, m),)."""
-    n = min(len(values), len(others))
-    return values[:n] - others[:n]
-
-
-def _select_cheaper(texts: Sequence[str], logs: Sequence[Array]) -> list[str]:
-    """Select the texts whose paired differences surely have a mean below 0, Holm-corrected."""
-    sure = holm([compute_p_value(item) for item in logs])
-    return [text for text, is_sure in zip(texts, sure, strict=True) if is_sure]
-
-
 def _make_oracle_table(matrix: Matrix) -> ResultTable:
-    """Make the table of every task's demand and baselines, and of whether they fall in cost."""
+    """Make the table of every task's demand and baselines."""
     note = (
         "Gaps: medians by which oracle-state's root mean square errors are below nominal's. r is "
         "0.69 for half of nominal's cost."
     )
     if not matrix.foresight:
         note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
-    if matrix.regrets:
-        names = [f"{entry.label} ({task.name})" for task, entry in matrix.regrets]
-        below = "; ".join(_select_cheaper(names, list(matrix.regrets.values())))
-        summary = f"below it: {below}" if below else "nobody is below it (Holm-corrected)"
-        note += f" On the clairvoyant's seeds {summary}."
     lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
     return ResultTable("The oracles", _BASELINES, lines, note, keyed=False)
 
@@ -234,12 +188,11 @@ def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
     none, nominal, parameters, state = (matrix.results[task, Entry(name)] for name in names)
     errors = [drive.error for drive in (none, nominal, state) if drive.error]
     if errors:
-        return {"task": task.name, "falls": "; ".join(errors)}
+        return {"task": task.name, "oracle-state is": "; ".join(errors)}
     pair = PairedDrives(nominal, state, task.cost_floor)
-    state_scores, foresight = pair.compute_scores(), matrix.foresight.get(task)
-    scores = [np.zeros(pair.n), state_scores]
+    foresight, knowing = matrix.foresight.get(task), None
     if not parameters.error:
-        scores[1:1] = [PairedDrives(nominal, parameters, task.cost_floor).compute_scores()]
+        knowing = PairedDrives(nominal, parameters, task.cost_floor).compute_scores().mean()
     slip, yaw = compute_gaps(pair, task)
     return {
         "task": task.name,
@@ -248,10 +201,9 @@ def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:
         "oracle-state is": find_oracle(task),
         "slip": slip,
         "yaw": yaw,
-        "parameters": scores[1].mean() if len(scores) > 2 else None,
-        "state": average(state_scores),
+        "parameters": knowing,
+        "state": average(pair.compute_scores()),
         "foresight": None if foresight is None else foresight.mean(),
-        "falls": _describe_order(scores, foresight),
     }
 
 
@@ -274,60 +226,13 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
     return gaps[0], gaps[1]
 
 
-def _describe_order(scores: Sequence[Array], foresight: Array | None) -> str:
-    """Describe whether a baseline surely scores less than the one before it, which knows less."""
-    if foresight is not None and foresight.mean() <= 0.0:
-        return "clairvoyant does not"
-    rises = [average(_subtract(more, less)) for less, more in itertools.pairwise(scores)]
-    if any(rise.high < 0.0 for rise in rises):
-        return "no"
-    return "yes" if average(scores[-1]).low > 0.0 else "not surely"
-
-
-def list_knowledge(
-    standings: Sequence[Standing], foresight: Sequence[Array]
-) -> dict[str, list[Array]]:
-    """List r gained by knowing the car, then its state, then what is ahead, of each task's drives.
-
-    Args:
-        standings: Standings with the oracles.
-        foresight: Log of oracle-state's cost over the clairvoyant's, shape (n,) each.
-
-    Returns:
-        Numbers by what is known, empty without an oracle.
-    """
-    by_name = {x.entry.agent: x.scores for x in standings if x.entry.is_oracle}
-    parameters, state = (by_name.get(name, {}) for name in (PARAMETERS, STATE))
-    sensing = [_subtract(state[x], r) for x, r in parameters.items() if x in state]
-    return {"model": [*parameters.values()], "sensing": sensing, "foresight": [*foresight]}
-
-
-def _make_knowledge_table(matrix: Matrix) -> ResultTable:
-    """Make the table of what not knowing costs in each tier: differences of neighbours' scores."""
-    lines = []
-    for tier, ranked in matrix.by_tier.items():
-        foresight = [x for task, x in matrix.foresight.items() if task.tier == tier]
-        steps = list_knowledge(ranked, foresight)
-        saved = {name: average(*logs) for name, logs in steps.items() if logs}
-        lines.append({"tier": f"{tier}: {TITLES[tier]}"} | saved)
-    note = (
-        "Scores gained: oracle-parameters over nominal, oracle-state over oracle-parameters; "
-        "clairvoyant over oracle-state by the logarithm of cost alone."
-    )
-    return ResultTable("What knowing is worth", _KNOWLEDGE, lines, note, keyed=False)
-
-
-def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
-    """List where a failure is not the car's, such as a NaN.
+def make_failure_tables(results: Results) -> list[ResultTable]:
+    """Make the table of the failures that are not the car's, such as a NaN; none without any.
 
     Args:
         results: Episodes.
-        late: Delay of the sensors (s).
-
-    Returns:
-        Tier, task, entry and what happened of each.
     """
-    lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
+    lines = []
     for (task, entry), result in results.items():
         codes = result["failure"]
         ended = [
@@ -340,5 +245,8 @@ def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
         elif not ended and not result.survived.any():
             ended = ["every car fails"]
         if ended:
-            lines.append([task.tier, task.name + more, entry.label, ", ".join(ended)])
-    return lines
+            lines.append([task.tier, task.name, entry.label, ", ".join(ended)])
+    header = ("tier", "task", "controller and estimator", "what happened")
+    note = "The share of a cell's episodes; the rest of a failed one is charged at the most."
+    table = ResultTable("Cells that went wrong", header, lines, note, keyed=False)
+    return [table] if lines else []

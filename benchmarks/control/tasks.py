@@ -20,7 +20,6 @@ from ...agents.learned.network import SUFFIX
 from ...envs.io import from_json
 from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
 from ...envs.scenarios.world import WORLD_VERSION
-from ...envs.ticks import TICK
 from ...envs.validation import check_choice
 from ..harness.results import read_objects
 
@@ -92,11 +91,6 @@ class ControlTask:
     def seed_text(self) -> str:
         """JSON from which the seeds are drawn."""
         return json.dumps(self.record)
-
-    @property
-    def control_period(self) -> float:
-        """Time between two decisions (s)."""
-        return int(self.changes.get("control_period", 10)) * TICK
 
     @property
     def env_options(self) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import resource
 import signal
 import site
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -103,7 +102,7 @@ def main() -> None:
 
     _limit_process(Path(start.scratch))
     sys.addaudithook(_make_audit_hook(opened, start, refuse))
-    driver.send_bytes(DONE + json.dumps(time.process_time()).encode())
+    driver.send_bytes(DONE)
     server = _EntryServer()
     with suppress(EOFError):
         while True:

@@ -19,27 +19,25 @@ from ...envs.numerics import require_extra
 from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
 from ..control.run import Chunk, Results, measure
 from ..control.score import Standing, rank_entries
-from ..control.tables import list_failures, make_task_table
-from ..control.tasks import NOMINAL, make_salt, make_task_seeds, make_tuning_seeds
-from ..harness.results import Column, Line, ResultTable, Suite
-from ..harness.stats import Estimate, average
+from ..control.tables import make_failure_tables, make_main_table, make_task_table
+from ..control.tasks import make_salt, make_task_seeds, make_tuning_seeds
+from ..harness.results import Suite
+from ..harness.stats import Estimate
 from ..harness.verdict import format_percent
 from ..report.study import Request
-from .baselines import find_baselines, make_baseline_cases
-from .challenge import EPISODES, ComparisonRequest, choose_estimator, make_user_entry
+from .challenge import (
+    EPISODES,
+    ComparisonRequest,
+    choose_estimator,
+    find_baselines,
+    make_baseline_cases,
+    make_user_entry,
+)
 from .worker import LIMIT, IsolatedDrive, run_user_chunk
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_TABLE = (
-    Column("label", "entry"),
-    Column("score", "score [95 %]", form=".2f"),
-    Column("failure_rate", "fails, %", 100.0, ".1f", interval=False),
-    Column("cost_vs_nominal", "cost, % [95 %]", 100.0, ".0f"),
-    Column("share_won", "won, %", 100.0, ".0f", interval=False),
-    Column("n", "episodes"),
-)
 _NONE = Estimate(math.nan)
 _COLUMNS = dict(score="score", cost="cost_vs_nominal", won="share_won", failures="failure_rate")
 _REHEARSED = 2  # episodes of a task in which entries show what they open
@@ -116,14 +114,12 @@ def _make_sentence(standing: Standing) -> str:
     if score is None:
         why = f"not driven: {errors[0]}" if errors else "nominal is not driven"
         return f"{standing.label}: {why}"
-    tiers = []
-    for tier in dict.fromkeys(task.tier for task in standing.scores if task.tier):
-        scores = [r for task, r in standing.scores.items() if task.tier == tier]
-        tiers.append(f"{tier}: {average(*scores).value:.2f}")
+    below = "surely below" if score.high < 0.0 else "not told apart from"
+    where = "surely above" if score.low > 0.0 else below
     finished = np.concatenate([x.finished for x in standing.pairs.values()], axis=1)
     lost = 100.0 * (1.0 - finished.mean(axis=1))
     parts = [
-        _describe_score(score) + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
+        f"score {score.inline()}, {where} nominal's 0",
         f"loses {lost[0]:.1f} % of the cars (nominal {lost[1]:.1f} %)"
         + (", surely more" if standing.loses_more else ""),
     ]
@@ -135,14 +131,6 @@ def _make_sentence(standing: Standing) -> str:
     if errors:
         text += f"; not driven in {len(errors)} of {len(standing.results)} tasks: {errors[0]}"
     return text
-
-
-def _describe_score(score: Estimate) -> str:
-    """Describe a score, and whether it is told apart from nominal's 0."""
-    text = f"score {score.inline()}"
-    if score.low > 0.0:
-        return f"{text}, surely above nominal's 0"
-    return f"{text}, {'surely below' if score.high < 0.0 else 'not told apart from'} nominal's 0"
 
 
 def _describe_trust(comparison: Comparison) -> str:
@@ -164,24 +152,6 @@ def _describe_trust(comparison: Comparison) -> str:
         f"Not publishable: {where} on seeds {seeds}, which an entry can be tuned on; --fresh "
         f"draws new ones. Baselines {rows}. Not said: other cars, manoeuvres and sensors."
     )
-
-
-def _make_table(comparison: Comparison) -> ResultTable:
-    """Make the table of everybody over all tasks, the best first; the user's own are marked."""
-    lines: list[Line] = []
-    for standing in comparison.overall:
-        label = standing.label
-        if standing.entry in comparison.request.entries:
-            label = f"> {label}"
-        elif label == NOMINAL:
-            label = f"{label} (lqr on {REFERENCE_FILTER})"
-        lines.append({"label": label, "n": standing.n} | standing.overall)
-    note = (
-        "> yours. score: mean r, 0 as nominal, an LQG that knows the nominal car; a loss that "
-        "nominal does not have counts -2. Who surely loses more cars than nominal comes last, and "
-        "who does not drive every task. cost, won: of the drives that nominal finishes too."
-    )
-    return ResultTable("Your entries and the package's", _TABLE, lines, note)
 
 
 @dataclass(frozen=True, repr=False)
@@ -224,19 +194,10 @@ class Score:
 
 
 def score(
-    agent: object,
-    env_id: str = "",
-    *,
-    scenarios: Sequence[Any] = (),
-    vehicle: Any = None,
-    estimator: object = None,
-    episodes: int = EPISODES,
-    seeds: Sequence[int] | None = None,
-    fresh: bool = False,
-    limit: float = LIMIT,
-    trust: bool = False,
-    jobs: int | None = None,
-) -> Score:
+    agent: object, env_id: str = "", *, scenarios: Sequence[Any] = (), vehicle: Any = None,
+    estimator: object = None, episodes: int = EPISODES, seeds: Sequence[int] | None = None,
+    fresh: bool = False, limit: float = LIMIT, trust: bool = False, jobs: int | None = None,
+) -> Score:  # fmt: skip
     """Score a controller, a policy or a filter as `sideslip bench control` does.
 
     A file drives in a process of its own, an object in this one. An error while it drives becomes
@@ -298,12 +259,12 @@ def run(request: ComparisonRequest, options: Request) -> Suite:
     comparison = _compare(request, options)
     suite = Suite("control", "Your own beside the package's", _TEXT)
     suite.verdict = "\n".join(_compose_verdict(comparison))
-    by_task = make_task_table("Task by task", comparison.overall, request.tasks)
-    suite.tables += [_make_table(comparison), by_task]
-    lines = [line[1:] for line in list_failures(comparison.results)]
-    if lines:
-        header = ("task", "entry", "what happened")
-        suite.tables.append(ResultTable("Cells that went wrong", header, lines, keyed=False))
+    title = "Your entries and the package's"
+    suite.tables = [
+        make_main_table(title, comparison.overall, request.entries),
+        make_task_table("Task by task", comparison.overall, request.tasks),
+        *make_failure_tables(comparison.results),
+    ]
     for tier in dict.fromkeys(task.tier for task in request.tasks):
         for standing in rank_entries(comparison.results, tier):
             standing.add_rows(suite, comparison.salt)

@@ -6,7 +6,6 @@ The process never holds the env, its seeds or a result.
 import json
 import os
 import re
-import resource
 import shutil
 import signal
 import socket
@@ -80,7 +79,7 @@ class _ChildProcess:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))
         start = ChildSettings(scratch, drive.allowed)
         self._left, self._limit = _GRACE, _GRACE
-        self._started = float(json.loads(self.call(start)))
+        self.call(start)
         self._left = self._limit = drive.limit
 
     def call(self, *message: object, length: int | None = None) -> bytes:
@@ -138,17 +137,13 @@ class _ChildProcess:
         last = (text.strip().splitlines() or [""])[-1]
         return f"its process ended with status {status}; {last}".rstrip("; ")
 
-    def close(self) -> float:
-        """End the process and its group; return its CPU seconds after its start."""
+    def close(self) -> None:
+        """End the process and its group."""
         self._stop()
-        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         self._process.wait()
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         self._pipe.close()
         self._log.close()
         self._folder.cleanup()
-        spent = after.ru_utime + after.ru_stime - usage.ru_utime - usage.ru_stime
-        return max(spent - self._started, 0.0)
 
 
 def _find_place(texts: Sequence[str], stack: str) -> str:
@@ -162,18 +157,15 @@ def _find_place(texts: Sequence[str], stack: str) -> str:
 LIMIT = 600.0  # s of wall time a cell
 
 
-def _make_remote_agent(
-    child: _ChildProcess, source: str, trust: bool, env: CarVectorEnv, **options: object
-) -> "_RemotePolicy":
-    """Let a child build the agent of a text from the view of an env."""
-    view = EnvView.from_env(env)
-    child.call("agent", source, view, {"trust": trust, **options})
-    return _RemotePolicy(child, (view.num_envs, view.facts.width))
-
-
 class _RemotePolicy:
-    def __init__(self, child: _ChildProcess, shape: tuple[int, int]) -> None:
-        self._child, self._shape = child, shape
+    """The agent that a child builds of a text, from the view of an env."""
+
+    def __init__(
+        self, child: _ChildProcess, source: str, trust: bool, env: CarVectorEnv, **options: object
+    ) -> None:
+        view = EnvView.from_env(env)
+        self._child, self._shape = child, (view.num_envs, view.facts.width)
+        child.call("agent", source, view, {"trust": trust, **options})
 
     def predict(
         self, observation: Array, state: object = None, episode_start: Array | None = None,
@@ -288,7 +280,7 @@ class IsolatedDrive:
                     continue
                 child = _ChildProcess((entry.agent, entry.estimator), self)
                 children.append(child)
-                make_agent = partial(_make_remote_agent, child, source, entry.trust)
+                make_agent = partial(_RemotePolicy, child, source, entry.trust)
                 objects[part] = make_agent if part == "agent" else _RemoteEstimators(child, source)
             result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
             for child in children:
@@ -297,12 +289,11 @@ class IsolatedDrive:
         except _EntryError as error:
             result = _make_failed_result(chunk, str(error))
         finally:
-            spent = sum(child.close() for child in children)
-        reason = next((child.reason for child in children if child.reason), result.error)
-        if reason:
-            return _make_failed_result(chunk, reason), opened
-        return replace(result, seconds=result.seconds + spent), opened
+            for child in children:
+                child.close()
+        reason = next((child.reason for child in children if child.reason), "")
+        return (_make_failed_result(chunk, reason) if reason else result), opened
 
 
 def _make_failed_result(chunk: Chunk, error: str) -> DriveResult:
-    return DriveResult(np.full((len(chunk.seeds), len(NUMBERS)), np.nan), np.nan, error=error)
+    return DriveResult(np.full((len(chunk.seeds), len(NUMBERS)), np.nan), error=error)

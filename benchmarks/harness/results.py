@@ -109,7 +109,6 @@ class Suite:
     tables: list[ResultTable] = field(default_factory=list)
     figures: list[tuple[str, "Figure", str]] = field(default_factory=list)  # title, plotly, caption
     explorers: list[Explorer] = field(default_factory=list)  # figures with menus
-    files: list[tuple[str, str, str]] = field(default_factory=list)  # name, media type, text
     verdict: str = ""  # answer in plain words, at most five lines
     warnings: list[str] = field(default_factory=list)  # about the input, above the verdict
     answers: list[tuple[str, "Figure", str]] = field(default_factory=list)  # question, plotly, text

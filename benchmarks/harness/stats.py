@@ -5,7 +5,7 @@ No interval of a mean holds for rare failures that did not occur: `share` bounds
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -265,35 +265,3 @@ def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
     one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)
     larger, differing = int((one & ~other).sum()), int((one != other).sum())
     return differing > 0 and float(bdtrc(larger - 1, differing, 0.5)) <= _TAIL
-
-
-def compute_p_value(logs: Array) -> float:
-    """Compute p of Student's test that paired differences have a mean not below 0.
-
-    Args:
-        logs: Differences, shape (n,).
-
-    Returns:
-        Probability; 1 where they do not vary.
-    """
-    spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
-    middle = float(np.mean(logs)) if len(logs) else math.nan
-    if not spread > 0.0:
-        return 1.0
-    from scipy.special import stdtr
-
-    return float(stdtr(len(logs) - 1, middle * math.sqrt(len(logs)) / spread))
-
-
-def holm(chances: Sequence[float]) -> list[bool]:
-    """Test p values at a family-wise level of 5 %, by Holm's step-down.
-
-    Args:
-        chances: Values of p.
-    """
-    significant = [False] * len(chances)
-    for rank, i in enumerate(np.argsort(chances)):
-        if not chances[i] <= (1.0 - _LEVEL) / (len(chances) - rank):
-            break
-        significant[i] = True
-    return significant

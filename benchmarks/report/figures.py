@@ -4,7 +4,7 @@ Every axis carries its unit, every name has its colour (`envs.rendering.palette`
 `POINTS` are thinned: those over time keep their peaks and gaps, tracks take even steps.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,6 @@ from ..harness.stats import Estimate
 with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
 
-_SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
-"""Colours from bad to good, safe for the colour-blind."""
 POINTS = 1000  # maximum of points of a line: a figure is no wider in pixels
 _DASHES = {"reference": "dash", "bound": "dot"}
 _DASH_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
@@ -190,33 +188,4 @@ def _finish(figure: go.Figure, x: str, y: str, height: int, **layout: object) ->
     figure.update_layout(height=height, legend=legend, showlegend=len(figure.data) > 1, **layout)
     figure.update_xaxes(title_text=x, hoverformat=".4~g", automargin=True)
     figure.update_yaxes(title_text=y, hoverformat=".4~g", automargin=True)
-    return figure
-
-
-def draw_heat_map(
-    names: Sequence[str], columns: Sequence[str], values: Array, unit: str, good: str = "high"
-) -> go.Figure:
-    """Draw names down, columns across, the number in each field; NaN stays empty.
-
-    Args:
-        names: Names of the rows.
-        columns: Names of the columns.
-        values: Numbers, shape (names, columns).
-        unit: Unit of the numbers.
-        good: Which values are the good ones (blue), "high" or "low".
-    """
-    flipped = [(1.0 - at, shade) for at, shade in _SHARE_SCALE[::-1]]
-    scale = [list(stop) for stop in (_SHARE_SCALE if good == "high" else flipped)]
-    low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
-    trace = go.Heatmap(
-        z=values, x=list(columns), y=list(names), zmin=float(low), zmax=float(high),
-        colorscale=scale, colorbar={"title": {"text": unit}}, xgap=1, ygap=1,
-        texttemplate="%{z:.2~f}", textfont={"size": 10},
-        hovertemplate="%{y}<br>%{x}: %{z:.2~f}<extra></extra>",
-    )  # fmt: skip
-    figure = go.Figure(trace)
-    figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)
-    figure.update_yaxes(autorange="reversed", showgrid=False, ticks="", automargin=True)
-    size = {"height": 170 + 22 * len(names), "meta": "scroll"}
-    figure.update_layout(hovermode="closest", showlegend=False, **size)
     return figure

@@ -216,7 +216,6 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
         figures = [f"<details><summary>{len(figures)} figures</summary>\n{inside}\n</details>"]
     blocks += figures
     blocks += [_format_table(table) for table in suite.tables]
-    blocks += [_download(*file) for file in suite.files]
     return f'<section id="{link}">\n' + "\n".join(blocks) + "\n</section>"
 
 
@@ -262,12 +261,6 @@ def _format_data(name: str, text: str) -> str:
 def _hash(script: str) -> str:
     """Hash a script as the page's policy names it."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
-
-
-def _download(name: str, media: str, text: str) -> str:
-    data = base64.b64encode(text.encode()).decode()
-    link = f'<a download="{escape(name)}" href="data:{media};base64,{data}">{escape(name)}</a>'
-    return f'<p class="file">{link}</p>'
 
 
 def _read_asset(name: str) -> str:

@@ -68,7 +68,7 @@ class PolicyEvaluation:
 
     def make_suite(self) -> Suite:
         """Make a suite of table and rows, and of the first episode over time and in motion."""
-        from ..control.report import make_time_explorer
+        from ..control.suite import make_time_explorer
 
         name, card, task = self.policy.name, self.policy.card, self.task
         text = (

@@ -46,7 +46,7 @@ def test_the_readme_is_a_door() -> None:
 
 
 def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
-    """`python -m sideslip.benchmarks.tuning.next_car --out docs/next_car.json` and `sideslip bench
+    """`python -m sideslip.benchmarks.tuning.levels parts --out docs/next_car.json` and `sideslip bench
     speed --json docs/speed.json` write two of them."""
     table = json.loads((ROOT / "docs/next_car.json").read_text())
     key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(ROOT / "docs/speed.json")

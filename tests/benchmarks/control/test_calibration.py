@@ -1,7 +1,6 @@
 """The clairvoyant's file: seeds of its own, stale entries refused by name, stopped runs go on."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,14 @@ from sideslip.agents.clairvoyant import plan as clairvoyant
 from sideslip.agents.clairvoyant.plan import ClairvoyantResult
 from sideslip.benchmarks.control import calibration
 from sideslip.benchmarks.control.calibration import (
-    Calibration,
     CalibrationRecord,
+    ClairvoyantEpisode,
     _derive_seeds,
     _read_calibration,
-    measure_regrets,
+    _update,
+    calibrate,
+    measure_foresight,
     read_current,
-    update,
 )
 from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import measure
@@ -32,9 +32,9 @@ GUST = ControlTask("", YAW, "coms", "zero-slip", "gust")
 SINE = ControlTask("", YAW, "coms", "zero-slip", "sine")
 
 
-def calibrate(folder: Path, *tasks: ControlTask) -> list[CalibrationRecord]:
+def solve(folder: Path, *tasks: ControlTask) -> list[CalibrationRecord]:
     """On two seeds, in this process."""
-    return Calibration(tasks, folder / "cases", 2).run(jobs=1)
+    return calibrate(folder / "made.json", tasks, 2, jobs=1)
 
 
 @pytest.fixture
@@ -64,26 +64,36 @@ def test_seeds_are_its_own_and_follow_the_world(monkeypatch: pytest.MonkeyPatch)
     assert not set(many) & set(_derive_seeds(GUST))
 
 
-def test_a_stopped_run_goes_on(asked: list[int], tmp_path: Path) -> None:
-    folder = tmp_path / "cases"
-    Calibration([GUST], folder, 3).run(jobs=1)
-    (entry,) = Calibration([GUST], folder, 5).run(jobs=1)
-    assert asked == _derive_seeds(GUST, 5)  # each once
-    assert entry.costs.tolist() == [seed % 10 for seed in asked]
-    Calibration([SINE], folder, 3).run(jobs=1)
-    assert len(asked) == 8  # another question
-    Calibration([GUST], folder, 5).remove_cases()
-    assert len(list(folder.iterdir())) == 3  # the other question's
-    Calibration([SINE], folder, 3).remove_cases()
-    assert not folder.exists()
+def test_a_stopped_run_goes_on(
+    asked: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, seek = tmp_path / "made.json", calibration._solve
+
+    def stopping(case: tuple[ControlTask, int]) -> ClairvoyantEpisode:
+        if case[0] == SINE:
+            raise KeyboardInterrupt
+        return seek(case)
+
+    monkeypatch.setattr(calibration, "_solve", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        solve(tmp_path, GUST, SINE)
+    assert not path.exists() and asked == _derive_seeds(GUST, 2)
+    monkeypatch.setattr(calibration, "_solve", seek)
+    first, second = solve(tmp_path, GUST, SINE)
+    assert asked == _derive_seeds(GUST, 2) + _derive_seeds(SINE, 2)  # each once
+    assert first.costs.tolist() == [seed % 10 for seed in _derive_seeds(GUST, 2)]
+    assert _read_calibration(path) == {GUST: first, SINE: second}
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(ValueError, match="an interval needs two seeds or more, got 1"):
+        calibrate(path, [GUST], 1)
 
 
 def test_a_file_keeps_other_entries(asked: list[int], tmp_path: Path) -> None:
     path = tmp_path / "clairvoyant.json"
-    both = calibrate(tmp_path, GUST, SINE)
-    update(path, both)
+    both = solve(tmp_path, GUST, SINE)
+    _update(path, both)
     changed = dataclasses.replace(both[0], command="other")
-    update(path, [changed])
+    _update(path, [changed])
     assert _read_calibration(path) == {GUST: changed, SINE: both[1]}
 
 
@@ -105,28 +115,28 @@ def test_a_file_that_does_not_fit_is_refused(
     message: str, asked: list[int], tmp_path: Path
 ) -> None:
     path = tmp_path / "clairvoyant.json"
-    update(path, calibrate(tmp_path, GUST))
+    _update(path, solve(tmp_path, GUST))
     spoiled = SPOILED[message](path.read_text())
     path.write_text(spoiled)
     stale = "is stale" in message
     for use in (
-        (_read_calibration,) if stale else (_read_calibration, lambda path: update(path, []))
+        (_read_calibration,) if stale else (_read_calibration, lambda path: _update(path, []))
     ):
         with pytest.raises(ValueError, match=message) as caught:
             use(path)
         assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
     assert path.read_text() == spoiled
     if stale:  # its other entries stay, and new ones can be written
-        (made,) = calibrate(tmp_path, SINE)
-        update(path, [made])
+        (made,) = solve(tmp_path, SINE)
+        _update(path, [made])
         assert _read_calibration(path) == {SINE: made}
 
 
 def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_path: Path) -> None:
     """Whatever its version: the uncontrolled car no longer costs what it did."""
-    (entry,) = calibrate(tmp_path, GUST)
+    (entry,) = solve(tmp_path, GUST)
     path = tmp_path / "file"
-    update(path, [entry])
+    _update(path, [entry])
     assert read_current(path, [SINE]) == {}
     with pytest.raises(ValueError, match="file: gust, yaw is stale: the uncontrolled car costs"):
         read_current(path, [GUST])
@@ -136,46 +146,27 @@ def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_pat
         dataclasses.replace(episode, costs={"none": cost})
         for episode, cost in zip(entry.episodes, none.tolist(), strict=True)
     )
-    update(path, [dataclasses.replace(entry, episodes=episodes)])
+    _update(path, [dataclasses.replace(entry, episodes=episodes)])
     assert read_current(path, [GUST]).keys() == {GUST}
 
 
-def test_everybody_is_paired_with_it_on_its_seeds(asked: list[int], tmp_path: Path) -> None:
-    (entry,) = Calibration([GUST], tmp_path, 4).run(jobs=1)
-    none = ControlCase(GUST, Entry("none"))
-    changed = dataclasses.replace(GUST, changes={"reference": "model"})
-    cases = [ControlCase(changed, Entry("none")), ControlCase(SINE, Entry("none"))]
-    regrets, there = measure_regrets({GUST: entry}, cases, jobs=1)
-    assert list(there) == [none]
-    costs = measure([none], _derive_seeds(GUST, 4), jobs=1)[GUST, Entry("none")].costs
+def test_oracle_state_is_paired_with_it_on_its_seeds() -> None:
+    episodes = tuple(
+        ClairvoyantEpisode(seed, 1.0 + seed % 10, "none", {}, {}, 0.0)
+        for seed in _derive_seeds(GUST, 4)
+    )
+    made: dict[str, Any] = GUST.record | {"world_version": 1, "command": ""}
+    entry = CalibrationRecord(**made, episodes=episodes)
+    ahead = measure_foresight({GUST: entry}, jobs=1)
+    case = ControlCase(GUST, Entry(STATE))
+    costs = measure([case], _derive_seeds(GUST, 4), jobs=1)[case].costs
     expected = np.clip(np.log((costs + 0.001) / (entry.costs + 0.001)), -3.0, 3.0)
-    assert regrets[none] == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        *("", "{", "[]", "null", "{}", "[" * 99999),
-        *(("winner", None), ("seed", 7), ("cost", "1"), ("cost", float("nan")), ("costs", {})),
-    ],
-    ids=range(11),
-)
-def test_a_damaged_case_is_sought_again(content: Any, asked: list[int], tmp_path: Path) -> None:
-    first = calibrate(tmp_path, GUST)
-    path = next((tmp_path / "cases").iterdir())
-    if isinstance(content, tuple):
-        key, value = content
-        content = json.dumps(json.loads(path.read_text()) | {key: value})
-    path.write_text(content)
-    assert calibrate(tmp_path, GUST) == first
-    assert len(asked) == 3
-    assert calibrate(tmp_path, GUST) == first
-    assert len(asked) == 3  # the file is whole again
+    assert ahead[GUST] == pytest.approx(expected)
 
 
 @pytest.mark.long
 def test_a_real_episode_is_no_dearer_than_the_rungs(tmp_path: Path) -> None:
-    (entry,) = calibrate(tmp_path, SINE)
+    (entry,) = solve(tmp_path, SINE)
     for episode in entry.episodes:
         assert episode.cost == min(episode.costs.values())
         assert set(episode.costs) == {"none", NOMINAL, STATE, f"from {NOMINAL}", f"from {STATE}"}

@@ -44,7 +44,7 @@ def driven(costs: np.ndarray, failed: int = 0, error: str = "", peak: float = 4.
     numbers[:, SLIP] = np.radians(costs)  # as large as the costs
     code = np.where(np.arange(len(costs)) < failed, FAILURES.index("spin"), 0)
     numbers[:, NUMBERS.index("failure")] = code
-    return DriveResult(numbers, 1.0, error=error)
+    return DriveResult(numbers, error=error)
 
 
 def found(

@@ -13,7 +13,7 @@ import sideslip
 from sideslip.agents.learned.network import SUFFIX
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import readme
-from sideslip.benchmarks.control import baseline_gaps, calibration, run, tasks
+from sideslip.benchmarks.control import calibration, run, tasks
 from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, measure
 from sideslip.benchmarks.control.tasks import (
@@ -52,7 +52,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def stand_in(function: Any, chunks: Any, *_: Any) -> list[DriveResult]:
         cases.extend((function, chunk) for chunk in chunks)
-        return [DriveResult(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
+        return [DriveResult(np.ones((len(chunk.seeds), len(NUMBERS)))) for chunk in chunks]
 
     monkeypatch.setattr(run, "run_cases", stand_in)
     return cases
@@ -82,13 +82,6 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(len(mine) == 1 for mine in driven.values())  # in a contest everybody the same
     every = [seed for mine in driven.values() for own in mine for seed in own]
     assert len(set(every)) == len(every) == 6 * 50
-
-
-def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    cases = asked(monkeypatch)
-    baseline_gaps.measure_delay_cost(make_salted_seeds(OTHER, 4))
-    assert len(cases) == len(baseline_gaps.DELAYS) * len(baseline_gaps.DELAY_ENTRIES)
-    assert {chunk.seeds for _, chunk in cases} == {tuple(make_salted_seeds(OTHER, 4))}
 
 
 @pytest.mark.parametrize("name", [*SALTED, "readme"])

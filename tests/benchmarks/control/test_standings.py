@@ -1,25 +1,21 @@
 """Standings: failures first, the best first, findings and the answer; what went wrong is said."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sideslip.benchmarks.control.entries import REFERENCE_FILTER, Entry
-from sideslip.benchmarks.control.report import _group_agents, compose_verdict
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
 from sideslip.benchmarks.control.score import Standing, rank_entries
+from sideslip.benchmarks.control.suite import _compose_verdict, _name_agent, _rank
 from sideslip.benchmarks.control.tables import (
     _LINE,
     Matrix,
-    _describe_findings,
-    _make_knowledge_table,
-    _make_main_table,
     _make_motion_table,
     _make_oracle_table,
-    _select_cheaper,
-    list_failures,
+    make_failure_tables,
+    make_main_table,
     make_task_table,
 )
 from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, STATE, ControlTask
@@ -39,11 +35,11 @@ def episodes(level: float, failed: int = 0, code: str = "spin", n: int = 40) -> 
     numbers = np.ones((n, len(NUMBERS)))
     numbers[:, COST] = 10.0 * level * seeds.lognormal(0.0, 1.0, n) * own.lognormal(0.0, 0.1, n)
     numbers[:, FAILURE] = np.where(np.arange(n) < failed, FAILURES.index(code), 0)
-    return DriveResult(numbers, 1.0)
+    return DriveResult(numbers)
 
 
 def undriven(error: str) -> DriveResult:
-    return DriveResult(np.full((40, len(NUMBERS)), np.nan), np.nan, error=error)
+    return DriveResult(np.full((40, len(NUMBERS)), np.nan), error=error)
 
 
 def results(*contests: ControlTask, **failed: int) -> Results:
@@ -71,8 +67,8 @@ def texts(shown: ResultTable) -> list[tuple[str, ...]]:
     return list(zip(*(column.texts for column in format_columns(shown)), strict=True))
 
 
-def matrix(found: Results, **more: Any) -> Matrix:
-    return Matrix(found, {"road": table(found)}, **more)
+def wrong(found: Results) -> list[list[str]]:
+    return [line for shown in make_failure_tables(found) for line in shown.cells]
 
 
 def test_the_best_come_first_with_their_numbers() -> None:
@@ -91,14 +87,14 @@ def test_the_line_stands_above_those_alone_who_lose_more_cars() -> None:
     """Who leaves out a task stood below it, and who loses cars, but scores more, above."""
     found = results(nominal=2, lqr=20)
     found[TWO, Entry("none")] = undriven("no")
-    labels = [line["label"] for line in _make_main_table("", table(found)).cells]
+    labels = [line["label"] for line in make_main_table("", table(found)).cells]
     assert labels[-3:] == ["none", _LINE, f"lqr on {REFERENCE_FILTER}"]
 
 
 def test_the_better_of_two_default_entries_of_a_name_speaks_for_it() -> None:
     found = results() | {(task, Entry("lqr")): episodes(90.0) for task in (ONE, TWO)}
     (best,) = (x for x in table(found) if x.entry == Entry("lqr", REFERENCE_FILTER))
-    gains = _group_agents(table(found)).gains["lqr"]
+    gains = _rank(table(found), _name_agent).gains["lqr"]
     assert all((gains[task] == best.scores[task]).all() for task in (ONE, TWO))
 
 
@@ -123,9 +119,9 @@ def test_who_surely_loses_more_cars_stands_under_a_line() -> None:
     assert [each.entry.agent for each in table(some)][:2] == [STATE, "lqr"]
     often = results(nominal=6, lqr=30)
     assert [each.entry.agent for each in table(often)][-1] == "lqr"
-    labels = [line["label"] for line in _make_main_table("", table(often)).cells]
+    labels = [line["label"] for line in make_main_table("", table(often)).cells]
     assert labels[-2:] == ["surely lose more cars than nominal:", f"lqr on {REFERENCE_FILTER}"]
-    assert not any("surely" in line["label"] for line in _make_main_table("", table(some)).cells)
+    assert not any("surely" in line["label"] for line in make_main_table("", table(some)).cells)
 
 
 @pytest.mark.parametrize("filter_, best", [("joint", "adaptive-lqr"), ("dakf", "lqr")])
@@ -135,7 +131,7 @@ def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
     found = results()
     for contest in (ONE, TWO):
         found[contest, Entry("adaptive-lqr", filter_)] = episodes(15.0)
-    assert _group_agents(table(found)).find_best() == best
+    assert _rank(table(found), _name_agent).find_best() == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
@@ -144,9 +140,9 @@ def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
     found[cell] = undriven("no GPS")
     standing = next(each for each in table(found) if each.entry.estimator == "dakf")
     assert np.isfinite(standing.overall["score"].value)
-    assert texts(_make_main_table("", [standing]))[0][6] == "1 of 2"
+    assert texts(make_main_table("", [standing]))[0][6] == "1 of 2"
     assert texts(make_task_table("", [standing], [ONE, TWO]))[0][2] == "not driven"
-    assert ["road", TWO.name, "lqr on dakf", "not driven: no GPS"] in list_failures(found)
+    assert ["road", TWO.name, "lqr on dakf", "not driven: no GPS"] in wrong(found)
     assert all(np.isfinite(row.value) for row in rows(standing))
 
 
@@ -159,7 +155,7 @@ def test_a_contest_that_nominal_alone_loses_counts_for_the_others() -> None:
     assert "cost_vs_nominal" not in standing["none"].by_task[TWO]
     shown = texts(make_task_table("", list(standing.values()), [TWO]))
     assert (NOMINAL, "0.00 (100)") in shown and ("none", "2.00 (0)") in shown
-    assert ["road", TWO.name, NOMINAL, "every car fails"] in list_failures(found)
+    assert ["road", TWO.name, NOMINAL, "every car fails"] in wrong(found)
     assert all(np.isfinite(row.value) for each in standing.values() for row in rows(each))
 
 
@@ -170,64 +166,37 @@ def test_a_nominal_that_cannot_be_computed_leaves_its_contest_without_score() ->
     lqr = next(each for each in standing if each.entry.agent == "lqr")
     assert list(lqr.pairs) == [ONE] and np.isfinite(lqr.overall["score"].value)
     assert texts(make_task_table("", [lqr], [TWO]))[0][1].startswith("no nominal")
-    assert texts(_make_oracle_table(matrix(found)))[1][-1] == "no plant"
+    assert texts(_make_oracle_table(Matrix(found)))[1][3] == "no plant"
 
 
 def test_a_nan_of_a_contestant_is_a_failure_that_is_not_the_cars() -> None:
     found = results()
     found[ONE, Entry("lqr", "dakf")] = episodes(30.0, 10, "bad-action")
-    assert ["road", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in list_failures(found)
+    assert ["road", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in wrong(found)
     standing = next(each for each in table(found) if each.entry.estimator == "dakf")
     assert standing.by_task[ONE]["bad_action_rate"].value == 0.25
     assert standing.scores[ONE][:10].tolist() == [-2.0] * 10
 
 
-def test_the_ladder_says_where_it_does_not_fall_and_what_is_too_close() -> None:
+def test_what_is_too_close_is_said() -> None:
     found = results()
-    assert [line[-1] for line in texts(_make_oracle_table(matrix(found)))] == ["yes", "yes"]
-    assert "saves less than 0.2 deg" in compose_verdict(matrix(found))  # all errors are equal
-    found[ONE, Entry(PARAMETERS)] = episodes(5.0)  # surely better than what knows more
-    found[TWO, Entry(STATE)] = episodes(80.0)
-    assert [line[-1] for line in texts(_make_oracle_table(matrix(found)))] == ["no", "no"]
+    assert "saves less than 0.2 deg" in _compose_verdict(Matrix(found))  # all errors are equal
     slip = NUMBERS.index("rms_slip_error")
     for contest in (ONE, TWO):
         found[contest, Entry(NOMINAL)].numbers[:, slip] += np.radians(0.3)
-    line = texts(_make_oracle_table(matrix(found)))[0]
-    assert line[4] == "0.30" and "less than" not in compose_verdict(matrix(found))
-
-
-def test_who_is_above_the_oracle_is_a_finding() -> None:
-    assert _describe_findings(table(results())) == []
-    found = results()
-    for contest in (ONE, TWO):
-        found[contest, Entry("lqr", "dakf")] = episodes(5.0)
-    (said,) = _describe_findings(table(found))
-    assert "lqr on dakf scores more than oracle-state in tier road" in said
-
-
-def test_who_is_surely_below_the_clairvoyant_is_named() -> None:
-    rng = np.random.default_rng(0)
-    leads = [rng.normal(0.3, 0.3, 64), rng.normal(-0.3, 0.3, 64), rng.normal(0.0, 0.3, 64)]
-    assert _select_cheaper(["above", "below", "level"], leads) == ["below"]
-    many = [rng.normal(0.0, 0.3, 64) for _ in range(40)]
-    assert _select_cheaper([str(k) for k in range(40)], many) == []
-
-
-def test_the_ladders_steps_are_differences_of_scores() -> None:
-    ahead = {(ONE, Entry(STATE)): np.full(8, np.log(1.5))}
-    made = _make_knowledge_table(matrix(results(), regrets=ahead))
-    numbers = [float(text.split(" ")[0]) for text in texts(made)[0][1:]]
-    assert numbers == pytest.approx(np.log([2.0, 4.0, 1.5]), abs=0.08)
-    assert texts(_make_knowledge_table(matrix(results())))[0][3] == ""
+    line = texts(_make_oracle_table(Matrix(found)))[0]
+    assert line[4] == "0.30" and "less than" not in _compose_verdict(Matrix(found))
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
-    _, controller, estimator, why, rest = compose_verdict(matrix(results())).splitlines()
+    measured = Matrix(results(), foresight={ONE: np.full(8, np.log(1.5))})
+    _, controller, estimator, why, rest = _compose_verdict(measured).splitlines()
     best = REFERENCE_FILTER.replace(", ", " with ")
     assert f"controller, {best} costs least, 6" in estimator and "as much as dakf" in estimator
     assert "controllers lqr costs least, 33 % [" in controller and "as much as esc" in controller
     assert ", and 16 % as much as no control." in controller  # 2 / 12
     assert "true car and road saves 50 %, then its exact motion saves 7" in why
+    assert "then what is ahead saves 33 %" in why
     assert "40 episodes a task" in rest
 
 
@@ -237,13 +206,12 @@ def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
         found[contest, Entry("lqr", "dakf")] = episodes(20.0)
         other[contest, Entry("esc", REFERENCE_FILTER)] = episodes(15.0)
         found[contest, Entry("esc", REFERENCE_FILTER)] = episodes(600.0)
-    _, _, estimator, *_ = compose_verdict(matrix(found)).splitlines()
+    _, _, estimator, *_ = _compose_verdict(Matrix(found)).splitlines()
     assert "cost least, too close to tell apart" in estimator and "dakf" in estimator
     elsewhere: Results = {}
     for (task, entry), driven in other.items():
         elsewhere[replace(task, tier="limit"), entry] = driven
-    tiers = {"road": table(found), "limit": rank_entries(elsewhere, "limit")}
-    *_, rest = compose_verdict(Matrix(found | elsewhere, tiers)).splitlines()
+    *_, rest = _compose_verdict(Matrix(found | elsewhere)).splitlines()
     assert rest.startswith("It costs less with esc in tier limit. ")
 
 
@@ -251,11 +219,11 @@ def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> Non
     """A policy of one class of contests, however little it costs there."""
     found = results()
     found[TWO, Entry("distill-car-yaw", "joint")] = episodes(12.0)
-    _, controller, *_, rest = compose_verdict(matrix(found)).splitlines()
+    _, controller, *_, rest = _compose_verdict(Matrix(found)).splitlines()
     assert "controllers lqr costs least, 33 % [" in controller
     assert rest.startswith("It costs less with distill-car-yaw on its own manoeuvres. ")
     found[ONE, Entry("distill-car-yaw", "joint")] = episodes(12.0)
-    _, controller, *_, rest = compose_verdict(matrix(found)).splitlines()
+    _, controller, *_, rest = _compose_verdict(Matrix(found)).splitlines()
     assert "controllers distill-car-yaw costs" in controller and "own manoeuvres" not in rest
 
 
@@ -263,7 +231,7 @@ def test_without_nominal_nobody_wins() -> None:
     found = results()
     for contest in (ONE, TWO):
         found[contest, Entry(NOMINAL)] = undriven("no plant")
-    _, controller, estimator, *_ = compose_verdict(matrix(found)).splitlines()
+    _, controller, estimator, *_ = _compose_verdict(Matrix(found)).splitlines()
     assert "nobody has a score" in estimator and "nobody has a score" in controller
 
 

@@ -18,6 +18,7 @@ from sideslip.benchmarks.control.entries import (
     select_quick_tasks,
 )
 from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, Results, run_chunk
+from sideslip.benchmarks.control.tables import make_main_table
 from sideslip.benchmarks.control.tasks import (
     NOMINAL,
     STEERING,
@@ -28,14 +29,15 @@ from sideslip.benchmarks.control.tasks import (
     make_salt,
     make_task_seeds,
 )
-from sideslip.benchmarks.entrants import baselines, score
+from sideslip.benchmarks.entrants import challenge as challenge_module
+from sideslip.benchmarks.entrants import score
 from sideslip.benchmarks.entrants.challenge import (
     EPISODES,
     ComparisonRequest,
     make_user_entries,
     make_user_entry,
 )
-from sideslip.benchmarks.entrants.score import _compose_verdict, _make_sentence, _make_table
+from sideslip.benchmarks.entrants.score import _compose_verdict, _make_sentence
 from sideslip.benchmarks.report.study import Request
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.benchmarks.conftest import Run
@@ -104,7 +106,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
         return {cell: episodes(cell[1], len(each)) for cell, each in mine}
 
     monkeypatch.setattr(score, "measure", stand_in)
-    monkeypatch.setattr(baselines, "measure", stand_in)
+    monkeypatch.setattr(challenge_module, "measure", stand_in)
     return asked
 
 
@@ -115,8 +117,8 @@ def episodes(entry: Entry, n: int) -> DriveResult:
     numbers[: n // 3, FAILURE] = entry.agent.endswith("e.py")
     if "broken" in entry.agent:
         nothing = np.full_like(numbers, np.nan)
-        return DriveResult(nothing, np.nan, error="ValueError: no (pd.py, line 3)")
-    return DriveResult(numbers, 0.0)
+        return DriveResult(nothing, error="ValueError: no (pd.py, line 3)")
+    return DriveResult(numbers)
 
 
 def on_default(agent: str) -> Entry:
@@ -130,10 +132,10 @@ def challenge(folder: Path, **options: Any) -> ComparisonRequest:
 
 def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) -> None:
     """A file of baselines with 8 episodes of a salt of its own, their costs times `change`."""
-    monkeypatch.setattr(baselines, "FILE", folder / "baselines.json")
-    monkeypatch.setattr(baselines, "EPISODES", 8)
-    monkeypatch.setattr(baselines, "make_salt", lambda: "abcd")
-    baselines._write_baselines(folder / "baselines.json")
+    monkeypatch.setattr(challenge_module, "FILE", folder / "baselines.json")
+    monkeypatch.setattr(challenge_module, "EPISODES", 8)
+    monkeypatch.setattr(challenge_module, "make_salt", lambda: "abcd")
+    challenge_module._write_baselines(folder / "baselines.json")
     text = json.loads((folder / "baselines.json").read_text())
     for entry in text:
         entry["costs"] = [change * cost for cost in entry["costs"]]
@@ -229,14 +231,14 @@ def test_the_verdict_has_a_sentence_each_in_five_lines(tmp_path: Path, driven: D
         _make_sentence(next(x for x in found.overall if x.entry == pairs[i])) for i in (0, 4, 1)
     )
     assert lines[0] == f"Place 3 of 9: {mine}."
-    assert "score 0.60 [0.60, 0.61], surely above nominal's 0 (small car: 0.59, road" in lines[0]
+    assert "score 0.60 [0.60, 0.61], surely above nominal's 0, loses" in lines[0]
     assert "costs 50 % [50, 50] of nominal where both finish" in lines[0]
     assert "loses 0.0 % of the cars (nominal 0.0 %)," in lines[0]
     assert "loses 33.3 % of the cars (nominal 0.0 %), surely more" in fails
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
-    cells = _make_table(found).cells
+    cells = make_main_table("", found.overall, pairs).cells
     assert sum(line["label"].startswith("> ") for line in cells) == 5
-    assert len(cells) == 5 + 4
+    assert len(cells) == 5 + 4 + 1  # the line above who surely loses more
 
 
 def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
@@ -319,7 +321,7 @@ def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) ->
 
 @pytest.mark.long
 def test_the_baselines_on_file_still_cost_the_same() -> None:
-    """Else: `python -m sideslip.benchmarks.entrants.baselines`."""
-    cells = baselines.make_baseline_cases(select_quick_tasks(list_scored_tasks()))
-    assert len(baselines._read_baselines()) == len(cells)
-    assert baselines.find_baselines(cells, EPISODES) is not None
+    """Else: `python -m sideslip.benchmarks.entrants.challenge`."""
+    cells = challenge_module.make_baseline_cases(select_quick_tasks(list_scored_tasks()))
+    assert len(challenge_module._read_baselines()) == len(cells)
+    assert challenge_module.find_baselines(cells, EPISODES) is not None

@@ -10,11 +10,9 @@ from scipy.stats import binom, mannwhitneyu, ttest_1samp, ttest_ind
 from sideslip.benchmarks.harness.stats import (
     Estimate,
     average,
-    compute_p_value,
     compute_tail_mean,
     compute_win_rate,
     geometric_mean,
-    holm,
     interval,
     margin_of_error,
     mean_share,
@@ -202,27 +200,12 @@ def test_rates_near_zero_and_one_have_an_interval() -> None:
     assert (all_.low, all_.high) == pytest.approx((1.0 - none.high, 1.0))
 
 
-def test_holm_is_the_step_down() -> None:
-    assert holm([0.001, 0.04, 0.02, 0.5]) == [True, False, False, False]  # 0.02 > 0.05 / 3
-    assert holm([0.001, 0.02, 0.016, 0.5]) == [True, True, True, False]
-    assert holm([]) == []
-
-
-def test_holm_accuses_nobody_in_19_of_20_tables() -> None:
-    """Twenty contestants as good as the best, 500 times: at most one table in 20 accuses one."""
-    rng = np.random.default_rng(5)
-    tables = ([compute_p_value(rng.laplace(size=64)) for _ in range(20)] for _ in range(500))
-    assert sum(any(holm(chances)) for chances in tables) / 500 < 0.08
-    assert holm([compute_p_value(rng.normal(-0.5, 1.0, 64)) for _ in range(20)]).count(True) > 10
-
-
 @pytest.mark.parametrize("n", [0, 1])
 def test_nothing_to_count_is_no_number(n: int) -> None:
     few = np.ones(n)
     for found in (geometric_mean(few), compute_tail_mean(few)):
         assert math.isnan(found.value) == (n == 0) and math.isnan(found.low)
     assert math.isnan(share(few).value) == (n == 0)
-    assert compute_p_value(few) == 1.0
     lost = np.array([1.0, np.nan])
     assert math.isnan(share(lost).value) and math.isnan(compute_tail_mean(lost).value)
 

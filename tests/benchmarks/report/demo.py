@@ -113,9 +113,8 @@ def _place(t: Any) -> dict[str, Any]:
 
 
 def matrix() -> Suite:
-    """What only the matrix has: a heat map, two cells side by side and in motion, a file."""
+    """What only the matrix has: two cells side by side and in motion."""
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    pictures = pytest.importorskip("sideslip.benchmarks.report.figures")
     t = np.linspace(0.0, 8.0, 801)
     cells: dict[tuple[str, ...], dict[str, Any]] = {
         (manoeuvre, who): {"t": t, "beta": k * np.sin(t + k), **_place(t)}
@@ -124,7 +123,6 @@ def matrix() -> Suite:
         )
     }
     panels = [Panel("slip / mrad", [("beta", "true")])] * 2
-    values = np.array([[0.0, 0.0, np.nan], [0.91, 0.72, 1.2]])
     delays = np.array([0.0, 100.0, 300.0])
     line = (np.array([0.9, 0.8, 0.5]), np.array([0.88, 0.78, 0.4]), np.array([0.92, 0.82, 0.6]))
     return Suite(
@@ -132,13 +130,7 @@ def matrix() -> Suite:
         "Which controller and estimator hold the car",
         "Made up.",
         figures=[
-            (
-                "Scores",
-                pictures.draw_heat_map(["none", "lqr"], ["gust", HOSTILE, "x"], values, "s"),
-                "",
-            ),
             ("Delay", figures.draw_curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
         ],
         explorers=[Explorer("Any two", ("manoeuvre",), cells, panels, "One.", ("none", HOSTILE))],
-        files=[("run.kml", "application/vnd.google-earth.kml+xml", HOSTILE)],
     )
