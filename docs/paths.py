@@ -56,7 +56,7 @@ PATHS = {
         Step("benchmarks/control/run.py", "measure",
              "drives entry.make(task, n) in processes: n seeds at once, step by step",
              "DriveResult of each case: metrics, shape (seeds, len(NUMBERS))"),
-        Step("benchmarks/control/score.py", "rank_entries",
+        Step("benchmarks/control/tables.py", "Matrix.by_tier",
              "pairs drives with nominal's, and ranks by score"),
     ),
 }  # fmt: skip

@@ -1,6 +1,6 @@
 """Tasks of the control benchmark: a manoeuvre with its car, actuators and reference.
 
-`contests.json` holds those that demand enough of a car without control (`baseline_gaps.py`). Test
+`contests.json` holds those that demand enough of a car without control (`calibration.py`). Test
 seeds follow a salt, a hash of the entries' sources and the world: nobody can have tuned on them.
 """
 
@@ -26,7 +26,7 @@ from ..harness.results import read_objects
 YAW = "sideslip/YawFusion-v0"
 STEERING = "sideslip/AfsYawFusion-v0"
 FILE = Path(__file__).with_name("contests.json")
-COMMAND = "python -m sideslip.benchmarks.control.baseline_gaps --write"
+COMMAND = "python -m sideslip.benchmarks.control.calibration --write"
 
 NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
 ORACLES = {PARAMETERS: baselines.PARAMETER_ORACLES, STATE: baselines.STATE_ORACLES}

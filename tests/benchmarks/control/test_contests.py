@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import tasks as module
-from sideslip.benchmarks.control.baseline_gaps import _BASELINES, _measure_task
+from sideslip.benchmarks.control.calibration import _BASELINES, _measure_task
 from sideslip.benchmarks.control.entries import Entry
 from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, measure
 from sideslip.benchmarks.control.score import PairedDrives
