@@ -46,8 +46,8 @@ def test_the_readme_is_a_door() -> None:
 
 
 def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
-    """`python -m sideslip.benchmarks.tuning.levels parts --out docs/next_car.json` and `sideslip bench
-    speed --json docs/speed.json` write two of them."""
+    """`python -m sideslip.benchmarks.tuning.levels parts --out docs/next_car.json` writes one of
+    them, `sideslip bench speed --json docs/speed.json` another."""
     table = json.loads((ROOT / "docs/next_car.json").read_text())
     key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(ROOT / "docs/speed.json")
     (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
