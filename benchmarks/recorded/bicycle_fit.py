@@ -248,13 +248,10 @@ class BicycleFit:
     pull: Array  # slope of the priors, shape (n,)
 
     def estimate_shift(self, left_out: npt.NDArray[np.bool_]) -> Array:
-        """Estimate to first order how the free parameters move when stretches are left out.
+        """Estimate to first order how the parameters, (n,), move without some stretches.
 
         Args:
             left_out: Mask, shape (stretches,).
-
-        Returns:
-            Changes of the parameters, shape (n,).
         """
         rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
         return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))

@@ -75,9 +75,6 @@ def identify(
             stiff as at small slips, with the stated friction and roll; None: what errs less on
             held-out stretches.
 
-    Returns:
-        Car, calibration and findings.
-
     Raises:
         ValueError: Swapped columns, or an unknown law of tyres.
     """
@@ -292,7 +289,7 @@ def identify_file(
     until: float | None = None,
     validate: bool = False,
 ) -> tuple[IdentificationResult, Suite]:
-    """Read a drive and identify its car.
+    """Read a drive and identify its car; return the result and its suite.
 
     Args:
         log: File of the drive.
@@ -302,9 +299,6 @@ def identify_file(
         tyres: Law of the tyres, as for `identify`.
         until: End of the part that is used (s), None for all.
         validate: Whether to say how well a car from half of the log drives the other half.
-
-    Returns:
-        Identified car and calibration, and their suite.
     """
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = make_vehicle(vehicle)

@@ -73,9 +73,6 @@ def inspect_file(
         wires: Calibration of the signals.
         figures: Whether to draw.
 
-    Returns:
-        Suite with the verdict, channels, findings, and what can be estimated.
-
     Raises:
         ValueError: A column's name or calibration is none, or it is a receiver's log (NMEA).
     """

@@ -58,15 +58,12 @@ class LoggedMotion(NamedTuple):
 
 
 def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
-    """Estimate the sideslip angle of drives by the gyro alone.
+    """Estimate the sideslip angle (rad) of drives, shape (rows,) each, by the gyro alone.
 
     Args:
         logs: Recorded drives, at least one.
         car: Car that is assumed.
         wires: Calibration of the steering.
-
-    Returns:
-        Sideslip angle (rad) of each, shape (rows,).
     """
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
@@ -75,14 +72,11 @@ def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) 
 
 
 def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
-    """Compute a statistic of the sum of blocks with its interval.
+    """Compute a statistic of the sum of blocks, and half of its 95 % interval.
 
     Args:
         blocks: Sums of blocks that are taken for independent, shape (count, ...).
         statistic: Function of such sums.
-
-    Returns:
-        The statistic and half of its 95 % interval.
     """
     total, count = blocks.sum(axis=0), len(blocks)
     without = np.array([statistic(total - block) for block in blocks])

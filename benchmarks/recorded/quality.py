@@ -102,15 +102,12 @@ def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
 
 
 def smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
-    """Smooth the columns of undisturbed rows.
+    """Smooth the columns of undisturbed rows, (rows,) each, zeros for one that is not logged.
 
     Args:
         logs: Parts of the log.
         names: Columns; also "turning", speed x yaw rate, and "slipping", the change of speed x
             truth (m/s2).
-
-    Returns:
-        Each column, shape (rows,), zeros for one that was not logged.
     """
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
@@ -192,13 +189,10 @@ def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, fl
 
 
 def estimate_resolution(values: Array) -> float:
-    """Estimate the step between the values of a column.
+    """Estimate the step between the values of a column, 0 for one too fine to be seen.
 
     Args:
         values: Values, shape (n,).
-
-    Returns:
-        Step in their unit, 0 for one too fine to be seen.
     """
     steps = np.diff(np.unique(values))
     step = float(np.median(steps)) if 2 <= len(steps) < len(values) / 3 else math.inf
@@ -207,14 +201,11 @@ def estimate_resolution(values: Array) -> float:
 
 
 def find_saturated(log: Log, name: str = "gyro") -> npt.NDArray[np.bool_]:
-    """Mark rows in which a column stays at its limit: long, and many steps of its resolution.
+    """Mark rows in which a column stays at its limit: long, many steps of its resolution.
 
     Args:
         log: Recorded drive.
         name: Column, "gyro" or "accel_y".
-
-    Returns:
-        Mask, shape (rows,).
     """
     x = log.record.fast[:, getattr(FAST, name)]
     runs = np.cumsum(np.diff(x, prepend=x[0]) != 0.0)
@@ -225,13 +216,10 @@ def find_saturated(log: Log, name: str = "gyro") -> npt.NDArray[np.bool_]:
 
 
 def find_swapped(logs: Sequence[Log]) -> str:
-    """Find what columns seem to be swapped.
+    """Find what columns seem to be swapped and why, "" for none that can be seen.
 
     Args:
         logs: Parts of the log.
-
-    Returns:
-        Their names and why, "" for none that can be seen.
     """
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
@@ -347,14 +335,11 @@ def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
 
 
 def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
-    """Find what does not fit together in a drive.
+    """Find what does not fit together in a drive: findings that are not OK.
 
     Args:
         logs: Parts of the log.
         car: The car that is assumed.
-
-    Returns:
-        Findings, none of them OK.
     """
     sentences: list[LogFinding] = []
     if what := find_swapped(logs):

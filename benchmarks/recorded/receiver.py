@@ -209,9 +209,6 @@ def replay_nmea(log: str | Path) -> ReceiverReplay:
     Args:
         log: Path of the log.
 
-    Returns:
-        The fixes, and the results of each law.
-
     Raises:
         ValueError: For a log too short to compare, and for all that `read_nmea` refuses.
     """

@@ -41,9 +41,6 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
         log: Recorded drive.
         vehicle: Vehicle from which the estimators are designed.
         settings: Fields of `Settings`; TypeError for an unknown, ValueError for a bad one.
-
-    Returns:
-        Suite with verdict, table and figures.
     """
     how = Settings(**settings)
     drives = make_drives(log, how)

@@ -349,13 +349,10 @@ class Traffic:
         return not bool(self.ego.lane.on_lane(self.ego.position, margin=0.5 * self.ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Locate our car on the lanes that it follows.
+        """Locate our car on the present lane of its route.
 
         Args:
             motion: `Motion` of our car.
-
-        Returns:
-            Position on the present lane of its route.
         """
         while True:
             lane = self.course.route[self._lane]

@@ -36,13 +36,10 @@ _UNITS = {
 
 
 def find_unit(text: str) -> str:
-    """Translate a unit such as "[km/h]" or "°/s" to that of our column names.
+    """Translate a unit such as "[km/h]" to that of our column names, "" for an unknown one.
 
     Args:
         text: Unit as a file writes it.
-
-    Returns:
-        Our unit, "" if unknown.
     """
     return _UNITS.get(re.sub(r"[\s\[\]()·*]", "", text.casefold().translate(_SIGNS)), "")
 
@@ -237,13 +234,10 @@ def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[st
 
 
 def find_sampling(values: Array) -> tuple[str, float]:
-    """Find whether a column repeats slower samples or draws lines between them.
+    """Find "held" or "interpolated" between slower samples, else "", and their period (rows).
 
     Args:
         values: Values in SI units without gaps, shape (n,).
-
-    Returns:
-        "held", "interpolated" or "", and the period of the samples (rows), 0 for "".
     """
     if period := _find_period(np.diff(np.flatnonzero(np.diff(values)))):
         return "held", period
@@ -335,15 +329,12 @@ def _compute_radii(latitude: float) -> tuple[float, float]:
 def to_metres(
     latitude: Array, longitude: Array, origin: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Convert places to metres east and north of an origin, the inverse of `to_degrees`.
+    """Convert places to metres (east, north) of an origin, the inverse of `to_degrees`.
 
     Args:
         latitude: Latitude (degrees north), shape (n,).
         longitude: Longitude (degrees east), shape (n,).
         origin: Origin (degrees north, degrees east).
-
-    Returns:
-        (east, north) (m), shape (n,) each.
     """
     east, north = _compute_radii(origin[0])
     delta = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
@@ -351,15 +342,12 @@ def to_metres(
 
 
 def to_degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """Convert metres east and north of an origin to degrees, within 0.2 m up to 1 km.
+    """Convert metres from an origin to (latitude, longitude), within 0.2 m up to 1 km.
 
     Args:
         X: Metres east (m), shape (n,).
         Y: Metres north (m), shape (n,).
         origin: Origin (degrees north, degrees east).
-
-    Returns:
-        (latitude, longitude) (degrees), shape (n,) each.
     """
     east, north = _compute_radii(origin[0])
     return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)

@@ -59,7 +59,7 @@ def _make_log(
 def make_packet_rows(
     sensor: str, captured: Array, arrived: Array, values: Array, quality: Array
 ) -> Array:
-    """Make the packets of one sensor in capture order.
+    """Make the packets of one sensor in capture order, shape (count, PACKET_WIDTH).
 
     Args:
         sensor: Name of the sensor, "camera" or "gps".
@@ -67,9 +67,6 @@ def make_packet_rows(
         arrived: Ticks of arrival, shape (count,).
         values: Values in SI units, shape (count, up to VALUES).
         quality: Quality, shape (count,).
-
-    Returns:
-        Packets, shape (count, PACKET_WIDTH).
     """
     packets = np.zeros((len(captured), PACKET_WIDTH))
     packets[:, PACKET.sensor] = SLOW_NAMES.index(sensor)
@@ -82,13 +79,10 @@ def make_packet_rows(
 
 
 def find_step(time: Array) -> float:
-    """Find the step of an even clock; ValueError, with the row, for an uneven one.
+    """Find the step of an even clock (s); ValueError, with the row, for an uneven one.
 
     Args:
         time: Time of each row (s), shape (n,).
-
-    Returns:
-        dt (s).
     """
     steps = np.diff(time)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
@@ -113,13 +107,10 @@ def find_step(time: Array) -> float:
 
 
 def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
-    """Make the record's fast rows and the names of their columns that carry something.
+    """Make the fast rows, shape (n, FAST_WIDTH), and the names of those that carry something.
 
     Args:
         values: Quantities in SI units, shape (n,) each.
-
-    Returns:
-        Fast rows, shape (n, FAST_WIDTH), and the names.
     """
     fast, present = np.zeros((len(values["time"]), FAST_WIDTH)), set()
     if not {"wheel_left", "wheel_right"} <= values.keys():
@@ -142,15 +133,12 @@ def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
 def make_packets(
     values: dict[str, Array], first: int, dt: float
 ) -> tuple[Array, dict[str, SlowSensor]]:
-    """Make the packets of all slow sensors and their clocks.
+    """Make the packets, shape (count, PACKET_WIDTH), and slow sensors by name.
 
     Args:
         values: Quantities in SI units, shape (n,) each; NaN where a slow sensor has no sample.
         first: Tick of the first row.
         dt: Tick (s).
-
-    Returns:
-        Packets, shape (count, PACKET_WIDTH), and slow sensors by name.
     """
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     absent = np.full(len(values["time"]), np.nan)

@@ -64,9 +64,6 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
         text: A file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
         tries: Number of times that a lost line is opened again before a byte comes.
         wait: Time before each (s).
-
-    Returns:
-        The source.
     """
     kind, _, rest = text.partition(":")
     head, _, number = rest.rpartition(":")
@@ -100,15 +97,13 @@ def is_nmea(path: str | Path) -> bool:
 
 
 def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
-    """Read all epochs of a file, their dates mended (extra `wires`); FileNotFoundError without it.
+    """Read all epochs of a file, their dates mended, and its counts (extra `wires`).
 
-    Raises ValueError for a folder, and a file without a valid sentence or an epoch with a fix.
+    Raises FileNotFoundError without it, ValueError for a folder and where no sentence is valid or
+    no epoch has a fix.
 
     Args:
         path: Path of the file.
-
-    Returns:
-        The epochs, and counts of what the file holds.
     """
     from .nmea import Decoder, correct_dates
 

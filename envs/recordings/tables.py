@@ -170,13 +170,10 @@ def read_quantities(
 
 
 def name_log(source: "LogSource") -> str:
-    """Name a log in messages.
+    """Name a log in messages by its path, or as "the frame".
 
     Args:
         source: Path of the table, or the table itself.
-
-    Returns:
-        The path, or "the frame".
     """
     return str(source) if isinstance(source, str | Path) else "the frame"
 

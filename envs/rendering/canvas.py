@@ -161,13 +161,10 @@ class Canvas:
 
 
 def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
-    """Read the pixels of a picture.
+    """Read the red, green and blue of a picture, shape (height, width, 3).
 
     Args:
         picture: Picture as a surface of pygame.
-
-    Returns:
-        Red, green and blue, shape (height, width, 3).
     """
     flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
     return flat.reshape(picture.get_height(), picture.get_width(), 3).copy()

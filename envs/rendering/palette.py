@@ -86,7 +86,7 @@ def find_colour(name: str) -> str:
 
 
 def mix_colours(shade: str, with_shade: str, share: float) -> str:
-    """Mix two colours.
+    """Mix two colours to one, "#rrggbb" in lower case.
 
     >>> mix_colours("#000000", "#FFFFFF", 0.2)
     '#cccccc'
@@ -95,9 +95,6 @@ def mix_colours(shade: str, with_shade: str, share: float) -> str:
         shade: One colour, "#RRGGBB".
         with_shade: The other colour.
         share: Fraction of the first, from 0 to 1.
-
-    Returns:
-        "#RRGGBB" in lower case.
     """
     pairs = [(int(shade[i : i + 2], 16), int(with_shade[i : i + 2], 16)) for i in (1, 3, 5)]
     return "#" + "".join(f"{round(a * share + b * (1.0 - share)):02x}" for a, b in pairs)

@@ -342,13 +342,10 @@ def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str)
 
 
 def compute_body(vehicle: Vehicle) -> _Body:
-    """Compute the extent of a car's body.
+    """Compute the front, rear and half width (m) of a car's body.
 
     Args:
         vehicle: Vehicle with the axles' places and the width.
-
-    Returns:
-        Front, rear and half width (m).
     """
     over = 0.5 * (_LENGTH_RATIO - 1.0) * vehicle.wheelbase
     return _Body(vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width)
