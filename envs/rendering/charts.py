@@ -47,18 +47,13 @@ class _Strip(NamedTuple):
 
 
 def _make_strips(
-    truth: Array,
-    estimates: dict[str, Array],
-    colours: dict[str, str],
-    ghosts: list[tuple[Array, str]],
-    max_moment: float,
-    has_yaw_reference: bool,
+    truth: Array, estimates: dict[str, Array], ghosts: list[Array], max_moment: float, turns: bool
 ) -> list[_Strip]:
-    """Make the charts of sideslip angle, yaw rate and yaw moment, with those of ghosts."""
+    """Make the charts of sideslip angle, yaw rate (turns: with a reference) and yaw moment."""
     t, point = truth[:, TRACE_POINT.t], TRACE_POINT
 
     def make_lines(column: int, factor: float = _DEGREES, reference: int = 0) -> list[_ChartLine]:
-        lines = [_ChartLine(g[:, point.t], factor * g[:, column], c) for g, c in ghosts]
+        lines = [_ChartLine(g[:, point.t], factor * g[:, column], GREY) for g in ghosts]
         if reference:
             lines.insert(0, _ChartLine(t, factor * truth[:, reference], INK, True, width=1.0))
         return [*lines, _ChartLine(t, factor * truth[:, column], INK, width=2.0)]
@@ -66,8 +61,8 @@ def _make_strips(
     slip = make_lines(point.beta, reference=point.beta_ref)
     for name, columns in estimates.items():
         hat, std = _DEGREES * columns.T
-        slip.append(_ChartLine(t, hat, colours[name], deviation=std))
-    rate = make_lines(point.gamma, reference=point.gamma_ref if has_yaw_reference else 0)
+        slip.append(_ChartLine(t, hat, find_colour(name), deviation=std))
+    rate = make_lines(point.gamma, reference=point.gamma_ref if turns else 0)
     return [
         _Strip("sideslip angle / deg", 1.0, 1.6, slip),
         _Strip("yaw rate / (deg/s)", 10.0, 1.0, rate),
@@ -134,33 +129,25 @@ MAGNIFIED = 4.0  # times the sideslip angle is drawn
 _LENGTH, _CIRCLE = 190.0, 38.0  # pixels: the car, and the circle of 0.3 of its weight
 
 
-def _draw_closeup(
-    canvas: Canvas,
-    box: Box,
-    scene: road.CarScene,
-    beta: float,
-    reference: float,
-    estimates: dict[str, tuple[float, str]],
-) -> None:
-    """Draw a car, its sideslip angle, reference and estimates (rad) with their colours by label."""
-    body = front, rear, half = road.compute_body(scene.vehicle)
+class _SlipAngles(NamedTuple):
+    """Sideslip angles of a car at an instant (rad)."""
+
+    beta: float
+    reference: float
+    estimates: dict[str, float]  # by label
+
+
+def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAngles) -> None:
+    """Draw a car with its tyres' forces, sideslip angles and wind."""
+    body = front, rear, _ = road.compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
     x_0, y_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear), box[1] + 0.5 * box[3]
     to_pixels = road.Projection((x_0, y_0), scale)
-    canvas.draw_polygon(to_pixels(body.outline), "#C9CED4")
-    inner = body._replace(front=front - 0.02, rear=rear + 0.02, half=half - 1.5 / scale)
-    canvas.draw_polygon(to_pixels(inner.outline), "#EDEFF1")
+    canvas.draw_polygon(to_pixels(body.outline), "#DFE2E5")
     per_newton = _CIRCLE / (0.3 * scene.vehicle.mass * GRAVITY)
     for wheel in scene.wheels:
-        centre = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
-        if wheel.capacity > 0.0:
-            radius = wheel.capacity * per_newton
-            canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
-            canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
-    for wheel in scene.wheels:
-        canvas.draw_polygon(to_pixels(wheel.outline(scene.vehicle.wheel_radius)), "#A9B0B7")
-    _draw_forces(canvas, scene, to_pixels, per_newton)
-    _draw_directions(canvas, (x_0, y_0), beta, reference, estimates)
+        _draw_wheel(canvas, wheel, scene.vehicle.wheel_radius, to_pixels, per_newton)
+    _draw_directions(canvas, (x_0, y_0), slips)
     if scene.wind:
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
         canvas.draw_arrow(foot, foot - (0.0, math.copysign(34.0, scene.wind)), PALETTE[3], 4.0)
@@ -168,34 +155,30 @@ def _draw_closeup(
     x = box[0] + 14.0
     if any(wheel.capacity for wheel in scene.wheels):
         canvas.draw_text((x, box[1] + 12.0), "tyre forces in their friction circles", road.SOFT, 12)
-    degrees = round(math.degrees(beta), 1) + 0.0  # no -0.0
+    degrees = round(math.degrees(slips.beta), 1) + 0.0  # no -0.0
     words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
     canvas.draw_text((x, box[1] + box[3] - 12.0), words, INK, 12)
 
 
-def _draw_forces(
-    canvas: Canvas, scene: road.CarScene, to_pixels: road.Projection, per_newton: float
+def _draw_wheel(
+    canvas: Canvas, wheel: road.Wheel, r: float, to_pixels: road.Projection, per_newton: float
 ) -> None:
-    """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
-    for wheel in scene.wheels:
-        cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
-        forward, left = cos * wheel.F_x - sin * wheel.F_y, sin * wheel.F_x + cos * wheel.F_y
-        start = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
-        utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
-        colour = mix_colours(road.ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
-        canvas.draw_arrow(start, start + per_newton * np.array([forward, -left]), colour, 3.0)
-        if wheel.capacity:
-            place = start[0], start[1] - math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
-            canvas.draw_text(place, f"{100.0 * utilisation:.0f} %", colour, 12, 0.5)
+    """Draw a wheel and its force in its friction circle, from green to orange at the limit."""
+    cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
+    forward, left = cos * wheel.F_x - sin * wheel.F_y, sin * wheel.F_x + cos * wheel.F_y
+    centre, radius = to_pixels(np.array([[wheel.x, wheel.y]]))[0], wheel.capacity * per_newton
+    utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
+    colour = mix_colours(road.ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
+    if wheel.capacity:
+        canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
+        canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
+        place = centre[0], centre[1] - math.copysign(radius + 10.0, wheel.y)
+        canvas.draw_text(place, f"{100.0 * utilisation:.0f} %", colour, 12, 0.5)
+    canvas.draw_polygon(to_pixels(wheel.outline(r)), "#A9B0B7")
+    canvas.draw_arrow(centre, centre + per_newton * np.array([forward, -left]), colour, 3.0)
 
 
-def _draw_directions(
-    canvas: Canvas,
-    centre: tuple[float, float],
-    beta: float,
-    reference: float,
-    estimates: dict[str, tuple[float, str]],
-) -> None:
+def _draw_directions(canvas: Canvas, centre: tuple[float, float], slips: _SlipAngles) -> None:
     """Draw the directions of the velocity, of its reference and of the estimates."""
 
     def make_ray(angle: float, length: float) -> Array:
@@ -203,10 +186,10 @@ def _draw_directions(
         return np.array([centre, centre + length * direction])
 
     canvas.draw_line(make_ray(0.0, 138.0), "#C3C8CE", 1.0)
-    canvas.draw_line(make_ray(reference, 138.0), INK, 1.0, (4.0, 3.0))
-    for angle, colour in estimates.values():
-        canvas.draw_line(make_ray(angle, 132.0), colour, 2.0)
-    canvas.draw_arrow(centre, make_ray(beta, 122.0)[1], INK, 3.0)
+    canvas.draw_line(make_ray(slips.reference, 138.0), INK, 1.0, (4.0, 3.0))
+    for label, angle in slips.estimates.items():
+        canvas.draw_line(make_ray(angle, 132.0), find_colour(label), 2.0)
+    canvas.draw_arrow(centre, make_ray(slips.beta, 122.0)[1], INK, 3.0)
     canvas.draw_disc(centre, 4.0, INK)
     canvas.draw_disc(centre, 1.8, "#FFFFFF")
 
@@ -231,7 +214,6 @@ def draw_picture(
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
     first = max(now[TRACE_POINT.t] - span, 0.0)
     truth, estimates = trace.select_since(first)
-    shades = {label: find_colour(label) for label in estimates}
     scene = road.make_car_scene(shot)
     ghost_cars = [
         road.CarTrack(road.make_car_scene(ghost), ghost.trace.select_since(first)[0], GREY, label)
@@ -242,16 +224,13 @@ def draw_picture(
     if draw_world is None:
         driven_car = road.CarTrack(scene, truth, road.BLUE, name if ghosts else "")
         road.draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
-    ends = {label: float(item[-1, 0]) for label, item in estimates.items()}
-    newest = {n: (end, shades[n]) for n, end in ends.items() if math.isfinite(end)}
-    slips = now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref]
-    _draw_closeup(canvas, _CLOSEUP, scene, *slips, newest)
-    has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
-    others = [(item.truth, item.colour) for item in ghost_cars]
-    scale = float(p[P.task.yaw_scale])
-    strips = _make_strips(truth, estimates, shades, others, scale, has_yaw_reference)
+    newest = {label: float(x[-1, 0]) for label, x in estimates.items() if np.isfinite(x[-1, 0])}
+    slips = _SlipAngles(now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], newest)
+    _draw_closeup(canvas, _CLOSEUP, scene, slips)
+    turns, scale = int(switches[FLAGS.reference]) != ZERO_SLIP, float(p[P.task.yaw_scale])
+    strips = _make_strips(truth, estimates, [x.truth for x in ghost_cars], scale, turns)
     _draw_strips(canvas, _STRIPS, strips, first, span)
-    _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
+    _draw_legend(canvas, name, [item for item, _ in ghosts], list(estimates))
     failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
     _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
     picture = canvas.finish()
@@ -261,10 +240,10 @@ def draw_picture(
     return picture
 
 
-def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, str]) -> None:
+def _draw_legend(canvas: Canvas, name: str, ghosts: list[str], estimates: list[str]) -> None:
     entries = [(name, INK, False), ("reference", INK, True)]
     entries += [(ghost, GREY, False) for ghost in ghosts]
-    entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
+    entries += [(f"{label} ± 1 std", find_colour(label), False) for label in estimates]
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
         ends, width = [(x, 272.0), (x + 20.0, 272.0)], 1.5 if dashed else 2.5

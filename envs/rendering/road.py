@@ -57,7 +57,7 @@ class _Body(NamedTuple):
         return np.concatenate([left, left[::-1] * (1.0, -1.0)])
 
 
-class _Wheel(NamedTuple):
+class Wheel(NamedTuple):
     """A wheel in car axes, x ahead and y to the left of the centre of gravity."""
 
     x: float  # m
@@ -68,7 +68,11 @@ class _Wheel(NamedTuple):
     capacity: float  # N in all directions; 0: without a limit
 
     def outline(self, r: float) -> Array:
-        """Make the corners of a wheel of a radius (m), points in car axes (m), (4, 2)."""
+        """Make the corners in car axes (m), shape (4, 2).
+
+        Args:
+            r: Radius of the wheel (m).
+        """
         w, cos, sin = 0.3 * r, np.cos(self.angle), np.sin(self.angle)
         corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
         rotated: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (self.x, self.y)
@@ -88,7 +92,7 @@ class CarScene(NamedTuple):
 
     motion: Motion
     vehicle: Vehicle
-    wheels: tuple[_Wheel, ...]  # front left and right, rear left and right
+    wheels: tuple[Wheel, ...]  # front left and right, rear left and right
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
     field_of_view: _CameraOverlay | None  # None without a camera
@@ -123,7 +127,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if variant.law == LINEAR else math.hypot(tyre.limit, F_wx)
         forces = (F_wx, F_wy, capacity) if shot.has_tyre_forces else (0.0, 0.0, 0.0)
-        wheels.append(_Wheel(*place, *forces))
+        wheels.append(Wheel(*place, *forces))
     lanes, view, overlay = _find_lanes(params.path, config), read(p, P.field_of_view), None
     s = np.arange(motion.s - _KNOWN_LENGTH, motion.s + _KNOWN_LENGTH, 0.5) if lanes else np.empty(0)
     if "camera" in config.slow:

@@ -23,6 +23,7 @@ from sideslip.envs.rendering.charts import (
     MAX_SPAN,
     SIZE,
     _draw_closeup,
+    _SlipAngles,
     draw_picture,
 )
 from sideslip.envs.rendering.palette import GREY, INK, PALETTE, find_colour, mix_colours
@@ -210,7 +211,7 @@ def test_both_cars_are_named_in_their_colours() -> None:
 
 BOX = (0.0, 0.0, 400.0, 300.0)
 WIND = PALETTE[3]
-ESTIMATE = "#123456"
+ESTIMATE = find_colour("exact-kf")
 
 
 class Noted(Canvas):
@@ -244,7 +245,7 @@ def still() -> CarScene:
 
 def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
     canvas = Noted()
-    _draw_closeup(canvas, BOX, scene, beta, 0.0, {"filter": (estimate, ESTIMATE)})
+    _draw_closeup(canvas, BOX, scene, _SlipAngles(beta, 0.0, {"exact-kf": estimate}))
     return canvas
 
 
