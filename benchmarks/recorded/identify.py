@@ -17,6 +17,7 @@ from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
+from ..harness.stats import Estimate
 from ..harness.verdict import format_verdict
 from . import quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, fit
@@ -328,19 +329,14 @@ def _make_suite(result: IdentificationResult, name: str) -> Suite:
     untold = f"Not told by this log: {', '.join(missing) or 'nothing'}."
     limits = "Not covered: the mass, which scales all; drives beside the part that was used."
     suite.verdict = format_verdict(answer, slip, untold, limits)
-    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = list(map(_format_cells, result.findings))
-    suite.tables = [ResultTable("What the log shows", header, cells, _FINDINGS_NOTE, keyed=False)]
+    numbers = Column("stated", form=".4g"), Column("found", "found [95 %]", form=".4g")
+    columns = ("number", *numbers, "unit", "told by this log?")
+    cells = []
+    for name, value, at, half, unit, is_determined, remark in result.findings:
+        number, is_so = Estimate(at, at - half, at + half), "yes" if is_determined else "no"
+        cells.append([name, value, number, unit or "-", ": ".join(filter(None, [is_so, remark]))])
+    suite.tables = [ResultTable("What the log shows", columns, cells, _FINDINGS_NOTE, keyed=False)]
     return suite
-
-
-def _format_cells(row: Finding) -> list[str]:
-    stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
-    ends = "-"
-    if math.isfinite(row.half):
-        ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
-    remark = ": ".join(filter(None, ["yes" if row.is_determined else "no", row.remark]))
-    return [row.name, stated, value, ends, row.unit or "-", remark]
 
 
 def _cut(log: Log, start: int, end: int) -> Log:

@@ -15,7 +15,7 @@ from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
 from ..task import COLLISION, DEPARTURE, REPORT, RUNNING, compute_failure_cost
-from ..validation import check_choice, check_int, check_mapping, describe_unknown
+from ..validation import check_choice, check_int, check_mapping, check_options
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import VehicleSource
 from .traffic import PERIOD, ROADS, Hazard, Traffic, TrafficStart
@@ -27,13 +27,6 @@ MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
 _MAX_PERIOD = 20  # ticks between two looks at a lane that bends
 _OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")
 _FIXED_STATE = ("s", "theta", "X", "Y")
-
-
-def _make_hazard(source: Mapping[str, Range]) -> Hazard:
-    known = Hazard.__dataclass_fields__
-    if unknown := [name for name in check_mapping("hazard", source) if name not in known]:
-        raise TypeError(describe_unknown("field of hazard", unknown, known))
-    return Hazard(**source)
 
 
 class HighwayEnv(StabilityEnv):
@@ -80,7 +73,9 @@ class HighwayEnv(StabilityEnv):
         **options: Any,
     ) -> None:
         check_choice("road", road, ROADS)
-        self.road, self.hazard = road, None if hazard is None else _make_hazard(hazard)
+        if hazard is not None:
+            check_options("hazard", Hazard.__init__, check_mapping("hazard", hazard))
+        self.road, self.hazard = road, None if hazard is None else Hazard(**hazard)
         self.traffic = check_int("traffic", traffic, "vehicles", 0, MAX_VEHICLES)
         adapted = self._adapt_scenario(make_scenario(scenario))
         super().__init__(sensors, adapted, vehicle, reference=reference, **options)
