@@ -19,16 +19,9 @@ from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..harness.verdict import format_verdict
-from . import quality
+from . import motion, quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, fit
-from .motion import (
-    LATE_WITHIN,
-    WIDE,
-    Finding,
-    LoggedMotion,
-    estimate_slips,
-    make_sensor_findings,
-)
+from .motion import Finding, LoggedMotion
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6
@@ -90,7 +83,8 @@ def identify(
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
     result = IdentificationResult(car, stated)
     w = Windows.from_logs(logs, car)
-    gain, related = quality.estimate_steering_gain(logs, car)
+    line = quality.fit_steering(logs, car, steady=False)
+    gain, related = (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
     if reason := _find_reason(w, related):
         result.reason = reason
         for _, label, value, unit in _list_parameters(car, stated):
@@ -101,10 +95,10 @@ def identify(
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
-    slips = estimate_slips(logs, result.car, result.wires._replace(at={}))
-    both = (estimate_slips(logs, car, stated._replace(at={})), slips)
+    slips = motion.estimate_slips(logs, result.car, result.wires._replace(at={}))
+    both = (motion.estimate_slips(logs, car, stated._replace(at={})), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
-    findings, noise, latency = make_sensor_findings(logs, slips)
+    findings, noise, latency = motion.make_sensor_findings(logs, slips)
     result.findings += findings
     result.wires = result.wires._replace(noise=noise, latency={**result.wires.latency, **latency})
     return result
@@ -190,14 +184,14 @@ def _fit_latencies(w: Windows, base: BicycleFit) -> tuple[list[Finding], Bicycle
     free = fit(w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.halves[name], float(getattr(free.theta, name))
-        is_determined, remark = half < LATE_WITHIN, "within its interval of 0"
+        is_determined, remark = half < motion.LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
             single_fit = fit(w, base.theta, (*base.free, name), base.scale)
             share = np.linalg.norm(_evaluate_folds(w, single_fit) / base.scale) / usual
             pays += [name] if share < _MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
-        text = remark if is_determined else WIDE
+        text = remark if is_determined else motion.WIDE
         rows.append(Finding(label, 0.0, value, half, "s", is_determined, text))
     best = fit(w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
@@ -229,7 +223,7 @@ def _make_car_findings(
         at = float(getattr(best.theta, name))
         half = math.hypot(best.halves.get(name, math.inf), float(getattr(free.theta, name)) - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
-        remark = "" if is_determined else WIDE
+        remark = "" if is_determined else motion.WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
         elif label == "steering sign":

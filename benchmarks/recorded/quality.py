@@ -163,8 +163,15 @@ def _describe_contradiction(
     return [_make_finding("unit", column, text, cure)]
 
 
-def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
-    """Line of the linear car's steering for its yaw rate over the logged one; tyres 0: neutral."""
+def fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
+    """Fit the linear car's steering for its yaw rate over the logged one; None if constant.
+
+    Args:
+        logs: Parts of the log.
+        car: Stated car.
+        steady: Whether steady turns count alone.
+        tyres: Factor of the understeer gradient, 0 for a neutral car.
+    """
     speed, gyro, steer, accel_y = smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
@@ -172,20 +179,6 @@ def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float 
     used = (np.abs(speed * gyro) < _MILD) & ~slides
     used |= (used.sum() < _FEW) | (not steady)
     return _fit_line((gyro * (car.wheelbase / speed + under * speed))[used], steer[used])
-
-
-def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
-    """Estimate gain and correlation of the logged steering, from the linear car's yaw rate.
-
-    Args:
-        logs: Parts of the log.
-        car: Stated car.
-
-    Returns:
-        Gain (rad at the wheels per unit) and correlation; (1, 0) where steering is constant.
-    """
-    line = _fit_steering(logs, car, steady=False)
-    return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
 def estimate_resolution(values: Array) -> float:
@@ -303,7 +296,7 @@ def _describe_fixes(logs: Sequence[Log]) -> list[LogFinding]:
 
 def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[LogFinding]:
     """Findings on the steering, by steady turns and all rows, by these and other tyres."""
-    line, *lines = (_fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
+    line, *lines = (fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     sentences = _describe_contradiction(line, "steering", "yaw rate")
     if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
         return []

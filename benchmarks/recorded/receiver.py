@@ -62,9 +62,10 @@ def _make_track(epochs: Sequence[Epoch]) -> _Track:
         if epoch.has_fix and late and math.isfinite(epoch.hdop):
             shown.append(epoch)
             last = epoch.t
-    columns = np.array(shown, np.float64).reshape(-1, len(Epoch._fields)).T
-    now = dict(zip(Epoch._fields, columns, strict=True))
-    origin = (float(now["latitude"][0]), float(now["longitude"][0])) if shown else (0.0, 0.0)
+    if not shown:
+        raise ValueError("no fix has an HDOP: expected GGA, GNS or GSA sentences with one")
+    now = dict(zip(Epoch._fields, np.array(shown, np.float64).T, strict=True))
+    origin = float(now["latitude"][0]), float(now["longitude"][0])
     east, north = to_metres(now["latitude"], now["longitude"], origin)
     return _Track(origin, now["t"], east, north, now["course"], now["speed"], now["hdop"])
 
@@ -214,10 +215,8 @@ def replay_nmea(log: str | Path) -> ReceiverReplay:
     """
     path = Path(log)
     epochs, counts = read_nmea(path)
-    track = _make_track(epochs)
     try:
-        if not len(track.t):
-            raise ValueError("no fix has an HDOP: expected GGA, GNS or GSA sentences with one")
+        track = _make_track(epochs)
         outcomes = [(signal, _compare(signal)) for signal in _make_signals(track)]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

@@ -20,7 +20,7 @@ from sideslip.benchmarks.procedures import suite as procedures
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
 from sideslip.benchmarks.recorded import replay as recorded
-from sideslip.benchmarks.recorded.scoring import ReplayResult as Replayed
+from sideslip.benchmarks.recorded.replay import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 from sideslip.benchmarks.speed.timing import Taken

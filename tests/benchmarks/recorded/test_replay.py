@@ -11,12 +11,13 @@ from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.motion import GYRO_ONLY, LoggedMotion
-from sideslip.benchmarks.recorded.replay import replay, replay_file
-from sideslip.benchmarks.recorded.scoring import (
+from sideslip.benchmarks.recorded.replay import (
     ESTIMATORS,
     Settings,
     _emulate_course,
-    make_drives,
+    _make_drives,
+    replay,
+    replay_file,
 )
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
@@ -49,7 +50,7 @@ def values(suite: Suite, metric: str) -> dict[str, float]:
         ({"bias_deg": math.nan}, ValueError, "bias_deg must be finite"),
         ({"seeds": 0}, ValueError, "expected seeds >= 1"),
         ({"q_gamma": -1.0}, ValueError, "q_gamma must be finite and not negative"),
-        ({"estimators": ["kf"]}, ValueError, "unknown estimator kf; known here: bicycle-kf"),
+        ({"estimators": ["kf"]}, ValueError, "unknown estimator 'kf'; did you mean 'dakf'"),
         ({"course_rat": 5.0}, TypeError, "course_rat"),
     ],
 )
@@ -261,7 +262,7 @@ def test_the_noise_has_its_seed_and_size(log: Log) -> None:
 
 
 def test_a_gyro_bias_reaches_the_estimators_but_not_the_heading(log: Log) -> None:
-    one, two = (make_drives(log, Settings(gyro_bias_degps=x))[0].record for x in (0.0, 0.2))
+    one, two = (_make_drives(log, Settings(gyro_bias_degps=x))[0].record for x in (0.0, 0.2))
     np.testing.assert_allclose(two.fast[:, FAST.gyro] - one.fast[:, FAST.gyro], 0.2 * DEG)
     np.testing.assert_array_equal(two.packets, one.packets)
 

@@ -22,7 +22,7 @@ from sideslip.benchmarks.recorded.bicycle_fit import (
     fit,
 )
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, IdentificationResult, identify
-from sideslip.benchmarks.recorded.scoring import Settings, run_estimators
+from sideslip.benchmarks.recorded.replay import Settings, _run_estimators
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 from sideslip.estimators.wires import SignalCalibration, apply_wires
@@ -143,7 +143,7 @@ def test_five_rows_identify_nothing(tmp_path: Path) -> None:
 
 def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
     how = Settings(estimators=ESTIMATORS, seeds=1, noise=wires.noise)
-    scores = run_estimators([apply_wires(log, wires)], car, how).scores
+    scores = _run_estimators([apply_wires(log, wires)], car, how).scores
     return np.array([scores[name][0, 0] for name in ESTIMATORS])
 
 
