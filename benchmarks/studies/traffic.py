@@ -52,7 +52,7 @@ def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
 
 def _keep_lane(case: tuple[str, int]) -> Array:
     """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,)."""
-    from ...envs.highway.lane_keeping_adapter import STATES, KeepingEnv, NativeObservation
+    from ...envs.highway.env import STATES, KeepingEnv, NativeObservation
 
     reader, seed = case
     base: Any = KeepingEnv()

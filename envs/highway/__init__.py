@@ -1,6 +1,5 @@
 """Our car in highway-env's road networks, among its vehicles; and its lane keeping as our record.
 
-`traffic` has the networks and the vehicles, `env` the environment `sideslip/Highway-v0`,
-`lane_keeping_adapter` the adapter of `lane-keeping-v0`. highway-env's y axis points to the right:
-every number is mirrored once, where it crosses into or out of this room.
+`traffic` has the networks and the vehicles, `env` the environments. highway-env's y axis points to
+the right: every number is mirrored once, where it crosses into or out of this room.
 """

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.envs.highway import lane_keeping_adapter as keeping
+from sideslip.envs.highway import env as keeping
 from sideslip.envs.outside.plants import OutsideInputs
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
