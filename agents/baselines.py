@@ -15,10 +15,9 @@ from typing import Any
 import gymnasium as gym
 
 from ..envs.io import read_document
-from ..envs.scenarios.draws import get_range
 from ..envs.scenarios.manoeuvres import SCENARIOS
 from ..envs.scenarios.scenario import Scenario
-from ..envs.scenarios.world import IDEAL, WORLD_VERSION, World
+from ..envs.scenarios.world import IDEAL, WORLD_VERSION, World, get_range
 from ..envs.sensors.inertial import Noise
 from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.validation import check_choice

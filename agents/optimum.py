@@ -14,7 +14,7 @@ import numpy as np
 from ..envs.engine.config import EnvConfig
 from ..envs.numerics.jit import as_python
 from ..envs.record import PACKET_WIDTH, Array
-from ..envs.scenarios.steering import compute_wander_gains
+from ..envs.scenarios.driver import compute_wander_gains
 from ..envs.task import REFERENCES
 from ..envs.ticks import TICK
 from ..estimators.design.models import select_states

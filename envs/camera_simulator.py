@@ -20,13 +20,14 @@ from .numerics.functions import PI, draw_uniforms
 from .numerics.jit import as_python
 from .numerics.packed import read
 from .record import PACKET, PACKET_WIDTH, Array
-from .sensors.camera.analytic import (
+from .sensors.slow import (
+    BLOCKS,
+    CAMERA,
     MAX_DELAY,
     compute_preview_offset,
     count_delay_ticks,
     load_detector,
 )
-from .sensors.slow import BLOCKS, CAMERA
 from .task import REPORT
 from .validation import check_mapping, describe_unknown
 from .vehicle.dynamics import Motion
@@ -53,9 +54,8 @@ class CameraSimulator:
 
     def __init__(self, delay: str, appearance: Mapping[str, object] | None) -> None:
         with require_extra("vision", "vision='image' needs {}"):
-            from .sensors.camera.images import Appearance, RoadRenderer, RoadScene
+            from .sensors.camera.images import Appearance, Pinhole, RoadRenderer, RoadScene
             from .sensors.camera.lane_finder import LaneFinder
-            from .sensors.camera.pinhole import Pinhole
         fields = check_mapping("appearance", appearance or {})
         known = Appearance.__dataclass_fields__
         if unknown := [name for name in fields if name not in known]:

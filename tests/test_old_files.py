@@ -32,7 +32,7 @@ from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.scenarios.scenario import Scenario
-from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.camera.images import Pinhole
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, WIRE_TABLES, Vehicle, make_vehicle
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wires import SignalCalibration, read_wires

@@ -21,10 +21,9 @@ from .common import print_written, refuse_unused_options, write_output
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
-    from ...envs.sensors.camera.images import Image
+    from ...envs.sensors.camera.images import Image, Pinhole
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
     from ...envs.sensors.camera.pictures import Film
-    from ...envs.sensors.camera.pinhole import Pinhole
     from ...estimators.wires import SignalCalibration
 
 _MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
@@ -276,9 +275,9 @@ class _Lane:
     def _make_finder(self, pictures: "list[Image]", source: Path) -> "LaneFinder":
         """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""
         from ...envs.sensors.camera import pictures as calibration
-        from ...envs.sensors.camera.analytic import FieldOfView
+        from ...envs.sensors.camera.images import Pinhole
         from ...envs.sensors.camera.lane_finder import LaneFinder
-        from ...envs.sensors.camera.pinhole import Pinhole
+        from ...envs.sensors.slow import FieldOfView
 
         file, lane_width, known = self.intrinsics, self.lane_width, dict[str, object]()
         height, width = pictures[0].shape[:2]

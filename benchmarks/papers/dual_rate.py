@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from ...envs.record import Array
-from ...envs.scenarios.draws import KMH
+from ...envs.scenarios.world import KMH
 from ...envs.vehicle import linear
 from ...envs.vehicle.linear import make_course_model
 from ...envs.vehicle.parameters import COMS

@@ -21,7 +21,7 @@ from ...agents import make_agent
 from ...agents.controllers.two_dof import CAMERA_PERIOD, PLACEMENTS, POLE, design_pi
 from ...agents.rollout import rollout
 from ...envs.record import Array
-from ...envs.scenarios.draws import KMH
+from ...envs.scenarios.world import KMH
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ...envs.vehicle.parameters import COMS, Vehicle

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ...envs.record import Array
-from ...envs.scenarios.draws import KMH
+from ...envs.scenarios.world import KMH
 from ...envs.sensors.slow import CAMERA_33_30
 from ...envs.vehicle.linear import make_vision_model
 from ...envs.vehicle.parameters import COMS

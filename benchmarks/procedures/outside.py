@@ -13,9 +13,9 @@ import numpy as np
 from ...agents.rollout import rollout
 from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
 from ...envs.record import Array
-from ...envs.scenarios import steering as profiles
-from ...envs.scenarios.draws import Draws
+from ...envs.scenarios import driver as profiles
 from ...envs.scenarios.scenario import Scenario
+from ...envs.scenarios.world import Draws
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY

@@ -1,8 +1,7 @@
 """The environments on torch tensors: `torch_env` with gradients, `cuda_env` one CUDA kernel a step.
 
-`base` is what both share. `torch_sensors` and `torch_step` are the engine's step by torch.
-`cuda_kernel` is the fused step, made of the engine's own text; `cuda_launch` compiles it without a
-GPU and starts it.
+`base` is what both share. `torch_sensors` and `torch_step` are the engine's step by torch,
+`cuda_kernel` is the fused step, made of the engine's own text.
 """
 
 from typing import Any

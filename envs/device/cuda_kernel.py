@@ -31,7 +31,7 @@ from ..numerics.jit import as_python, copy_into
 from ..numerics.packed import load_element, read, store_element, write
 from ..numerics.primitives import Matrix, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH
-from ..scenarios.draws import DRAWS_WIDTH
+from ..scenarios.world import DRAWS_WIDTH
 from ..task import REPORT
 from ..vehicle.dynamics import Motion
 

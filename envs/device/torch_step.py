@@ -16,11 +16,9 @@ from ..numerics.packed import read
 from ..numerics.primitives import Scalar, select
 from ..numerics.torch_backend import GradientGate, compile_method, to_torch, torch
 from ..record import FAST, FAST_WIDTH, PACKET
-from ..scenarios.driver import compute_target_angle
+from ..scenarios.driver import compute_steering, compute_target_angle
 from ..scenarios.road import NominalMotion
-from ..scenarios.steering import compute_steering
-from ..sensors.errors import ErrorState
-from ..sensors.inertial import NormalDraws
+from ..sensors.inertial import ErrorState, NormalDraws
 from ..sensors.slow import WIDTHS, draw_first_drift
 from ..task import (
     AGE_CAP,

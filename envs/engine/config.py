@@ -12,25 +12,26 @@ import gymnasium as gym
 import numpy as np
 
 from ..record import Array
-from ..scenarios.draws import get_range
-from ..scenarios.driver import DriverParams, SpeedProfile, Wind
+from ..scenarios.driver import STEERING_KINDS, STEERING_WIDTH, DriverParams, SpeedProfile, Wind
 from ..scenarios.manoeuvres import make_scenario
 from ..scenarios.road import ROADS, make_path
 from ..scenarios.scenario import MIN_GPS_PERIOD, Scenario
-from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
-from ..scenarios.world import IDEAL, World
-from ..sensors.camera.analytic import (
+from ..scenarios.world import IDEAL, World, get_range
+from ..sensors.inertial import IDEAL_SENSORS, Noise
+from ..sensors.link import MAX_IN_FLIGHT, Link, SlowSensor, make_link
+from ..sensors.slow import (
     DELAYS,
+    HDOP_LAWS,
     MAX_DELAY,
+    SENSOR_SETS,
+    SLOW_NAMES,
     VISIONS,
     FieldOfView,
+    SatelliteGeometry,
+    apply_changes,
     count_delay_ticks,
     load_detector,
 )
-from ..sensors.errors import IDEAL_SENSORS
-from ..sensors.inertial import Noise
-from ..sensors.link import MAX_IN_FLIGHT, Link, SlowSensor, make_link
-from ..sensors.slow import HDOP_LAWS, SENSOR_SETS, SLOW_NAMES, SatelliteGeometry, apply_changes
 from ..task import (
     REFERENCES,
     ObservationEntry,

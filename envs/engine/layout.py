@@ -9,14 +9,11 @@ from typing import Annotated, Any, NamedTuple
 from ..numerics.packed import make_offsets
 from ..numerics.primitives import Matrix, Scalar, Vector
 from ..record import PACKET_WIDTH
-from ..scenarios.driver import DriverParams, SpeedProfile, Wind
+from ..scenarios.driver import STEERING_WIDTH, DriverParams, SpeedProfile, Wind
 from ..scenarios.road import NominalMotion, TrackPath
-from ..scenarios.steering import STEERING_WIDTH
-from ..sensors.camera.analytic import FieldOfView
-from ..sensors.errors import ErrorState, SensorErrors
-from ..sensors.inertial import Noise
+from ..sensors.inertial import ErrorState, Noise, SensorErrors
 from ..sensors.link import MAX_IN_FLIGHT, Link
-from ..sensors.slow import SLOW, VALUES, SatelliteGeometry
+from ..sensors.slow import SLOW, VALUES, FieldOfView, SatelliteGeometry
 from ..task import RATE_TICKS, ReferenceParams
 from ..vehicle.actuators import Lag
 from ..vehicle.dynamics import CarParams, Motion, RoadParams

@@ -5,12 +5,22 @@ from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
 from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, minimum, select
 from ..record import FAST
-from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
-from ..scenarios.driver import compute_target_angle
+from ..scenarios.driver import (
+    DRIVER,
+    WANDER,
+    compute_target_angle,
+    write_gentle_steering,
+    write_steering,
+)
 from ..scenarios.road import add_weave, transform_path
-from ..scenarios.steering import DRIVER, WANDER, write_gentle_steering, write_steering
-from ..sensors.errors import ErrorState, SensorErrors, apply_sensor_errors
-from ..sensors.inertial import NormalDraws, compute_fast_row
+from ..scenarios.world import DRAWS, DRAWS_WIDTH, Draws, draw_car, draw_stable
+from ..sensors.inertial import (
+    ErrorState,
+    NormalDraws,
+    SensorErrors,
+    apply_sensor_errors,
+    compute_fast_row,
+)
 from ..sensors.slow import GPS, draw_first_drift
 from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
 from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity

@@ -13,7 +13,7 @@ from ..numerics.jit import inline, jit, noinline
 from ..numerics.packed import lane_width, load_element, load_lanes, read, store_element, write
 from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, select
 from ..record import FAST
-from ..scenarios.steering import DRIVER
+from ..scenarios.driver import DRIVER
 from ..task import (
     BAD_ACTION,
     RATE_TICKS,

@@ -20,8 +20,16 @@ from ..scenarios.driver import (
     compute_wind,
 )
 from ..scenarios.road import NOMINAL_PATH, NominalMotion, TrackPath, step_nominal_car
-from ..sensors.errors import ErrorState, SensorErrors, advance_errors, apply_sensor_errors
-from ..sensors.inertial import Noise, NormalDraws, compute_fast_row, compute_specific_force
+from ..sensors.inertial import (
+    ErrorState,
+    Noise,
+    NormalDraws,
+    SensorErrors,
+    advance_errors,
+    apply_sensor_errors,
+    compute_fast_row,
+    compute_specific_force,
+)
 from ..task import ReferenceParams, compute_reference, filter_reference
 from ..ticks import TICK
 from ..vehicle.actuators import (

@@ -21,8 +21,8 @@ from ..numerics.packed import (
 from ..numerics.primitives import Scalar, Vector, absolute, to_float, to_int, to_word
 from ..numerics.simd import LANES
 from ..record import Array
+from ..scenarios.driver import WANDER_START, compute_steering, interpolate_trace
 from ..scenarios.road import TrackPath, compute_path_offset
-from ..scenarios.steering import WANDER_START, compute_steering, interpolate_trace
 from ..sensors.inertial import NormalDraws
 from ..task import RATE_TICKS, compute_cost_rate
 from ..ticks import TICK

@@ -23,10 +23,10 @@ from ..numerics.packed import read
 from ..outside.env import PlantEnv
 from ..outside.plants import OutsideInputs
 from ..record import Array
-from ..scenarios.draws import Range
 from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
-from ..sensors.camera.analytic import compute_preview_offset
+from ..scenarios.world import Range
+from ..sensors.slow import compute_preview_offset
 from ..stability import StabilityEnv
 from ..task import (
     COLLISION,

@@ -15,8 +15,8 @@ from ..numerics import require_extra
 from ..record import Array
 from ..rendering import canvas
 from ..rendering.road import compute_body
-from ..scenarios.draws import Range, get_range
 from ..scenarios.road import TrackPath
+from ..scenarios.world import Range, get_range
 from ..validation import is_finite
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import GRAVITY, Vehicle

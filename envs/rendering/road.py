@@ -18,7 +18,7 @@ from ..numerics.primitives import ARRAYS
 from ..record import Array
 from ..scenarios import road as tracks
 from ..scenarios.driver import compute_wind
-from ..sensors.camera.analytic import compute_lane_quality
+from ..sensors.slow import compute_lane_quality
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import LINEAR, compute_lateral_forces, compute_tyres

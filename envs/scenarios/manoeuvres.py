@@ -21,8 +21,8 @@ from ..recordings.log_file import find_step
 from ..recordings.tables import read_quantities
 from ..validation import check_choice, describe_unknown, short_repr
 from ..vehicle.parameters import COMS, PASSENGER_CAR
-from .draws import KMH
 from .scenario import Fields, Scenario
+from .world import KMH
 
 _DEGREE = math.radians(1.0)
 

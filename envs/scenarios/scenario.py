@@ -18,10 +18,9 @@ from ..ticks import TICK
 from ..validation import check_choice, describe_unknown, is_finite, join_names, quantity, short_repr
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import TYRE_LAWS
-from .draws import KMH, Draws, Range, get_range
+from .driver import STEERING_KINDS
 from .road import PATHS, ROADS
-from .steering import STEERING_KINDS
-from .world import IDEAL, World
+from .world import IDEAL, KMH, Draws, Range, World, get_range
 
 Fields = dict[str, Any]
 """Fields of a `Scenario` by name, each of a type of its own."""

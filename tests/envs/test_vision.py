@@ -12,9 +12,8 @@ import pytest
 pytest.importorskip("cv2")
 import sideslip
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.camera.analytic import Detector, load_detector
-from sideslip.envs.sensors.camera.images import RoadRenderer
-from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.camera.images import Pinhole, RoadRenderer
+from sideslip.envs.sensors.slow import Detector, load_detector
 from sideslip.estimators import EstimateObservation
 
 assert sideslip.__version__

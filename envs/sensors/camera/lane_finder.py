@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...numerics.jit import as_python
-from .analytic import FieldOfView, compute_preview_offset
-from .images import Image
-from .pinhole import WORKING_WIDTH, Pinhole, resample
+from ..slow import FieldOfView, compute_preview_offset
+from .images import WORKING_WIDTH, Image, Pinhole, resample
 
 Array = npt.NDArray[np.floating[Any]]
 

@@ -14,10 +14,9 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from .analytic import FieldOfView
-from .images import Image
+from ..slow import FieldOfView
+from .images import WORKING_WIDTH, Image, Pinhole, resample
 from .lane_finder import Array, Lane, LaneFinder
-from .pinhole import WORKING_WIDTH, Pinhole, resample
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 

@@ -14,8 +14,7 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.sensors.camera.images import RoadRenderer, RoadScene
-from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.camera.images import Pinhole, RoadRenderer, RoadScene
 from tests.benchmarks.conftest import Run
 
 CAMERA = Pinhole()

@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
-from sideslip.envs.device import cuda_env, cuda_launch  # noqa: E402
+from sideslip.envs.device import cuda_env  # noqa: E402
 from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
 from sideslip.envs.device.cuda_kernel import (  # noqa: E402
     SIMULATED,
@@ -87,16 +87,16 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
 
 def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(driver: Any) -> None:
     fake = driver()
-    loaded = cuda_launch._DriverKernel("// PTX", torch.device("cuda:0"), fake)
+    loaded = cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), fake)
     assert fake.calls["cuModuleLoadData"] == (b"// PTX\0",)
     assert fake.calls["cuModuleGetFunction"] == ("module", b"sideslip_step")
     arrays = [torch.zeros(3), torch.zeros(0)]
-    loaded(cuda_launch.BLOCK + 1, True, arrays)
+    loaded(cuda_env.BLOCK + 1, True, arrays)
     function, *grid = fake.calls["cuLaunchKernel"]
     assert function == "function"
-    assert grid[:8] == [2, 1, 1, cuda_launch.BLOCK, 1, 1, 0, 77]
+    assert grid[:8] == [2, 1, 1, cuda_env.BLOCK, 1, 1, 0, 77]
     values, kinds = grid[8]
-    assert values == (cuda_launch.BLOCK + 1, True, arrays[0].data_ptr(), arrays[1].data_ptr())
+    assert values == (cuda_env.BLOCK + 1, True, arrays[0].data_ptr(), arrays[1].data_ptr())
     assert [kind.__name__ for kind in kinds] == ["c_long", "c_bool", "c_void_p", "c_void_p"]
 
 
@@ -111,4 +111,4 @@ def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(drive
 def test_what_the_driver_refuses_is_said(driver: Any, call: str, code: str, error: Any) -> None:
     fake = driver(**{call: code})
     with pytest.raises(error, match=f"on cuda:0: {code}"):
-        cuda_launch._DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])
+        cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv
-from sideslip.envs.device import cuda_launch
+from sideslip.envs.device import cuda_env
 from sideslip.envs.device.cuda_kernel import NAME, DeviceArrays, KernelConstants, make_constants
 from sideslip.envs.numerics import kernel_cache
 
@@ -29,7 +29,7 @@ def how() -> KernelConstants:
 
 
 def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
-    text = cuda_launch.get_ptx(how(), np.float64, H200)
+    text = cuda_env.get_ptx(how(), np.float64, H200)
     found = Counter(OPCODE.findall(text))
     assert ".target sm_90" in text
     head = text[text.index(f".visible .entry {NAME}(") :].partition(")")[0]
@@ -45,7 +45,7 @@ def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
 
 
 def test_float32_has_no_double_in_the_ticks() -> None:
-    text = cuda_launch.get_ptx(how(), np.float32, H200)
+    text = cuda_env.get_ptx(how(), np.float32, H200)
     assert OPCODE.findall(text).count("fma.rn.f32") > 500
     kinds = ARITHMETIC.findall(text)
     assert kinds.count("f64") < 0.02 * kinds.count("f32")
@@ -63,16 +63,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         made.append(arguments)
         return f"text {len(made)}"
 
-    monkeypatch.setattr(cuda_launch, "_compile_ptx", compiled)
+    monkeypatch.setattr(cuda_env, "_compile_ptx", compiled)
     monkeypatch.setattr(kernel_cache, "find_kernel_folder", lambda layer: tmp_path)
     return tmp_path
 
 
 def test_each_gpu_has_its_own_file(folder: Path) -> None:
-    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 1"
-    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 1"
-    assert cuda_launch.get_ptx(how(), np.float64, (8, 0)) == "text 2"
-    assert cuda_launch.get_ptx(how(), np.float32, H200) == "text 3"
+    assert cuda_env.get_ptx(how(), np.float64, H200) == "text 1"
+    assert cuda_env.get_ptx(how(), np.float64, H200) == "text 1"
+    assert cuda_env.get_ptx(how(), np.float64, (8, 0)) == "text 2"
+    assert cuda_env.get_ptx(how(), np.float32, H200) == "text 3"
     assert len(list(folder.iterdir())) == 3
 
 
@@ -90,8 +90,8 @@ def test_each_gpu_has_its_own_file(folder: Path) -> None:
 def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
     folder: Path, left: Callable[[bytes], bytes]
 ) -> None:
-    cuda_launch.get_ptx(how(), np.float64, H200)
+    cuda_env.get_ptx(how(), np.float64, H200)
     (path,) = folder.iterdir()
     path.write_bytes(left(path.read_bytes()))
-    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 2"
+    assert cuda_env.get_ptx(how(), np.float64, H200) == "text 2"
     assert path.read_bytes().endswith(b"text 2")

@@ -14,7 +14,7 @@ from sideslip.envs.numerics import functions
 from sideslip.envs.numerics import functions as noise
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
-from sideslip.envs.scenarios import steering as programme
+from sideslip.envs.scenarios import driver as programme
 from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle
 from sideslip.envs.scenarios.road import make_path, transform_path
 from sideslip.envs.task import make_reference_params

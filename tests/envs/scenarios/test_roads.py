@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.record import FAST, PACKET, concatenate
-from sideslip.envs.scenarios.steering import compute_steering
+from sideslip.envs.scenarios.driver import compute_steering
 from sideslip.envs.vehicle.linear import make_bicycle_model
 
 SLALOM: dict[str, Any] = {"base": "slalom", "amplitude": 0.05, "duration": 4.0}

@@ -14,8 +14,8 @@ from scipy import stats
 from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, make_scenario
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import Z
-from sideslip.envs.scenarios.draws import DRAWS_WIDTH, KMH, Draws, _is_stable, draw_stable
 from sideslip.envs.scenarios.manoeuvres import TIERS
+from sideslip.envs.scenarios.world import DRAWS_WIDTH, KMH, Draws, _is_stable, draw_stable
 
 from ..helpers import play
 

@@ -10,19 +10,17 @@ from hypothesis import strategies as st
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, _is_stable
 from sideslip.envs.scenarios.driver import (
+    STEERING_KINDS,
+    STEERING_WIDTH,
     SpeedProfile,
     Wind,
     compute_acceleration_command,
-    compute_wind,
-)
-from sideslip.envs.scenarios.steering import (
-    STEERING_KINDS,
-    STEERING_WIDTH,
     compute_steering,
+    compute_wind,
     write_steering,
 )
+from sideslip.envs.scenarios.world import DRAWS_WIDTH, Draws, _is_stable
 from sideslip.envs.ticks import FOREVER, TICK
 
 from ..helpers import FULL, LINEAR, fast_rows, packets, play

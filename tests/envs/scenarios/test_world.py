@@ -14,10 +14,9 @@ import pytest
 import sideslip
 from sideslip.envs import StabilityEnv
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.scenarios.draws import Draws
 from sideslip.envs.scenarios.scenario import Scenario
-from sideslip.envs.scenarios.world import GROUPS, IDEAL, WORLDS, World, make_world
-from sideslip.envs.sensors.errors import CAMERA_HEIGHT
+from sideslip.envs.scenarios.world import GROUPS, IDEAL, WORLDS, Draws, World, make_world
+from sideslip.envs.sensors.inertial import CAMERA_HEIGHT
 from sideslip.envs.task import RATE_TICKS
 from sideslip.envs.vehicle.parameters import GRAVITY, PASSENGER_CAR, critical_speed
 from sideslip.estimators import EstimateObservation

@@ -10,16 +10,16 @@ from scipy import stats
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors.camera.analytic import FieldOfView, sample_camera
-from sideslip.envs.sensors.errors import IDEAL_SENSORS
-from sideslip.envs.sensors.inertial import Noise
+from sideslip.envs.sensors.inertial import IDEAL_SENSORS, Noise
 from sideslip.envs.sensors.slow import (
     HDOP_LAWS,
     OUTAGE_JUMP,
+    FieldOfView,
     MeasurementContext,
     SatelliteGeometry,
     _count_satellites,
     _sample_gps,
+    sample_camera,
 )
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 

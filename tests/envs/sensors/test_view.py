@@ -8,13 +8,12 @@ import pytest
 
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.camera.analytic import (
+from sideslip.envs.sensors.inertial import IDEAL_SENSORS, Noise
+from sideslip.envs.sensors.slow import (
     FieldOfView,
     compute_lane_quality,
     sample_camera,
 )
-from sideslip.envs.sensors.errors import IDEAL_SENSORS
-from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 from sideslip.estimators import make_estimator
 

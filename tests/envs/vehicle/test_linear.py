@@ -10,10 +10,14 @@ from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
 from sideslip.envs.engine.config import make_car
-from sideslip.envs.sensors.camera.analytic import FieldOfView, sample_camera
-from sideslip.envs.sensors.errors import IDEAL_SENSORS
-from sideslip.envs.sensors.inertial import Noise
-from sideslip.envs.sensors.slow import MeasurementContext, SatelliteGeometry, _sample_gps
+from sideslip.envs.sensors.inertial import IDEAL_SENSORS, Noise
+from sideslip.envs.sensors.slow import (
+    FieldOfView,
+    MeasurementContext,
+    SatelliteGeometry,
+    _sample_gps,
+    sample_camera,
+)
 from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.linear import (

@@ -12,10 +12,9 @@ pytest.importorskip("cv2")
 import cv2
 
 from sideslip.envs.numerics.jit import as_python
-from sideslip.envs.sensors.camera.analytic import FieldOfView, compute_preview_offset
-from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
+from sideslip.envs.sensors.camera.images import Appearance, Pinhole, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _CameraMount, _search_starts
-from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.slow import FieldOfView, compute_preview_offset
 from sideslip.envs.vehicle.dynamics import RoadParams, compute_curvature
 
 VIEW = FieldOfView(0.35, 4.0)  # of the scored scenarios

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.sensors.camera.images import Image, RoadRenderer, RoadScene
+from sideslip.envs.sensors.camera.images import Image, Pinhole, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pictures import (
     calibrate_camera,
@@ -18,7 +18,6 @@ from sideslip.envs.sensors.camera.pictures import (
     make_default_camera,
     read_picture,
 )
-from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.vehicle.dynamics import RoadParams
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -16,12 +16,12 @@ from typing import Any
 
 from sideslip.envs.sensors.camera.images import (
     Appearance,
+    Pinhole,
     RoadRenderer,
     RoadScene,
     _compute_rays,
     _make_rotation,
 )
-from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.vehicle.dynamics import RoadParams
 
 CAMERA = Pinhole()
