@@ -164,14 +164,11 @@ def _find_base(path: Path, values: Mapping[str, object]) -> Path | None:
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, object]) -> None:
-    """Write a mapping to a TOML or JSON file, which `read_document` reads back.
+    """Write a TOML or JSON file that `read_document` reads back; ValueError for another ending.
 
     Args:
         path: Path of the file, whose ending chooses the format.
         values: Numbers, texts, lists and mappings of these by name.
-
-    Raises:
-        ValueError: For another ending.
     """
     kind = Path(path).suffix.lower()
     if kind not in _SUFFIXES:
@@ -202,15 +199,12 @@ def _format_key(name: str) -> str:
 
 
 def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT:
-    """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
+    """Make a dataclass's instance from JSON, lists for tuples; ValueError for what does not fit.
 
     Args:
         kind: Dataclass of the instance.
         entry: The parsed JSON value.
         where: Place of the value, for messages.
-
-    Raises:
-        ValueError: For an unknown or missing field and a value of another type.
     """
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected a JSON object, got {short_repr(entry)}")
@@ -229,15 +223,12 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
 
 
 def check_types(kind: "type[DataclassInstance]", values: Mapping[str, object], where: str) -> None:
-    """Check that values have the types of a dataclass's fields.
+    """Check that values have the types of a dataclass's fields; ValueError with place and field.
 
     Args:
         kind: Dataclass whose fields have the types.
         values: Values by the names of fields.
         where: Place of the values, for messages.
-
-    Raises:
-        ValueError: For a value of another type, with the place and the field.
     """
     types: dict[str, Any] = {spec.name: spec.type for spec in fields(kind)}
     for name, value in values.items():

@@ -76,26 +76,20 @@ class Record:
         return np.arange(self.first, self.first + len(self.fast))
 
     def select_packets(self, sensor: str) -> Array:
-        """Select the packets of one slow sensor.
+        """Select the packets of one slow sensor, shape (count, PACKET_WIDTH).
 
         Args:
             sensor: Name of the sensor, "camera" or "gps".
-
-        Returns:
-            Its packets, shape (count, PACKET_WIDTH).
         """
         is_wanted = self.packets[:, PACKET.sensor] == SLOW_NAMES.index(sensor)
         return np.asarray(self.packets[is_wanted], np.float64)
 
 
 def concatenate(records: list[Record]) -> Record:
-    """Concatenate records of consecutive ticks.
+    """Concatenate records of consecutive ticks; ValueError where they do not follow.
 
     Args:
         records: Records in the order of time; each begins a tick after the one before it.
-
-    Raises:
-        ValueError: If ticks do not follow.
     """
     for before, after in itertools.pairwise(records):
         end = before.first + len(before.fast)

@@ -180,14 +180,11 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; returns the observation and the info at tick 0.
 
         Args:
             seed: Seed of the env's generator; None continues it.
             options: Options of reset, listed in the class docstring.
-
-        Returns:
-            The observation and the info at tick 0.
         """
         config = self.config.apply_options(self._adapt_options(dict(options or {})))
         super().reset(seed=seed)  # refused options leave everything as it was

@@ -61,7 +61,7 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 def compute_reference(
     steer: Scalar, v: Scalar, target: ReferenceParams, reference_kind: int
 ) -> Vector:
-    """Compute the steady-state reference for a steering command at a measured speed.
+    """Compute the steady-state beta_ref (rad) and gamma_ref (rad/s) of a command at a speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
     1 + G v^2 at least 0.2. limited: the model with |gamma| <= 0.85 mu g / v and
@@ -73,9 +73,6 @@ def compute_reference(
         v: Measured speed (m/s).
         target: `ReferenceParams`.
         reference_kind: Place of the reference in `REFERENCES`.
-
-    Returns:
-        beta_ref (rad) and gamma_ref (rad/s).
     """
     if reference_kind == ZERO_SLIP:
         return 0.0 * steer, 0.0 * steer
@@ -94,16 +91,13 @@ def compute_reference(
 def filter_reference(
     before: Vector, steady: Vector, target: ReferenceParams, reference_kind: int
 ) -> Vector:
-    """Filter the reference over a tick: the lagged one approaches the steady state, others jump.
+    """Filter the reference (rad, rad/s) over a tick: the lagged one approaches, the others jump.
 
     Args:
         before: (beta_ref, gamma_ref) of the tick before (rad, rad/s).
         steady: Result of `compute_reference` (rad, rad/s).
         target: `ReferenceParams`.
         reference_kind: Place of the reference in `REFERENCES`.
-
-    Returns:
-        beta_ref (rad) and gamma_ref (rad/s).
     """
     if reference_kind == LAGGED:
         rest = target.rest
@@ -121,7 +115,7 @@ def compute_cost_rate(
     e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference_kind: int,
     moment_rate: Scalar = 0.0,
 ) -> Scalar:  # fmt: skip
-    """Compute the cost rate of a tick, capped at 100 per second.
+    """Compute the cost rate of a tick (1/s), capped at 100.
 
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (added steering/0.05)^2,
     angles in rad and rates in rad/s, and what the moment's rate costs.
@@ -133,9 +127,6 @@ def compute_cost_rate(
         steer_added: Added steering angle (rad).
         reference_kind: Place of the reference in `REFERENCES`.
         moment_rate: Cost rate of the yaw moment's rate (1/s).
-
-    Returns:
-        Cost rate (1/s).
     """
     b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
     c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
@@ -166,15 +157,12 @@ WILD_LIMIT = 10.0  # fraction of full scale beyond which an action is a mistake
 
 @jit
 def select_failure(lost: Scalar, spun: Scalar, off: Scalar) -> Scalar:
-    """Select the failure's code.
+    """Select the failure's code, a float: the first that applies, in this order.
 
     Args:
         lost: Whether the numbers are no longer finite.
         spun: Whether the car spins.
         off: Whether it has left the road.
-
-    Returns:
-        The code, as a float; the first that applies, in this order.
     """
     failure = select(spun, SPIN * 1.0, select(off, OFF_ROAD * 1.0, RUNNING * 1.0))
     return select(lost, NOT_FINITE * 1.0, failure)
@@ -225,14 +213,11 @@ def make_info(report: list[float]) -> Infos:
 
 
 def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> Infos:
-    """Make the infos of some rows of a batch as Gymnasium's vector environments have them.
+    """Make infos of a batch's rows as Gymnasium has them: arrays (N,) and, under `_key`, masks.
 
     Args:
         reports: Reports, shape (N, len(StepReport)).
         rows: Rows that are reported, shape (N,); the others have zeros.
-
-    Returns:
-        An array (N,) for every key and, with an underscore before it, a mask.
     """
     if rows.all():
         columns = reports.T.copy()
@@ -272,14 +257,11 @@ _LAST_ONLY = ("steer", "torque_left", "torque_right", "steer_command")  # seen a
 
 
 def make_space(layout: Sequence[ObservationEntry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
-    """Make the space of an observation, or of a stack of frames, entry by entry.
+    """Make the box, shape (len(layout) * frames,), of an observation or of a stack of frames.
 
     Args:
         layout: Entries of the observation.
         frames: Number of frames in the stack.
-
-    Returns:
-        A box of shape (len(layout) * frames,).
     """
     low, high = np.array([entry[2:] for entry in layout]).T.astype(np.float32)
     return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)

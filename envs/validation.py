@@ -158,15 +158,12 @@ def format_rows(rows: npt.ArrayLike) -> str:
 
 
 def parse_action(action: object, width: int, fail: bool) -> Actions:
-    """Parse an action to float32.
+    """Parse an action to float32, shape (width,).
 
     Args:
         action: Numbers of one row, shape (width,).
         width: Numbers of an action.
         fail: Whether a bad one becomes NaN instead of raising ValueError.
-
-    Returns:
-        The action, shape (width,).
     """
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
         return action if action.flags.carray else action.copy()  # others are other types
@@ -180,19 +177,15 @@ def parse_action(action: object, width: int, fail: bool) -> Actions:
 
 
 def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
-    """Parse actions of several rows to float32.
+    """Parse actions of several rows to float32, shape (count, width).
+
+    ValueError, with the rows, for a wrong shape or no numbers, unless `fail` is set.
 
     Args:
         actions: Numbers of all rows, shape (count, width).
         count: Number of rows.
         width: Numbers of a row.
         fail: Whether rows of a wrong shape or without numbers become NaN.
-
-    Returns:
-        The actions, shape (count, width).
-
-    Raises:
-        ValueError: For a wrong shape or no numbers, with the rows, unless `fail` is set.
     """
     try:
         array = np.array(actions, np.float32)  # a copy: contiguous whatever came

@@ -27,15 +27,12 @@ T = TypeVar("T")
 def make_rows(
     num_envs: int, arguments: Mapping[str, Any], is_uniform: bool = False
 ) -> tuple[StabilityEnv, list[EnvConfig]]:
-    """Make the rows of a batch, of which those with the same objects share an env and its config.
+    """Make a batch's first env, and each row's config; rows with the same objects share one.
 
     Args:
         num_envs: Number of rows N.
         arguments: Arguments of `StabilityEnv`; scenario and vehicle may each be a list (N,).
         is_uniform: Whether they may not, and all rows have one config.
-
-    Returns:
-        The first row's env, and each row's config.
     """
     N = check_int("num_envs", num_envs, "environments")
     count = 1 if is_uniform else N

@@ -154,15 +154,14 @@ class _DriverKernel:
 def load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
-    """Load a kernel on a GPU, or in numba's simulator: plain Python, a thread after the other.
+    """Load a kernel: a function of the number of rows, whether they are reset, and `DeviceArrays`.
+
+    In numba's simulator it is plain Python, a thread after the other.
 
     Args:
         constants: Constants of the kernel.
         real: Type of floats.
         device: GPU.
-
-    Returns:
-        Function of the number of rows, whether they are reset, and `DeviceArrays`.
     """
     if not SIMULATED:
         from cuda.bindings import driver

@@ -149,16 +149,13 @@ class _ThreadArrays(NamedTuple):
 def make_specification(
     constants: KernelConstants, real: type[np.floating[Any]], N: int, starts: int
 ) -> DeviceArrays:
-    """Make (type, shape) of each array.
+    """Make (type, shape) of each array, in place of the arrays.
 
     Args:
         constants: Constants of the kernel.
         real: Type of floats.
         N: Number of rows.
         starts: Number of starts.
-
-    Returns:
-        Types and shapes in place of the arrays.
     """
     width, byte, report = constants.width + sum(_DRAWN), np.uint8, len(REPORT)
     ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
@@ -346,14 +343,11 @@ def _store_element(array, value, i, j=None):
 
 
 def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
-    """Make the kernel for numba-cuda or its simulator.
+    """Make the kernel, a function of N, whether rows are reset, and pointers to `DeviceArrays`.
 
     Args:
         constants: Constants of the kernel.
         real: Type of floats.
-
-    Returns:
-        Function of N, whether rows are reset, and pointers to `DeviceArrays`.
     """
     step, make_array = _to_cuda(_step_row, real), carray
     if SIMULATED:

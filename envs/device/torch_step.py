@@ -88,22 +88,14 @@ class _InfoValues(NamedTuple):
 
 
 class _TickState(NamedTuple):
-    """State of the cars within an env-step; (N,) each, or tuples of such."""
+    """State of the cars within an env-step; (N,) each, or stacked in front of that axis."""
 
     alive: Tensor  # not frozen yet
-    motion: Numbers
-    drive: Numbers
-    driver: Tensor
-    refs: Numbers
-    nominal_motion: Numbers
-    errors: Numbers
-    past_efforts: Numbers
-    tick: Tensor
-    failure: Tensor  # places in `FAILURES`, as floats
+    cars: TorchState  # whose slow sensors, end and report are still those before the step
     cost: Tensor  # of the ticks of this step
-    shown: Numbers  # `_InfoValues`
-    row: Numbers  # the newest fast row
-    track: Numbers  # the newest motion, fit for `info` or not
+    shown: Tensor  # `_InfoValues`
+    row: Tensor  # the newest fast row
+    track: Tensor  # the newest motion, fit for `info` or not
 
 
 class _Ticked(NamedTuple):
@@ -163,14 +155,14 @@ class TorchStep:
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
         tick_state = _make_tick_state(state, running)
-        all_draws, steering = self._window(p, keys, tick_state.tick + 1, self.n)
+        all_draws, steering = self._window(p, keys, state.tick + 1, self.n)
         rows, track = [], []
         for j in range(self.n):  # of cars that fail or end the last values are repeated
             draws = tuple(normals[j] for normals in all_draws)
             angle = None if steering is None else steering[j]
             tick_state = self._tick(p, yaw_share, steer_share, tick_state, draws, angle)
-            rows.append(torch.stack(tick_state.row))
-            track.append(torch.stack(tick_state.track))
+            rows.append(tick_state.row)
+            track.append(tick_state.track)
         is_refused = ~is_finite & ~state.over
         ticked = _Ticked(tick_state, torch.stack(rows), torch.stack(track), running, is_refused)
         next_state: TorchState
@@ -200,21 +192,21 @@ class TorchStep:
         draws: Numbers, next_steer: Any,
     ) -> _TickState:  # fmt: skip
         """Step the cars that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
-        functions, pick, start_tick = self._functions, self._select, tick_state.tick
+        functions, pick, cars = self._functions, self._select, tick_state.cars
+        start_tick = cars.tick
         params = functions.make_step_params(p)
         task, change = params.task, params.tyre_change
         # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
         state = StepState(
-            Motion(*tick_state.motion), ActuatorState(*tick_state.drive), None, tick_state.driver,
+            Motion(*cars.motion), ActuatorState(*cars.drive), None, cars.driver,
             functions.apply_tyre_change(params.car, change, start_tick > change.tick),
-            tick_state.refs, NominalMotion(*tick_state.nominal_motion),
-            ErrorState(*tick_state.errors),
+            tuple(cars.refs), NominalMotion(*cars.nominal_motion), ErrorState(*cars.errors),
         )  # fmt: skip
         normals = NormalDraws(draws[:4], draws[4:8], draws[8])
         acts = start_tick >= task.lead_in
         N_z = pick(acts, yaw_share * task.yaw_scale, 0.0)
         added = pick(acts, steer_share * task.authority, 0.0)
-        inputs = TickInputs(N_z, added, normals, next_steer, tick_state.past_efforts[0])
+        inputs = TickInputs(N_z, added, normals, next_steer, cars.past_efforts[0])
         next_state, measured = functions.integrate_tick(
             params, inputs, state, start_tick, self.kind
         )
@@ -227,54 +219,55 @@ class TorchStep:
         refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
         beta = pick(measured.lost, 0.0, tick_cost.beta)
         info_values = (beta, *refs, measured.steer, measured.moment)
-        efforts = tick_state.past_efforts
+        efforts = cars.past_efforts
         if self.kind.has_errors:
-            efforts = (*efforts[1:], measured.cost_inputs.effort)
+            efforts = torch.cat((efforts[1:], measured.cost_inputs.effort[None]))
 
-        def select_cars(where: Tensor, new: Any, old: Any) -> Numbers:
-            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
+        def select_cars(where: Tensor, new: Any, old: Tensor) -> Tensor:
+            return torch.stack([pick(where, a, b) for a, b in zip(new, old, strict=True)])
 
+        next_cars = cars._replace(
+            motion=select_cars(is_fit, next_state.motion, cars.motion),
+            drive=select_cars(alive, next_state.drive, cars.drive),
+            driver=pick(alive, next_state.driver, cars.driver),
+            refs=select_cars(alive, refs, cars.refs),
+            nominal_motion=select_cars(alive, next_state.nominal_motion, cars.nominal_motion),
+            errors=select_cars(alive, next_state.errors, cars.errors),
+            past_efforts=pick(alive, efforts, cars.past_efforts),
+            tick=tick, failure=pick(alive, failure, cars.failure),
+        )  # fmt: skip
         return _TickState(
             alive & (failure == RUNNING) & (tick < task.duration),
-            select_cars(is_fit, next_state.motion, tick_state.motion),
-            select_cars(alive, next_state.drive, tick_state.drive),
-            pick(alive, next_state.driver, tick_state.driver),
-            select_cars(alive, refs, tick_state.refs),
-            select_cars(alive, next_state.nominal_motion, tick_state.nominal_motion),
-            select_cars(alive, next_state.errors, tick_state.errors),
-            select_cars(alive, efforts, tick_state.past_efforts),
-            tick, pick(alive, failure, tick_state.failure),
+            next_cars,
             tick_state.cost + pick(alive & acts, tick_cost.cost * TICK, 0.0),
             select_cars(alive, info_values, tick_state.shown),
             select_cars(alive, measured.row, tick_state.row),
             select_cars(alive, next_state.motion, tick_state.track),
-        )  # fmt: skip
+        )
 
     def _finish_step(
         self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked
     ) -> tuple[TorchState, StepOutcome]:
         """Do slow sensors, observation and report of a step whose ticks are integrated."""
         tick_state, rows, track, running, refused = ticked
-        done, duration = tick_state.tick - state.tick, p[P.task.duration]
-        window = TickWindow(state.tick, tick_state.tick, running, track)
+        cars = tick_state.cars
+        done, duration = cars.tick - state.tick, p[P.task.duration]
+        window = TickWindow(state.tick, cars.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
         obs = self._observe(rows, done, tick_state, slow_state.slow, delivered)
         obs = torch.where(running[:, None], obs, 0.0)
         report = self._report(tick_state, duration, delivered.number)
         report = torch.where(running, report, state.report)
-        refusal = self._report_refusal(tick_state, duration, state.report)
+        refusal = self._report_refusal(cars.tick, duration, state.report)
         report = torch.where(refused, refusal, report)
-        failure = self._select(running, tick_state.failure, state.failure)
-        failure = self._select(refused, BAD_ACTION * 1.0, failure)
+        failure = self._select(refused, BAD_ACTION * 1.0, cars.failure)
         stepped = ~state.over
         terminated = stepped & (failure != RUNNING)
         truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
-        next_state = TorchState(
-            torch.stack(tick_state.motion), torch.stack(tick_state.drive), tick_state.driver,
-            torch.stack(tick_state.refs), torch.stack(tick_state.nominal_motion),
-            torch.stack(tick_state.errors), torch.stack(tick_state.past_efforts), tick_state.tick,
-            failure, *slow_state, terminated | truncated, report,
-        )  # fmt: skip
+        slow, queue = slow_state
+        next_state = cars._replace(
+            failure=failure, slow=slow, queue=queue, over=terminated | truncated, report=report
+        )
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
         return next_state, StepOutcome(
             obs, rewards, terminated, truncated, refused, rows, delivered.packets,
@@ -298,7 +291,7 @@ class TorchStep:
         if self._switches.with_map:
             entries.append(rows[-1, FAST.curvature])
         for sensor in self.sensors:
-            entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
+            entries += self._read_sensor(sensor, tick_state.cars.tick, slow[sensor], delivered)
         info_values = _InfoValues(*tick_state.shown)
         entries += [info_values.beta_ref, info_values.gamma_ref]
         clipped: Tensor = self._functions.clip(torch.stack(entries), *self._bounds.unbind(0))
@@ -320,26 +313,25 @@ class TorchStep:
 
     def _report(self, tick_state: _TickState, duration: Tensor, count: Tensor) -> Tensor:
         """Compute the reports (len(StepReport), N) of cars that were stepped."""
-        failure_cost = self._functions.compute_failure_cost(duration, tick_state.tick)
-        cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
-        info_values = _InfoValues(*tick_state.shown)
-        values = {
-            "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
-            "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
-            "gamma_ref": info_values.gamma_ref, "steer": info_values.steer,
-            "yaw_moment": info_values.moment, "cost": cost, "failure": tick_state.failure,
-            "packets": count.to(cost.dtype), "reward": -cost,
-            "ended": (tick_state.tick >= duration).to(cost.dtype),
-        }  # fmt: skip
-        return torch.stack([values[name] for name in StepReport._fields])
+        cars, shown = tick_state.cars, _InfoValues(*tick_state.shown)
+        failure_cost = self._functions.compute_failure_cost(duration, cars.tick)
+        cost = tick_state.cost + self._select(cars.failure != RUNNING, failure_cost, 0.0)
+        return torch.stack(
+            StepReport(
+                t=cars.tick * TICK, beta=shown.beta, gamma=cars.motion[2], psi=cars.motion[3],
+                beta_ref=shown.beta_ref, gamma_ref=shown.gamma_ref, steer=shown.steer,
+                yaw_moment=shown.moment, cost=cost, failure=cars.failure,
+                packets=count.to(cost.dtype), reward=-cost,
+                ended=(cars.tick >= duration).to(cost.dtype),
+            )
+        )  # fmt: skip
 
-    def _report_refusal(self, tick_state: _TickState, duration: Tensor, before: Tensor) -> Tensor:
+    def _report_refusal(self, tick: Tensor, duration: Tensor, before: Tensor) -> Tensor:
         """Compute the reports of cars that fail by a non-finite action, from those before."""
-        cost = self._functions.compute_failure_cost(duration, tick_state.tick)
-        values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
-        values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}
-        values["failure"] = torch.full_like(cost, BAD_ACTION)
-        return torch.stack([values[name] for name in StepReport._fields])
+        cost = self._functions.compute_failure_cost(duration, tick)
+        failure, packets = torch.full_like(cost, BAD_ACTION), torch.zeros_like(cost)
+        report = StepReport(*before)._replace(cost=cost, reward=-cost)
+        return torch.stack(report._replace(failure=failure, packets=packets))
 
 
 class TorchReset:
@@ -379,8 +371,8 @@ class TorchReset:
         all_cars = torch.ones_like(state.over)
         beta = functions.compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
         started = state._replace(drive=drive, driver=steer, refs=refs)
-        info_values = _InfoValues(beta, refs[0], refs[1], steer, zero)
-        tick_state = _make_tick_state(started, all_cars)._replace(shown=info_values)
+        shown = torch.stack(_InfoValues(beta, refs[0], refs[1], steer, zero))
+        tick_state = _make_tick_state(started, all_cars)._replace(shown=shown)
         empty_queue = torch.full_like(state.queue, NEVER)
         # as if a step of one tick had led here from tick -1: its window holds tick 0 alone
         previous = state._replace(
@@ -410,13 +402,8 @@ class TorchReset:
 
 def _make_tick_state(state: TorchState, alive: Tensor) -> _TickState:
     """Make the state of cars at the start of an env-step."""
-    tick, n_shown = state.tick, len(_InfoValues._fields)
-    zeros = tick.new_zeros((2 + n_shown + FAST_WIDTH, len(tick)))
-    failure, cost, *numbers = zeros.unbind(0)
-    motion, drive, refs = state.motion.unbind(0), state.drive.unbind(0), state.refs.unbind(0)
+    n_shown = len(_InfoValues._fields)
+    zeros = state.tick.new_zeros((1 + n_shown + FAST_WIDTH, len(state.tick)))
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
-    return _TickState(
-        alive, motion, drive, state.driver, refs, state.nominal_motion.unbind(0),
-        state.errors.unbind(0), state.past_efforts.unbind(0), tick, failure, cost,
-        tuple(numbers[:n_shown]), tuple(numbers[n_shown:]), state.motion.unbind(0),
-    )  # fmt: skip
+    shown, row = zeros[1 : 1 + n_shown], zeros[1 + n_shown :]
+    return _TickState(alive, state, zeros[0], shown, row, state.motion.clone())

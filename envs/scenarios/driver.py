@@ -43,16 +43,13 @@ MIN_STEER_FACTOR = 0.2  # of 1 + G v^2, dakf-stability (23): at an oversteering 
 
 @jit
 def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
-    """Compute the driver's steering command at a tick.
+    """Compute the driver's steering command at a tick: the angle at the wheels (rad).
 
     The profile is an array: a tuple goes through memory in every call.
 
     Args:
         tick: Tick since the start of the episode.
         profile: Array that begins with the STEERING_WIDTH numbers of `write_steering`.
-
-    Returns:
-        Angle at the wheels (rad).
     """
     angle = 0.0
     for i in range(SINES):
@@ -91,14 +88,11 @@ def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
 
 @jit
 def interpolate_trace(tick: Scalar, trace: Vector) -> Scalar:
-    """Interpolate a recorded trace at a tick, linearly between its samples.
+    """Interpolate a recorded trace at a tick, linearly: the angle at the wheels (rad).
 
     Args:
         tick: Tick since the start of the episode.
         trace: Ticks from sample to sample, the samples (rad), and the last one again.
-
-    Returns:
-        Angle at the wheels (rad).
     """
     position = minimum(tick / trace[0], len(trace) - 2.0)
     k = int(minimum(floor(position), len(trace) - 3.0))
@@ -107,7 +101,7 @@ def interpolate_trace(tick: Scalar, trace: Vector) -> Scalar:
 
 @jit
 def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> tuple[Scalar, Scalar]:
-    """Compute decay and noise gain of a wandering driver's angle over one hold.
+    """Compute decay, and noise gain (rad), of a wandering driver's angle over one hold.
 
     The next angle is decay times the last one plus noise gain times a standard normal number.
 
@@ -115,9 +109,6 @@ def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> tupl
         amplitude: Standard deviation of the angle (rad).
         hertz: Corner frequency (Hz).
         hold: Time from one angle to the next (s).
-
-    Returns:
-        Decay, and noise gain (rad).
     """
     decay = exp(maximum(-2.0 * PI * hertz * hold, -7.5))  # where `exp` ends
     return decay, amplitude * sqrt(1.0 - decay * decay)
@@ -262,7 +253,7 @@ def compute_target_angle(
     driver: DriverParams,
     stop: Scalar,
 ) -> Scalar:
-    """Compute the steering angle that brings the car onto the path.
+    """Compute the steering angle (rad) that brings the car onto the path, within +-stop.
 
     Args:
         motion: `Motion` of the car.
@@ -271,9 +262,6 @@ def compute_target_angle(
         target: `ReferenceParams` of the nominal car, which the driver knows.
         driver: `DriverParams`.
         stop: Largest angle (rad).
-
-    Returns:
-        Angle at the wheels (rad), within +-stop.
     """
     v = motion.v_x
     distance = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
@@ -298,7 +286,7 @@ def compute_driver_angle(
     driver: DriverParams,
     stop: Scalar,
 ) -> Scalar:
-    """Compute the driver's steering angle a tick later.
+    """Compute the driver's steering angle (rad) a tick later.
 
     Args:
         angle: Present angle at the wheels (rad).
@@ -308,9 +296,6 @@ def compute_driver_angle(
         target: `ReferenceParams` of the nominal car, which the driver knows.
         driver: `DriverParams`.
         stop: Largest angle (rad).
-
-    Returns:
-        The next angle (rad).
     """
     target_angle = compute_target_angle(motion, path, road, target, driver, stop)
     return limit_rate(angle, apply_lag(target_angle, angle, driver.rest), driver.slew)
@@ -332,14 +317,11 @@ class SpeedProfile(NamedTuple):
 
 @inline
 def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> tuple[Scalar, Scalar]:
-    """Compute the speed and the acceleration that the driver wants at a tick.
+    """Compute the speed (m/s) and the acceleration (m/s2) that the driver wants at a tick.
 
     Args:
         tick: Tick since the start of the episode.
         profile: `SpeedProfile`.
-
-    Returns:
-        Speed (m/s) and acceleration (m/s2).
     """
     acceleration = select((tick >= profile.start) & (tick < profile.end), profile.acceleration, 0.0)
     elapsed = (minimum(maximum(tick, profile.start), profile.end) - profile.start) * TICK
@@ -355,7 +337,7 @@ def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> tuple[Scalar
 def compute_acceleration_command(
     tick: Scalar, v_x: Scalar, integral: Scalar, profile: SpeedProfile, limit: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Compute the driver's acceleration command: PI on the speed with feedforward.
+    """Compute the driver's acceleration command and its next integral part (m/s2): PI on the speed.
 
     The integral part is held at the limit. A profile that does not hold its speed gives the wanted
     acceleration alone.
@@ -366,9 +348,6 @@ def compute_acceleration_command(
         integral: Integral part of the command (m/s2).
         profile: `SpeedProfile`.
         limit: Largest acceleration of the motors (m/s2).
-
-    Returns:
-        The command and the next integral (m/s2).
     """
     speed, feedforward = compute_speed_reference(tick, profile)
     error = speed - v_x
@@ -391,14 +370,11 @@ class Wind(NamedTuple):
 
 @jit
 def compute_wind(tick: Scalar, wind: Wind) -> tuple[Scalar, Scalar, Scalar]:
-    """Compute force and moments of the wind from this tick to the next.
+    """Compute force (N), yaw and roll moment (N m) of the wind from this tick to the next.
 
     Args:
         tick: Tick since the start of the episode.
         wind: `Wind`.
-
-    Returns:
-        Force (N), yaw moment and roll moment (N m).
     """
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
     return force, force * wind.arm, 0.0 - force * wind.height

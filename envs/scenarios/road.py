@@ -181,14 +181,11 @@ def add_weave(path: TrackPath, start: Scalar, speed: Scalar, duration: Scalar) -
 
 @jit
 def compute_path_offset(path: TrackPath, s: Scalar) -> Scalar:
-    """Compute the path's lateral offset from the road's centre line; its slope is continuous.
+    """Compute the path's offset (m) to the left of the road's centre line; its slope is continuous.
 
     Args:
         path: `TrackPath`.
         s: Distance along the road (m).
-
-    Returns:
-        Offset (m), to the left.
     """
     first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
     offset = first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)

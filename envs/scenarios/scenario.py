@@ -255,24 +255,18 @@ class Scenario:
                 raise ValueError(message)
 
     def range(self, name: str) -> tuple[float, float]:
-        """Get the ends of a drawn quantity; zeros where it is None.
+        """Get the ends (low, high) of a drawn quantity, equal for a number; zeros where it is None.
 
         Args:
             name: Name of the field.
-
-        Returns:
-            (low, high), equal for a number.
         """
         return get_range(getattr(self, name))
 
     def get_draw_ranges(self, world: World = IDEAL) -> tuple[Array, Array]:
-        """Collect the ends of every quantity of `Draws`.
+        """Collect the ends (low, high) of all quantities of `Draws`, each of shape (len(Draws),).
 
         Args:
             world: Errors of car and sensors.
-
-        Returns:
-            (low, high), each of shape (len(Draws),).
         """
         sides = (0.0, 1.0) if self.mirror else (1.0, 1.0)
         ranges = vars(self) | vars(world) | dict.fromkeys(_SIDES, sides)

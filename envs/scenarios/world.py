@@ -29,13 +29,10 @@ KMH = 1.0 / 3.6
 
 
 def get_range(value: Range | None) -> tuple[float, float]:
-    """Get the ends of a drawn quantity; zeros for None.
+    """Get the ends (low, high) of a drawn quantity, equal for a number; zeros for None.
 
     Args:
         value: A number, a range or None.
-
-    Returns:
-        (low, high), equal for a number.
     """
     low, high = value if isinstance(value, tuple) else (value or 0.0, value or 0.0)
     return float(low), float(high)
@@ -129,14 +126,11 @@ def _draw_numbers(
 
 @jit
 def draw_car(d: Draws, car: CarParams) -> CarParams:
-    """Load a car and draw its tyres.
+    """Load a car, whose load rolls with the body, and draw its tyres' stiffness.
 
     Args:
         d: `Draws`.
         car: `CarParams` of the vehicle.
-
-    Returns:
-        `CarParams` with the load, which rolls with the body, and the drawn stiffness.
     """
     laden, shift = 1.0 + d.load, d.gravity_shift * (car.l_f + car.l_r)
     drawn = (
@@ -171,7 +165,7 @@ def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: CarParams) 
 def draw_stable(
     low: Vector, high: Vector, key_low: int, key_high: int, car: CarParams, out: Vector
 ) -> tuple[Draws, int]:
-    """Draw until the vehicle is stable, at most 64 times.
+    """Draw until the vehicle is stable, at most 64 times; returns the count of rejected draws, too.
 
     Args:
         low: Lower ends, shape (len(Draws),).
@@ -180,9 +174,6 @@ def draw_stable(
         key_high: Upper 32 bits of the episode's key.
         car: `CarParams`.
         out: Array for the draws, shape (len(Draws),).
-
-    Returns:
-        The `Draws`, and the number of draws that were rejected.
     """
     attempt = 0
     _draw_numbers(low, high, key_low, key_high, attempt, out)

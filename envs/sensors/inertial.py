@@ -50,7 +50,7 @@ class NormalDraws(NamedTuple):
 def compute_specific_force(
     before: Motion, after: Motion, road: RoadParams, small_angle: int, roll: int
 ) -> tuple[Scalar, Scalar]:
-    """Compute the mean specific force over a tick, from v', the turning axes and gravity.
+    """Compute the mean specific force (a_x, a_y) (m/s2) over a tick: v', turning axes, gravity.
 
     Args:
         before: `Motion` at the start of the tick.
@@ -58,9 +58,6 @@ def compute_specific_force(
         road: `RoadParams`.
         small_angle: 1 for the small-angle plant, else 0.
         roll: 1 if the body rolls, else 0.
-
-    Returns:
-        (a_x, a_y) (m/s2).
     """
     turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
     turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)

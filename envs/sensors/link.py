@@ -89,15 +89,12 @@ class Link(NamedTuple):
 def make_link(
     sensor: SlowSensor | None, outage: tuple[float, float] | None = None, max_stamp: float = 0.0
 ) -> Link:
-    """Convert a slow sensor to ticks; ValueError for more packets under way than the queue holds.
+    """Convert a slow sensor to ticks, its stamp 0; ValueError for more packets than there is room.
 
     Args:
         sensor: Clock and link; None: an absent sensor.
         outage: (from, to) without packets (s).
         max_stamp: How much later than a capture its stamp is, at most (s).
-
-    Returns:
-        The link, whose stamp is 0 until one is drawn.
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
@@ -121,7 +118,7 @@ def make_link(
 def compute_arrivals(
     link: Link, frame: Scalar, tick: Scalar, key_low: int, key_high: int, block: int
 ) -> tuple[Scalar, Scalar]:
-    """Compute when a frame arrives: loss, outage, duplication, latency and jitter.
+    """Compute the ticks at which a frame and its duplicate arrive; NEVER where one does not.
 
     Args:
         link: `Link` of the sensor.
@@ -130,9 +127,6 @@ def compute_arrivals(
         key_low: Lower 32 bits of the episode's key.
         key_high: Upper 32 bits of the episode's key.
         block: The sensor's channel of random numbers for its link.
-
-    Returns:
-        Ticks of the first and the second arrival; NEVER for none.
     """
     jitter_share, loss_share, duplicate_share, second_share = 0.0, 0.0, 0.0, 0.0
     if any_lane((link.jitter > 0.0) | (link.loss > 0.0) | (link.duplicate > 0.0)):

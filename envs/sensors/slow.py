@@ -121,14 +121,11 @@ class Sample(NamedTuple):
 
 @jit
 def compute_lane_quality(motion: Motion, field_of_view: FieldOfView) -> Scalar:
-    """Compute the quality of a camera sample.
+    """Compute the quality of a camera sample: 1, or 0 where the lane is out of view.
 
     Args:
         motion: `Motion` of the car.
         field_of_view: `FieldOfView`.
-
-    Returns:
-        1, or 0 where the lane is out of view.
     """
     is_turned = absolute(wrap(motion.psi - motion.theta)) > field_of_view.heading
     return select(is_turned | (absolute(motion.y) > field_of_view.offset), 0.0, 1.0)
@@ -136,16 +133,13 @@ def compute_lane_quality(motion: Motion, field_of_view: FieldOfView) -> Scalar:
 
 @inline
 def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar) -> Scalar:
-    """Compute the lateral offset y_l at the preview point from the lane's centre line.
+    """Compute the offset y_l (m) of the preview point from the lane's centre line, left positive.
 
     Args:
         y: Offset of the centre of gravity (m), left positive.
         psi: Heading relative to the lane (rad).
         kappa: Curvature of the lane (1/m).
         l_pre: Preview distance (m).
-
-    Returns:
-        y_l (m), left positive.
     """
     return y + l_pre * psi - 0.5 * kappa * l_pre * l_pre  # tie-vision (4) with curvature
 
@@ -154,7 +148,7 @@ def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar)
 def sample_camera(
     motion: Motion, road: RoadParams, l_pre: Scalar, noise: Noise, n: Vector, errors: SensorErrors
 ) -> tuple[Scalar, Scalar]:
-    """Sample the camera's heading relative to the road and its lateral offset, with noise.
+    """Sample the camera's heading psi (rad) relative to the road and offset y_l (m), with noise.
 
     Args:
         motion: `Motion` of the car.
@@ -163,9 +157,6 @@ def sample_camera(
         noise: `Noise`.
         n: Standard normal numbers, at least two.
         errors: `SensorErrors`.
-
-    Returns:
-        psi (rad) and y_l (m).
     """
     # A misaligned camera sees what is X ahead on the flat at X', 1 / X' = 1 / X - pitch / height,
     # times its height's error; lateral distances grow with X' / X, and a lane beside it seems to
@@ -239,16 +230,13 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: S
 def draw_first_drift(
     sensor: int, sky: SatelliteGeometry, key_low: Scalar, key_high: Scalar
 ) -> Scalar:
-    """Draw a slow sensor's drift at the start of an episode.
+    """Draw a slow sensor's drift at the start: the deviation of log HDOP for the GPS, else 0.
 
     Args:
         sensor: Place of the sensor in `SLOW`.
         sky: `SatelliteGeometry`.
         key_low: Lower 32 bits of the episode's key.
         key_high: Upper 32 bits of the episode's key.
-
-    Returns:
-        The drift: deviation of log HDOP for the GPS, else 0.
     """
     if sensor == GPS:
         return sky.spread * draw_normals(key_low, key_high, 0, BLOCKS[sensor].drift)[1]
@@ -306,13 +294,10 @@ class Detector:
     noise: dict[str, float]  # by the names of `Noise`
 
     def compute_delay(self, share: float) -> float:
-        """Compute the delay at a quantile of its distribution.
+        """Compute the delay (s), within `range`, at a quantile of its distribution.
 
         Args:
             share: Quantile, in (0, 1).
-
-        Returns:
-            Delay (s), within `range`.
         """
         from statistics import NormalDist  # 2 ms, which `import sideslip` does not need
 
@@ -321,13 +306,10 @@ class Detector:
 
 
 def count_delay_ticks(seconds: float) -> int:
-    """Count the whole ticks after which a result arrives.
+    """Count the whole ticks, at least one, after which a result arrives.
 
     Args:
         seconds: Time that it takes (s).
-
-    Returns:
-        Ticks, at least one.
     """
     return max(math.ceil(seconds / TICK - 1e-9), 1)
 

@@ -31,6 +31,8 @@ REFUSED: list[Refusal] = [
     (ENV, {"scenario": {"gps_outage": (3.0, 1.0)}}, VALUE, "gps_outage is .from, to., from before"),
     (ENV, {"scenario": {"wind_length": -2.0}}, VALUE, "wind_length is zero or more, got -2.0"),
     (ENV, {"scenario": {"vehicle": {"friction": 0.3}}}, VALUE, "vehicle has no friction here"),
+    (ENV, {"scenario": {"nominal": {"masss": 1.0}}}, TYPE,
+     "'custom': unknown parameter of nominal 'masss'; did you mean"),
     (ENV, {"world": {"moment_rate": -1.0}}, VALUE, "moment_rate is zero or more, got -1.0"),
     (ENV, {"vehicle": "comms"}, VALUE, "unknown vehicle 'comms'; did you mean 'coms'"),
     (ENV, {"vehicle": {"base": "coms", "mass": 0.0}}, VALUE, "Vehicle.mass: 0.0 kg is not"),

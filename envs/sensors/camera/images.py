@@ -92,13 +92,10 @@ class Pinhole:
         write_document(path, dataclasses.asdict(self) | measured)
 
     def undistort(self, pixels: Array) -> Array:
-        """Undistort pixels to points on the plane one unit ahead of the lens.
+        """Undistort pixels to points (..., 2) on the plane one unit ahead of the lens.
 
         Args:
             pixels: Pixels, shape (..., 2).
-
-        Returns:
-            Points, shape (..., 2).
         """
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
@@ -107,14 +104,11 @@ class Pinhole:
         return np.asarray(straight, float).reshape(np.shape(pixels))
 
     def project_points(self, x: Array, y: Array) -> Array:
-        """Project points of the road to pixels.
+        """Project points of the road to pixels (..., 2), NaN where they lie outside the picture.
 
         Args:
             x: Distance ahead of the car (m).
             y: Distance to the left of the car (m), in a shape that broadcasts with x.
-
-        Returns:
-            Pixels, shape (..., 2); NaN where they lie outside the picture.
         """
         x, y = np.broadcast_arrays(np.asarray(x, float) - self.ahead, np.asarray(y, float))
         depth = x * cos(self.tilt) + self.height * sin(self.tilt)
@@ -132,13 +126,10 @@ class Pinhole:
 
 
 def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Resample a picture to `WORKING_WIDTH`, in its proportions.
+    """Resample a picture to a width of `WORKING_WIDTH`, in its proportions.
 
     Args:
         picture: Bytes, shape (height, width) or (height, width, 3).
-
-    Returns:
-        The picture, WORKING_WIDTH wide.
     """
     size = WORKING_WIDTH, round(picture.shape[0] * WORKING_WIDTH / picture.shape[1])
     method = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
@@ -207,14 +198,11 @@ class RoadRenderer:
         self._rays = np.array(_compute_rays(camera, self.rows), np.float32)
 
     def render_picture(self, scene: RoadScene, seed: int | tuple[int, int] = 0) -> Image:
-        """Render the picture of a scene.
+        """Render the picture of a scene in grey levels, shape (height, width).
 
         Args:
             scene: Place of the car on the road.
             seed: Key of the noise's `np.random.Philox`, or (key, tick) with its counter.
-
-        Returns:
-            Grey levels, shape (height, width).
         """
         style, light = self.appearance, self._render_road(scene)
         if style.blur > 0.0:

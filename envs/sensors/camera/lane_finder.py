@@ -245,13 +245,10 @@ class LaneFinder:
         self.points: Array = np.zeros((0, 2))
 
     def find(self, picture: Image) -> Lane:
-        """Find the lane in a picture; ValueError for one of another size than the camera's.
+        """Find the lane in a picture, all 0 where there is none; ValueError for another size.
 
         Args:
             picture: Bytes, grey (height, width) or blue, green, red (height, width, 3).
-
-        Returns:
-            The lane, all 0 where none was found.
         """
         size = picture.shape[1::-1]
         if size != self.camera.size or picture.dtype != np.uint8:
@@ -318,14 +315,11 @@ class LaneFinder:
         return np.asarray(is_inside & self._inner[np.arange(len(column)), inner_column])
 
     def locate_marking(self, lane_fit: _LaneFit, side: int) -> Array:
-        """Compute the lateral place of a marking in every row, at `rows_ahead`.
+        """Compute the place of a marking to the left of the car (m) at `rows_ahead`, shape (rows,).
 
         Args:
             lane_fit: Lane that was fitted to the picture.
             side: 1 for the left marking, -1 for the right one.
-
-        Returns:
-            Y to the left of the car (m), shape (rows,).
         """
         psi, offset, kappa, pitch, roll = lane_fit[:5]
         y = np.zeros_like(self.rows_ahead)

@@ -22,13 +22,12 @@ PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def read_picture(path: "str | os.PathLike[str]") -> Image:
-    """Read a picture from a file; FileNotFoundError without it, ValueError for a broken one.
+    """Read a picture from a file, (height, width, 3) bytes of blue, green, red.
+
+    FileNotFoundError without the file, ValueError for a broken one.
 
     Args:
         path: Path of the file.
-
-    Returns:
-        Bytes in blue, green, red, shape (height, width, 3).
     """
     _check_file(path)
     data = np.fromfile(path, np.uint8)
@@ -60,13 +59,10 @@ class Film:
         return np.asarray(frame, np.uint8) if has_frame else None
 
     def read_head(self, count: int) -> list[Image]:
-        """Read the first frames, which iteration returns again.
+        """Read the first frames, at most `count`, which iteration returns again.
 
         Args:
             count: Largest number of frames.
-
-        Returns:
-            At most `count` pictures.
         """
         while len(self._buffer) < count and (frame := self._read_frame()) is not None:
             self._buffer.append(frame)
@@ -79,15 +75,12 @@ class Film:
 
 
 def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
-    """Draw the markings that a finder found in its newest picture onto a copy of it.
+    """Draw the markings in a finder's newest picture onto a copy in colour, (height, width, 3).
 
     Args:
         picture: Picture in grey or colour, shape (height, width) or (height, width, 3).
         finder: Finder whose newest picture this is.
         lane: Result of the finder.
-
-    Returns:
-        Picture in colour, shape (height, width, 3).
     """
     shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
     thick = max(shown.shape[1] // 400, 1)

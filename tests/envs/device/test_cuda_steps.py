@@ -1,6 +1,6 @@
 """The fused kernel takes the steps of the compiled engine: the same bits, episode after episode.
 
-On a GPU, or with NUMBA_ENABLE_CUDASIM=1 in numba's simulator (`test_cuda_simulator.py`).
+On a GPU, or with NUMBA_ENABLE_CUDASIM=1 in numba's simulator (`test_cuda_kernel.py`).
 """
 
 from typing import Any

@@ -64,11 +64,6 @@ def test_a_device_is_called_as_its_tensors_call_it() -> None:
     env.step(torch.zeros(2, 1, device=env.device))
 
 
-def test_what_engines_differ_in_has_no_place_but_a_name() -> None:
-    with pytest.raises(TypeError, match="positional"):
-        DeviceVectorEnv(2, "cpu", "float64", "NextStep", False)  # type: ignore[call-arg]
-
-
 def test_without_a_compiler_nothing_is_compiled_and_a_warning_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

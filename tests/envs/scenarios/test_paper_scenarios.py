@@ -1,4 +1,4 @@
-"""The papers' simulations by name, exactly as docs/reference/papers.md gives them."""
+"""The papers' simulations as docs/reference/papers.md gives them, and the twins of road tests."""
 
 import math
 from typing import Any
@@ -9,9 +9,8 @@ import pytest
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.numerics.packed import read
+from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import ROAD_TESTS, SIMULATIONS
-
-pytestmark = pytest.mark.plain
 
 Fields = dict[str, Any]
 OURS = [scenario.name for scenario in SIMULATIONS]
@@ -59,12 +58,14 @@ TABLE: dict[str, tuple[Fields, float, float, bool, dict[str, float]]] = {
 }
 
 
+@pytest.mark.plain
 def test_every_paper_simulation_stands_in_the_table() -> None:
     assert set(TABLE) == set(OURS)
     fixed = {name for name, each in SCENARIOS.items() if not each.mirror}
     assert fixed == {*OURS, *TWINS}
 
 
+@pytest.mark.plain
 @pytest.mark.smoke
 @pytest.mark.parametrize("name", TABLE)
 def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
@@ -100,6 +101,7 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
         assert env.packed_state[Z.clock.redraws] == 0
 
 
+@pytest.mark.plain
 def test_ou_disturbance_has_the_stated_size_and_time() -> None:
     env = StabilityEnv(scenario="tie-vision-fig7")
     env.reset(seed=0)
@@ -107,3 +109,80 @@ def test_ou_disturbance_has_the_stated_size_and_time() -> None:
     assert (force, moment) == (50.0, 20.0)
     assert keep == math.exp(-0.001 / 0.3)
     assert fresh**2 + keep**2 == pytest.approx(1.0, abs=1e-15)  # stationary
+
+
+def uncontrolled(name: str, seed: int = 0) -> tuple[StabilityEnv, Any, Any]:
+    """(env at the end, times and true motions with beta at each step, packets)."""
+    env = StabilityEnv("fusion", scenario=name)
+    env.reset(seed=seed)
+    over, seen, packets = False, [], []
+    while not over:
+        _, _, failed, over, info = env.step(np.zeros(1, np.float32))
+        assert not failed
+        seen.append((info["t"], info["beta"], *env.motion))
+        packets.append(env.record.packets)
+    return env, np.array(seen), np.concatenate(packets)
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_twins_of_road_tests_drive_the_whole_plant(name: str) -> None:
+    scenario = SCENARIOS[name]
+    assert not (scenario.small_angle or scenario.tyres == "linear" or scenario.tier)
+    assert scenario.lags
+    assert scenario.roll
+    assert scenario.hdop_law == "half"
+    low, high = scenario.get_draw_ranges()
+    np.testing.assert_array_equal(low, high)
+    _, seen, _ = uncontrolled(name)
+    assert seen[-1, 0] == scenario.duration
+    assert np.abs(seen[:, 1]).max() > 0.01  # the slip is worth an estimate
+    assert np.abs(seen[:, 11]).max() > 0.01  # the body rolls
+
+
+@pytest.mark.parametrize("name", ["tie-vision-fig9", "uneven-delay-fig7"])
+def test_the_driver_goes_from_standstill_to_30_kmh(name: str) -> None:
+    v_x = uncontrolled(name)[1][:, 2] * 3.6
+    assert abs(v_x[50]) < 1e-3  # the side force of 50 N hardly rolls a standing car
+    assert v_x[-1] == pytest.approx(30.0, abs=0.2)  # the turns brake it a little
+    assert np.diff(v_x[150:2000]).min() > 0.0
+
+
+def test_the_steering_motors_lane_change_has_a_slip_of_almost_3_hundredths() -> None:
+    peaks = [np.abs(uncontrolled("tie-vision-fig10", seed)[1][:, 1]).max() for seed in range(9)]
+    assert np.median(peaks) == pytest.approx(0.03, abs=0.002)
+
+
+def test_image_processing_takes_9_to_18_ms() -> None:
+    packets = uncontrolled("uneven-delay-fig7")[2]
+    camera = packets[packets[:, PACKET.sensor] == 0.0]
+    late = camera[:, PACKET.arrived] - camera[:, PACKET.captured]
+    assert set(late.tolist()) == set(range(9, 19))
+
+
+def test_the_course_is_unused_from_10_5_to_13_s() -> None:
+    _, seen, packets = uncontrolled("dakf-fig8")
+    gps = packets[packets[:, PACKET.sensor] == 1.0, PACKET.captured] * 0.001
+    assert not np.any((gps >= 10.5) & (gps < 13.0))
+    assert {10.4, 13.0} <= set(gps.round(3))
+    assert seen[:, 2].mean() * 3.6 == pytest.approx(20.0, abs=0.2)
+    during = (seen[:, 0] > 10.5) & (seen[:, 0] < 13.0)
+    assert np.abs(seen[during, 1]).max() == np.abs(seen[:, 1]).max()  # the lane change
+
+
+@pytest.mark.parametrize("name", ["dual-rate-fig4", "dual-rate-fig5"])
+def test_course_comes_at_10_hz(name: str) -> None:
+    env, _, packets = uncontrolled(name)
+    gps = packets[packets[:, PACKET.sensor] == 1.0]
+    assert set(np.diff(gps[:, PACKET.captured])) == {100.0}
+    assert env.slow_sensors["gps"].period == 0.1
+
+
+def test_the_driver_of_the_double_layer_simulation_surges() -> None:
+    _, seen, _ = uncontrolled("double-layer-fig9-calm")
+    rate = math.tau * 0.1
+    wanted = 25.0 / 3.6 + 0.5 / rate * (1.0 - np.cos(rate * seen[:, 0]))
+    # PI of 2 / s against the turns' gamma v_y
+    turning = np.abs(seen[:, 4] * seen[:, 3]).max()
+    assert np.abs(seen[:, 2] - wanted).max() < turning / 2.0 < 0.5
+    lean = seen[:, 11]
+    assert 0.05 < np.abs(lean).max() < 0.2

@@ -1,6 +1,9 @@
-"""The kernel compiles for an H200 without a GPU: what PTX it becomes, and where that is kept."""
+"""The kernel without a GPU: its PTX for an H200, the file of that, its keys, its simulation."""
 
+import os
 import re
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -13,10 +16,18 @@ pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv
 from sideslip.envs.device import cuda_env
-from sideslip.envs.device.cuda_kernel import NAME, DeviceArrays, KernelConstants, make_constants
+from sideslip.envs.device.cuda_env import _read_words
+from sideslip.envs.device.cuda_kernel import (
+    NAME,
+    DeviceArrays,
+    KernelConstants,
+    _draw_key,
+    make_constants,
+)
 from sideslip.envs.numerics import kernel_cache
 
 H200 = (9, 0)
+STEPS = Path(__file__).with_name("test_cuda_steps.py")
 ARITHMETIC = re.compile(r"^\t(?:@!?%\w+ )?(?:add|sub|mul|fma|div|rcp|sqrt)\S*\.(f32|f64)\s", re.M)
 
 
@@ -95,3 +106,29 @@ def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
     path.write_bytes(left(path.read_bytes()))
     assert cuda_env.get_ptx(how(), np.float64, H200) == "text 2"
     assert path.read_bytes().endswith(b"text 2")
+
+
+@pytest.mark.plain
+def test_keys_are_those_of_numpys_generator() -> None:
+    """A row's generator on the device draws what NumPy's draws on the host."""
+    generators = [np.random.default_rng(seed) for seed in range(200)]
+    words = _read_words(generators)
+    for i, generator in enumerate(generators):
+        for _ in range(5):
+            key = int(generator.integers(0, 2**64, dtype=np.uint64))
+            assert _draw_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
+    assert np.array_equal(words, _read_words(generators))  # and it stands where NumPy's does
+
+
+def test_the_simulated_steps_are_those_of_the_compiled_engine() -> None:
+    """In numba's CUDA simulator, in a process of its own."""
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "--confcutdir=tests", "-q", "-x", "-p", "no:xdist", STEPS],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        cwd=STEPS.parents[3],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout[-5000:] + run.stderr[-2000:]
+    assert "skipped" not in run.stdout.splitlines()[-1]
