@@ -46,10 +46,6 @@ class CameraSimulator:
     Args:
         delay: "fitted" or "measured", of the lane finder, or "link", the camera's own delay.
         appearance: Fields of `Appearance` that replace the defaults.
-
-    Attributes:
-        picture: Picture that was rendered last; None before the first.
-        lane: Lane that was found in `picture`; None before the first.
     """
 
     def __init__(self, delay: str, appearance: Mapping[str, object] | None) -> None:
@@ -64,8 +60,8 @@ class CameraSimulator:
         self.delay, self._scene_class = delay, RoadScene
         self.finder = LaneFinder(Pinhole(), style.lane_width)
         self.renderer = RoadRenderer(self.finder.camera, style, self.finder.rows)
-        self.picture: Image | None = None
-        self.lane: Lane | None = None
+        self.picture: Image | None = None  # the newest one
+        self.lane: Lane | None = None  # that was found in it
         self.metadata_flags = {"nondeterministic": True} if delay == "measured" else {}
         self.finder.find(np.zeros(self.finder.camera.size[::-1], np.uint8))  # warm
 

@@ -85,19 +85,6 @@ def write_atomic(path: Path | str, content: bytes) -> None:
         file.write(content)
 
 
-def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
-    """Check whether a value is a text or a `Path` with one of these endings.
-
-    Args:
-        source: Any value.
-        suffixes: Endings in lower case, with the dot.
-
-    Returns:
-        True if it ends in one of them, in upper or lower case.
-    """
-    return isinstance(source, str | os.PathLike) and str(source).lower().endswith(suffixes)
-
-
 def is_document(source: object) -> bool:
     """Check whether a value is a path: any `Path`, or a text with an ending.
 
@@ -127,7 +114,8 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
         if base.resolve() in visited:
             raise ValueError(f"{path}: its base is the file itself, or leads back to it")
         visited.add(base.resolve())
-        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, _SUFFIXES) else None
+        is_parsed = base.suffix.lower() in _SUFFIXES  # else: a recorded drive, which has no base
+        base = _find_base(base, _parse_file(base, what)) if is_parsed else None
     return values
 
 

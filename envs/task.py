@@ -219,16 +219,11 @@ def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> Infos:
         reports: Reports, shape (N, len(StepReport)).
         rows: Rows that are reported, shape (N,); the others have zeros.
     """
-    if rows.all():
-        columns = reports.T.copy()
-    else:
-        columns = np.zeros(reports.shape[::-1])
-        columns[:, rows] = reports[rows].T
+    columns = np.where(rows, reports.T, 0.0)
     failure = columns[REPORT.failure].astype(np.int64)
     success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
     values = (*columns[: len(_NUMBERS)], failure, success)
-    masks = np.empty((len(values), len(rows)), np.bool_)
-    masks[:] = rows
+    masks = np.tile(rows, (len(values), 1))
     return dict(zip((*_KEYS, *_MASKS), (*values, *masks), strict=True))
 
 

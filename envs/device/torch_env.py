@@ -69,13 +69,13 @@ def _split_inputs(
     known = [name for name in _FIELDS if _find_places([name], base)]
     if unknown := [name for name in parameters if name not in known]:
         raise ValueError(describe_unknown("parameter", unknown, known))
-    for name, value in parameters.items():
-        low, high = _expand_rows(name, value, count, template).detach().aminmax()
-        base.vehicle.replace(**{name: low.item()}).replace(**{name: high.item()})
-    if parameters and base.scenario.roll:  # which they make together
-        expanded = (_expand_rows(k, value, count, template) for k, value in parameters.items())
-        for row in set(zip(*(tensor.detach().tolist() for tensor in expanded), strict=True)):
-            base.vehicle.replace(**dict(zip(parameters, row, strict=True))).check_roll()
+    columns = {k: _expand_rows(k, x, count, template).detach() for k, x in parameters.items()}
+    for name, column in columns.items():
+        for number in column.aminmax():
+            base.vehicle.replace(**{name: number.item()})
+    if columns and base.scenario.roll:  # which they make together
+        for row in set(zip(*(column.tolist() for column in columns.values()), strict=True)):
+            base.vehicle.replace(**dict(zip(columns, row, strict=True))).check_roll()
     state = remaining.get("state")
     state_values = dict(state) if isinstance(state, Mapping) else {}
     tensors = {
@@ -116,18 +116,15 @@ def _replace_values(vehicle: Vehicle, values: Mapping[str, Any]) -> Vehicle:
 def _find_places(names: Iterable[str], config: EpisodeConfig) -> list[int]:
     """Find the places of the packed parameters that depend on these of a vehicle."""
     changed = _replace_values(config.vehicle, dict.fromkeys(names, np.nan))
-    # the friction under the right wheels is the vehicle's where the scenario has none of its own
-    excluded = () if config.scenario.friction_right is None else (P.car.mu_r,)
-    packed = _pack_vehicle(changed, config).items()
-    return [place for place, value in packed if value != value and place not in excluded]
+    return [place for place, value in _pack_vehicle(changed, config).items() if value != value]
 
 
 class _AttachedParameters:
     """Tensors in the packed parameters of some rows."""
 
     def __init__(self) -> None:
-        # rows of one scenario, its config, the configs of all rows, and the parameters
-        self._held: list[tuple[Tensor, EpisodeConfig, list[EpisodeConfig], dict[str, Any]]] = []
+        # rows by the place that they replace, the configs of all rows, and the parameters
+        self._held: list[tuple[dict[int, Tensor], list[EpisodeConfig], dict[str, Any]]] = []
 
     def put(
         self, rows: Tensor, configs: Sequence[EpisodeConfig], parameters: dict[str, Any]
@@ -135,46 +132,42 @@ class _AttachedParameters:
         """Put parameters, () or (N,), of some rows (M,) in place of those that they had."""
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
-        held = [(mask & ~selected, base, old, x) for mask, base, old, x in self._held]
-        self._held = [entry for entry in held if entry[0].any()]
-        texts, groups = dict[int, str](), dict[str, list[int]]()  # most rows share one scenario
-        for row in rows.tolist() if parameters else ():
-            scenario = configs[row].scenario
-            text = texts.get(id(scenario)) or texts.setdefault(id(scenario), repr(scenario))
-            groups.setdefault(text, []).append(row)
-        for members in groups.values():
-            mask = torch.zeros_like(selected)
-            mask[members] = True
-            self._held.append((mask, configs[members[0]], list(configs), parameters))
+        for masks, *_ in self._held:
+            masks.update({place: mask & ~selected for place, mask in masks.items()})
+        # under the right wheels the friction is the vehicle's where the scenario has none for them
+        is_single = [config.scenario.friction_right is None for config in configs]
+        masks = dict.fromkeys(_find_places(parameters, configs[0]), selected)
+        if P.car.mu_r in masks:
+            masks[P.car.mu_r] = selected & torch.tensor(is_single, device=rows.device)
+        held = [*self._held, (masks, list(configs), parameters)]
+        self._held = [entry for entry in held if any(mask.any() for mask in entry[0].values())]
 
     def insert_tensors(self, params: Tensor) -> Tensor:
         """Insert the tensors into packed parameters (PARAMS_WIDTH, N)."""
         columns, count = list(params.unbind(0)), params.shape[1]
-        for mask, base, configs, parameters in self._held:
+        for masks, configs, parameters in self._held:
             values = {
                 name: params.new_tensor([getattr(config.vehicle, name) for config in configs])
                 for name in _FIELDS
             }
             for name, tensor in parameters.items():
                 values[name] = _expand_rows(name, tensor, count, params)
-            packed = _pack_vehicle(_replace_values(base.vehicle, values), base)
-            for place in _find_places(parameters, base):
+            packed = _pack_vehicle(_replace_values(configs[0].vehicle, values), configs[0])
+            for place, mask in masks.items():
                 columns[place] = torch.where(mask, packed[place], columns[place])
         return torch.stack(columns) if self._held else params
 
     def write(self, params: Tensor, packed: Array) -> None:
         """Write the tensors' numbers into parameters (N, PARAMS_WIDTH) on the host."""
-        for mask, base, _, parameters in self._held:
-            places = _find_places(parameters, base)
-            where = np.ix_(mask.cpu().numpy(), np.array(places))
-            packed[where] = params.detach()[places].T[mask].cpu()
+        for masks, *_ in self._held:
+            for place, mask in masks.items():
+                packed[mask.cpu().numpy(), place] = params.detach()[place, mask].cpu()
 
 
 class _DeviceRows:
     """Parameters, keys, state and last outcome of episodes, as tensors; `start` is for gradients.
 
-    They come from the compiled engine's arrays, and go back there. Without `start` parameters stay
-    at their place.
+    They come from the compiled engine's arrays, and go back there.
     """
 
     def __init__(
@@ -199,25 +192,22 @@ class _DeviceRows:
         params, keys, state = self._read_states(episodes, rows)
         outcome = self._read_outcome(episodes, rows)
         row_index = torch.as_tensor(rows, device=self._device)
-        if self._start is None:
-            self.params.index_copy_(-1, row_index, params)
-        else:
-            self._packed_params = self._packed_params.index_copy(-1, row_index, params)
-            self._attached.put(row_index, configs, inputs.parameters)
-            self.params = self._attached.insert_tensors(self._packed_params)
+        self.keys.index_copy_(-1, row_index, keys)
+        self._packed_params = self._packed_params.index_copy(-1, row_index, params)
+        self._attached.put(row_index, configs, inputs.parameters)
+        self.params = self._attached.insert_tensors(self._packed_params)
+        if self._start is not None:
             motion = dict(zip(Motion._fields, state.motion.unbind(0), strict=True))
             motion |= {name: tensor[row_index] for name, tensor in inputs.state.items()}
             state = state._replace(motion=torch.stack(list(motion.values())))
             state, outcome = self._start(self.params[:, row_index], keys, state)
         if len(rows) == len(episodes.params):
-            self.keys.copy_(keys)
             self.state, self.outcome = state, outcome
             return
 
         def merge(old: Tensor, new: Tensor, axis: int = -1) -> Tensor:
             return old.index_copy(axis, row_index, new)
 
-        self.keys.index_copy_(-1, row_index, keys)
         self.state = TorchState(*map(merge, self.state, state))
         before = self.outcome
         record = map(merge, before[_RECORD:], outcome[_RECORD:])

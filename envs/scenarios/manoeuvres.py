@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..io import has_suffix, is_document, read_document
+from ..io import is_document, read_document
 from ..recordings.log_file import find_step
 from ..recordings.tables import read_quantities
 from ..validation import check_choice, describe_unknown, short_repr
@@ -377,9 +377,9 @@ def make_scenario(source: ScenarioSource) -> Scenario:
         return source
     if isinstance(source, Mapping):
         return _parse_scenario(dict(source))
-    if has_suffix(source, (".csv", ".parquet")):
-        return _read_trace(Path(source))
     if is_document(source):
+        if Path(source).suffix.lower() in (".csv", ".parquet"):
+            return _read_trace(Path(source))
         values = read_document(source, "scenario")
         try:
             return _parse_scenario({"name": Path(source).stem} | values)

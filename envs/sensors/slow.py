@@ -145,27 +145,18 @@ def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar)
 
 
 @jit
-def sample_camera(
-    motion: Motion, road: RoadParams, l_pre: Scalar, noise: Noise, n: Vector, errors: SensorErrors
-) -> tuple[Scalar, Scalar]:
-    """Sample the camera's heading psi (rad) relative to the road and offset y_l (m), with noise.
-
-    Args:
-        motion: `Motion` of the car.
-        road: `RoadParams`.
-        l_pre: Preview distance (m).
-        noise: `Noise`.
-        n: Standard normal numbers, at least two.
-        errors: `SensorErrors`.
-    """
+def _sample_camera(context: MeasurementContext, n: Vector) -> tuple[Vector, Scalar]:
+    """Sample heading and lateral offset relative to the road, with noise: values and quality."""
+    motion, noise, errors, l_pre = context.motion, context.noise, context.errors, context.car.l_pre
     # A misaligned camera sees what is X ahead on the flat at X', 1 / X' = 1 / X - pitch / height,
     # times its height's error; lateral distances grow with X' / X, and a lane beside it seems to
     # turn. Offset and curvature are those seen at the preview point.
     tilt, growth = errors.camera_pitch * (1.0 / CAMERA_HEIGHT), 1.0 + errors.camera_height
     psi = motion.psi - motion.theta + errors.camera_yaw + tilt * motion.y
-    kappa = compute_curvature(road, motion.s) / (growth + tilt * l_pre)
-    y_l = compute_preview_offset(growth * motion.y, psi, kappa, l_pre)
-    return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]
+    kappa = compute_curvature(context.road, motion.s) / (growth + tilt * l_pre)
+    y_l = compute_preview_offset(growth * motion.y, psi, kappa, l_pre) + noise.camera_y * n[1]
+    values = (wrap(psi + noise.camera_psi * n[0]), y_l, 0.0, 0.0, 0.0, 0.0)
+    return values, compute_lane_quality(motion, context.field_of_view)
 
 
 @jit
@@ -212,10 +203,8 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: S
     blocks, tick = BLOCKS[sensor], to_int(context.tick)
     n = draw_normals(context.key_low, context.key_high, tick, blocks.noise)
     if sensor == CAMERA:
-        motion, l_pre, noise = context.motion, context.car.l_pre, context.noise
-        psi, y_l = sample_camera(motion, context.road, l_pre, noise, n, context.errors)
-        quality = compute_lane_quality(context.motion, context.field_of_view)
-        return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), quality, drift)
+        values, quality = _sample_camera(context, n)
+        return Sample(values, quality, drift)
     sky = context.sky
     innovation = draw_normals(context.key_low, context.key_high, tick, blocks.drift)[0]
     is_after_outage = (link.outage_end > link.outage_start) & (context.tick >= link.outage_end)

@@ -33,6 +33,7 @@ REFUSED: list[Refusal] = [
     (ENV, {"scenario": {"vehicle": {"friction": 0.3}}}, VALUE, "vehicle has no friction here"),
     (ENV, {"scenario": {"nominal": {"masss": 1.0}}}, TYPE,
      "'custom': unknown parameter of nominal 'masss'; did you mean"),
+    (ENV, {"scenario": {"noise": {"gyroscope": 1.0}}}, TYPE, "parameter of noise 'gyroscope'; did"),
     (ENV, {"world": {"moment_rate": -1.0}}, VALUE, "moment_rate is zero or more, got -1.0"),
     (ENV, {"vehicle": "comms"}, VALUE, "unknown vehicle 'comms'; did you mean 'coms'"),
     (ENV, {"vehicle": {"base": "coms", "mass": 0.0}}, VALUE, "Vehicle.mass: 0.0 kg is not"),

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...io import read_document, write_document
+from ...io import read_document
 from ...validation import describe_unknown, is_finite, short_repr
 from ...vehicle.dynamics import RoadParams
 
@@ -81,15 +81,6 @@ class Pinhole:
             return cls(**{name: values[name] for name in values if name in known})
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: a camera's fields: {error}") from None
-
-    def write(self, path: "str | os.PathLike[str]", **measured: float) -> None:
-        """Write a file that `read` reads back.
-
-        Args:
-            path: Path of the file, whose ending chooses the format.
-            measured: Further results of a calibration, by name.
-        """
-        write_document(path, dataclasses.asdict(self) | measured)
 
     def undistort(self, pixels: Array) -> Array:
         """Undistort pixels to points (..., 2) on the plane one unit ahead of the lens.

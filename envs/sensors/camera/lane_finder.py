@@ -56,15 +56,6 @@ class _LaneFit(NamedTuple):
         return min(left, right) + 0.25 * (left + right)
 
 
-class _CameraMount(NamedTuple):
-    """Place of a camera, and the lane that it looks for."""
-
-    height: float  # m
-    forward: float  # m
-    preview: float  # m, at which y_l is measured
-    width: float  # m, of the lane
-
-
 def _compute_tolerance(x: Array) -> Array:
     """Distance (m) from a marking within which a point x (m) ahead belongs to it."""
     return 0.05 + 0.006 * x
@@ -84,7 +75,7 @@ def _draw_triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -
     return np.stack([a, b, c])[:, np.flatnonzero(is_marking)[:_MAX_TRIPLES]]
 
 
-def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> list[Array]:
+def _search_starts(x: Array, y: Array, weight: Array, camera: Pinhole, width: float) -> list[Array]:
     """Starts of a fit, (5,) each: pairs of markings that hold many of the points, best first."""
     if len(x) < 6:
         return []
@@ -98,34 +89,34 @@ def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> li
     own_score = (np.abs(residual) < reach) @ weight
     starts = []
     for pitch, width_factor in itertools.product(_PITCHES, _WIDTHS):
-        lane_width = np.float32(width_factor * mount.width) * np.sqrt(1.0 + b * b)
-        pitched_width = lane_width * (1.0 + x * np.float32(pitch / mount.height))
+        lane_width = np.float32(width_factor * width) * np.sqrt(1.0 + b * b)
+        pitched_width = lane_width * (1.0 + x * np.float32(pitch / camera.height))
         for sign in (1.0, -1.0):  # the marking is the right one, the left one
             other = (np.abs(residual - np.float32(sign) * pitched_width) < reach + 0.04) @ weight
             middle = (c + 0.5 * sign * lane_width)[:, 0]
             score = np.minimum(own_score, other) + 0.25 * (own_score + other)
-            score *= 1.0 - _SIDE * np.minimum(np.abs(middle) / mount.width, 3.0)
+            score *= 1.0 - _SIDE * np.minimum(np.abs(middle) / width, 3.0)
             i = int(np.argmax(score))
-            slope = b[i, 0] - c[i, 0] * pitch / mount.height  # of the marking on the road
+            slope = b[i, 0] - c[i, 0] * pitch / camera.height  # of the marking on the road
             cosine = 1.0 / np.sqrt(1.0 + slope * slope)
             offset = -middle[i] * cosine
-            roll = 0.5 * (width_factor - 1.0) * mount.height * offset / (offset * offset + 0.1)
+            roll = 0.5 * (width_factor - 1.0) * camera.height * offset / (offset * offset + 0.1)
             values = -np.arctan(slope), offset, a[i, 0] * cosine**3, pitch, roll
             starts.append((float(score[i]), np.array(values, float)))
     return [start for _, start in sorted(starts, key=lambda item: -item[0])[:_MAX_STARTS]]
 
 
 def _correct_attitude(
-    x: Array, y: Array, pitch: float, roll: float, mount: _CameraMount
+    x: Array, y: Array, pitch: float, roll: float, camera: Pinhole
 ) -> tuple[Array, Array]:
     """(ahead, left) (m) of points on the road, from their places seen without pitch and roll."""
     (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (pitch, roll))
-    x, up = x - mount.forward, -mount.height
+    x, up = x - camera.ahead, -camera.height
     y, up = y * cr - up * sr, y * sr + up * cr
     x, up = x * cp + up * sp, up * cp - x * sp
-    lens_height = mount.height * cr
-    lens_x, lens_y = mount.forward * cp + lens_height * sp, -mount.height * sr
-    reach = (lens_height * cp - mount.forward * sp) / np.maximum(-up, 1e-3)
+    lens_height = camera.height * cr
+    lens_x, lens_y = camera.ahead * cp + lens_height * sp, -camera.height * sr
+    reach = (lens_height * cp - camera.ahead * sp) / np.maximum(-up, 1e-3)
     return lens_x + reach * x, lens_y + reach * y
 
 
@@ -140,16 +131,16 @@ def _project_to_lane(
 
 
 def _fit_lane(
-    x: Array, y: Array, deviation: Array, start: Array, mount: _CameraMount
+    x: Array, y: Array, deviation: Array, start: Array, camera: Pinhole, width: float
 ) -> _LaneFit | None:
     """Lane by Gauss-Newton least squares from a start (5,); None without both markings' points."""
-    values, half = start, 0.5 * mount.width
+    values, half = start, 0.5 * width
     prior = np.array([0.0, 0.0, 0.0, _PITCH_SD**-2, _ROLL_SD**-2])
     inverse: Array = np.zeros((5, 5))
     step = 1e-4  # rad, of the derivatives by both angles
 
     def project_points(pitch: float, roll: float) -> tuple[Array, Array]:
-        return _project_to_lane(*_correct_attitude(x, y, pitch, roll, mount), *values[:3])
+        return _project_to_lane(*_correct_attitude(x, y, pitch, roll, camera), *values[:3])
 
     for scale in (2.0, 1.5, 1.2, 1.0, 0.8, 0.8):
         if not (np.abs(values) < [1.0, 50.0, 0.5, 0.1, 0.2]).all():  # nor is NaN
@@ -174,7 +165,7 @@ def _fit_lane(
         values = values - inverse @ (rows.T @ (weight * r) + prior * values)
     _, d = project_points(*values[3:])
     side = np.sign(d) * (np.abs(d - half * np.sign(d)) < 0.8 * _compute_tolerance(x))
-    row = np.array([mount.preview, 1.0, -0.5 * mount.preview * mount.preview])
+    row = np.array([camera.preview, 1.0, -0.5 * camera.preview * camera.preview])
     error = np.sqrt(np.array([inverse[0, 0], row @ inverse[:3, :3] @ row]))
     psi, offset, kappa, pitch, roll = values.tolist()
     return _LaneFit(psi, offset, kappa, pitch, roll, side.astype(np.int64), error)
@@ -219,9 +210,8 @@ class LaneFinder:
         if not (0.0 < near < far and 0.0 < lane_width < _SEARCHED):
             rule = f"expected 0 < near < far, and a lane's width below {_SEARCHED} m"
             raise ValueError(f"{rule}, got {near}, {far} and {lane_width} m")
-        self.camera, self.view = camera, view
+        self.camera, self.view, self._width = camera, view, lane_width
         self._scale = scale = camera.size[0] / WORKING_WIDTH
-        self._mount = _CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
         self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))  # m
         self._y = np.arange(_SEARCHED, -_SEARCHED, -_CELL)
@@ -241,8 +231,7 @@ class LaneFinder:
         ridge = (1.0 - u * u) * bell
         ridge -= bell * ridge.sum() / bell.sum()  # flat light gives exactly nothing
         self._ridge = (ridge / np.abs(ridge).sum() * 2.0).astype(np.float32)
-        self.fit: _LaneFit | None = None  # of the newest picture, with its points for drawing
-        self.points: Array = np.zeros((0, 2))
+        self.fit: _LaneFit | None = None  # of the newest picture, for drawing
 
     def find(self, picture: Image) -> Lane:
         """Find the lane in a picture, all 0 where there is none; ValueError for another size.
@@ -255,11 +244,12 @@ class LaneFinder:
             got = f"{size} in {picture.dtype}"
             raise ValueError(f"expected a picture of {self.camera.size} pixels in bytes, got {got}")
         x, y, strength = self._find_ridges(resample(picture))
-        self.points, self.fit = np.stack([x, y], 1), None
+        self.fit = None
         focal = self.camera.K[0][0] / self._scale
         weight, deviation = np.minimum(strength, 40.0), 0.03 + 2.0 * x / focal
-        starts = _search_starts(x, y, weight, self._mount)
-        fits = (_fit_lane(x, y, deviation, start, self._mount) for start in starts)
+        geometry = self.camera, self._width
+        starts = _search_starts(x, y, weight, *geometry)
+        fits = (_fit_lane(x, y, deviation, start, *geometry) for start in starts)
         candidates = [fit for fit in fits if fit is not None]
         best = max(candidates, key=lambda fit: fit._compute_support(weight), default=None)
         if best is None or (quality := self._compute_quality(best, x)) == 0.0:
@@ -324,7 +314,7 @@ class LaneFinder:
         psi, offset, kappa, pitch, roll = lane_fit[:5]
         y = np.zeros_like(self.rows_ahead)
         for _ in range(6):  # Newton, on the distance across the lane
-            x, level = _correct_attitude(self.rows_ahead, y, pitch, roll, self._mount)
+            x, level = _correct_attitude(self.rows_ahead, y, pitch, roll, self.camera)
             _, d = _project_to_lane(x, level, psi, offset, kappa)
-            y = y - (d - 0.5 * side * self._mount.width) / np.cos(psi - kappa * x)
+            y = y - (d - 0.5 * side * self._width) / np.cos(psi - kappa * x)
         return y

@@ -14,7 +14,6 @@ pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
 from sideslip.envs.device import cuda_env  # noqa: E402
-from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
 from sideslip.envs.device.cuda_kernel import (  # noqa: E402
     SIMULATED,
     make_constants,
@@ -22,17 +21,6 @@ from sideslip.envs.device.cuda_kernel import (  # noqa: E402
 )
 
 pytestmark = pytest.mark.skipif(SIMULATED, reason="of real devices")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_driver_the_devices_that_are_there_are_named() -> None:
-    with pytest.raises(ValueError, match=r"'cuda' is not there: torch .* finds cpu: (no|built)"):
-        CudaVectorEnv(2)
-
-
-def test_it_is_no_engine_for_the_cpu() -> None:
-    with pytest.raises(ValueError, match="engine='cuda' runs on a CUDA device, got 'cpu'"):
-        CudaVectorEnv(2, device="cpu")
 
 
 def test_rows_that_do_not_fit_are_refused_with_how_many_would(

@@ -234,16 +234,6 @@ def test_a_body_that_no_parameters_could_hold_up_is_refused() -> None:
         env.reset(options={"parameters": inertia | mass})
 
 
-def test_friction_is_that_of_both_sides_but_where_the_right_one_has_its_own() -> None:
-    for scenario, split in (("random-steering", False), ("split-friction", True)):
-        env = made(scenario=scenario)
-        env.reset(seed=0, options={"parameters": {"friction": leaf(0.8, 0.7)}})
-        params = env.get_state()["params"]
-        sides = [params[:, [P.car.mu, P.car.mu_r][i]].tolist() for i in range(2)]
-        assert [0.8, 0.7] in sides
-        assert (sides[0] == sides[1]) is not split
-
-
 def test_parameters_need_gradients() -> None:
     env = make_device_env(FUSION, 2)
     with pytest.raises(ValueError, match="unknown reset option parameters"):

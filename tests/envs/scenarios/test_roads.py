@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -101,19 +100,6 @@ def test_a_snapshot_and_other_control_periods_go_on_with_its_bits(n: int) -> Non
         env.step(np.zeros(1, np.float32))
         ends.append(env.get_state()["state"].copy())
     np.testing.assert_array_equal(*ends)
-
-
-def test_a_batch_in_lanes_has_the_bits_of_single_envs() -> None:
-    many: Any = gym.make_vec("sideslip/YawFusion-v0", 20, scenario=WINDING).unwrapped
-    many.reset(seed=0)
-    for _ in range(50):
-        many.step(np.zeros((20, 1), np.float32))
-    for row in (0, 7, 19):
-        one = StabilityEnv("fusion", WINDING, reference="model")
-        one.reset(seed=row)
-        for _ in range(50):
-            one.step(np.zeros(1, np.float32))
-        np.testing.assert_array_equal(one.get_state()["state"], many.engine.arrays.states[row])
 
 
 def test_braking_cars_are_followed_at_the_speed_that_their_drivers_want() -> None:

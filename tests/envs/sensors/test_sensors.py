@@ -18,8 +18,9 @@ from sideslip.envs.sensors.slow import (
     MeasurementContext,
     SatelliteGeometry,
     _count_satellites,
+    _sample_camera,
     _sample_gps,
-    sample_camera,
+    compute_lane_quality,
 )
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
@@ -80,16 +81,31 @@ def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
             assert speed == pytest.approx(v_x * stretch, rel=1e-14)  # some roundings
 
 
+def sample_camera(motion: Motion, road: RoadParams) -> Any:
+    """psi and y_l without noise; the COMS's preview is 5.135 m."""
+    parts = SatelliteGeometry(*[0.0] * 5), FieldOfView(1.0, 1.0), IDEAL_SENSORS
+    context = MeasurementContext(motion, road, make_car(COMS), QUIET, *parts, 0, 0, 0, 0)
+    return _sample_camera(context, CALM)[0][:2]
+
+
 @pytest.mark.plain
 def test_camera_sample_is_tie_vision_4_with_curvature() -> None:
     motion = Motion(7.0, 0.2, 0.1, 0.5, 30.0, 4.0, 31.0, 1.5, 0.44)
     for kappa, bend in ((0.0, 0.0), (0.02, 0.02)):
-        psi, y_l = sample_camera(
-            motion, RoadParams(kappa, 0.0, 1.0), 5.135, QUIET, CALM, IDEAL_SENSORS
-        )
+        psi, y_l = sample_camera(motion, RoadParams(kappa, 0.0, 1.0))
         assert psi == pytest.approx(0.06, abs=1e-15)
         # y_l = y_cg + l_pre psi - kappa l_pre^2 / 2
         assert y_l == pytest.approx(1.5 + 5.135 * 0.06 - bend * 5.135**2 / 2.0, abs=1e-14)
+
+
+@pytest.mark.plain
+def test_where_the_road_leads_changes_nothing_that_is_seen_of_it() -> None:
+    """A road and a car that are both turned: heading and offset are relative to the road."""
+    for turned in (0.0, 0.7, -2.0):
+        motion = Motion(0.0, 0.0, 0.0, turned + 0.1, 0.0, 0.0, 0.0, 0.4, turned)
+        assert compute_lane_quality(motion, FieldOfView(0.15, 1.0)) == 1.0
+        expected = pytest.approx((0.1, 0.4 + 5.135 * 0.1), rel=1e-7)
+        assert sample_camera(motion, RoadParams(0.0, 0.0, 1.0)) == expected
 
 
 @pytest.mark.plain
@@ -97,7 +113,7 @@ def test_y_l_is_where_the_road_is_seen_at_the_preview_distance() -> None:
     """On a circle the formula errs by the fourth order of the angles, geometry written out."""
     kappa, psi, y, l_pre = 0.01, 0.02, 0.5, 5.135
     motion = Motion(7.0, 0.0, 0.0, psi, 0.0, y, 0.0, y, 0.0)
-    _, y_l = sample_camera(motion, RoadParams(kappa, -1e3, 1.0), l_pre, QUIET, CALM, IDEAL_SENSORS)
+    _, y_l = sample_camera(motion, RoadParams(kappa, -1e3, 1.0))
     ahead = np.array([l_pre * math.cos(psi), y + l_pre * math.sin(psi)])
     left_of_road = 1.0 / kappa - math.hypot(ahead[0], ahead[1] - 1.0 / kappa)
     # kappa l^2/2 against the arc of (1 - kappa y): kappa^2 l^2 y / 2 = 7e-4, and l psi^3 / 6

@@ -6,18 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.inertial import IDEAL_SENSORS, Noise
-from sideslip.envs.sensors.slow import (
-    FieldOfView,
-    compute_lane_quality,
-    sample_camera,
-)
-from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 from sideslip.estimators import make_estimator
-
-from ..helpers import SILENT
 
 FUSION = "sideslip/YawFusion-v0"
 TURN = {"base": "sine", "steering": "held-step", "onset": 0.2, "amplitude": 0.06, "duration": 3.0}
@@ -37,22 +27,6 @@ def drive(view: Any, steps: int = 250, **arguments: Any) -> Any:
         infos.append(info)
     table = dict(zip(names, np.array(seen).T, strict=True))
     return concatenate(records), table, infos, env.unwrapped.slow_sensors
-
-
-@pytest.mark.plain
-def test_where_the_road_leads_changes_nothing_that_is_seen_of_it() -> None:
-    """A road and a car that are both turned: heading and offset are relative to the road."""
-    road, still = RoadParams(0.0, 0.0, 1.0), (0.0,) * 3
-    seen = []
-    for turned in (0.0, 0.7, -2.0):
-        motion = Motion(*still, turned + 0.1, 0.0, 0.0, 0.0, 0.4, turned)
-        assert as_python(compute_lane_quality)(motion, FieldOfView(0.15, 1.0)) == 1.0
-        seen.append(
-            as_python(sample_camera)(
-                motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4, IDEAL_SENSORS
-            )
-        )
-    np.testing.assert_allclose(seen, [(0.1, 0.9)] * 3)
 
 
 @pytest.mark.parametrize("view", [{"camera_heading": HEADING}, {"camera_offset": OFFSET}])

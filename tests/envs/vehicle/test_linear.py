@@ -15,8 +15,8 @@ from sideslip.envs.sensors.slow import (
     FieldOfView,
     MeasurementContext,
     SatelliteGeometry,
+    _sample_camera,
     _sample_gps,
-    sample_camera,
 )
 from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
@@ -66,10 +66,10 @@ def seen(
         dbeta = (v_x * rate.v_y - v_y * rate.v_x) / (v_x**2 + v_y**2)
     dpsi = rate.psi - rate.theta
     dx = [dbeta, rate.gamma, dpsi, rate.y + l_pre * dpsi]
-    psi_seen, y_seen = sample_camera(state, road, l_pre, SILENT, (0.0, 0.0), IDEAL_SENSORS)
     sky, view = SatelliteGeometry(0.0, 0.0, 0.0, 0.0, 0.0), FieldOfView(1.0, 1.0)
     parts = state, road, car, SILENT, sky, view, IDEAL_SENSORS
     context = MeasurementContext(*parts, small_angle, 0, 0, 0)
+    psi_seen, y_seen = _sample_camera(context, (0.0, 0.0))[0][:2]
     course_seen = _sample_gps(context, 1.0, (0.0,) * 4)[0][0]
     outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
     names = MODELS[model](vehicle, v).outputs

@@ -13,7 +13,7 @@ import cv2
 
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.sensors.camera.images import Appearance, Pinhole, RoadRenderer, RoadScene
-from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _CameraMount, _search_starts
+from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, _search_starts
 from sideslip.envs.sensors.slow import FieldOfView, compute_preview_offset
 from sideslip.envs.vehicle.dynamics import RoadParams, compute_curvature
 
@@ -109,7 +109,7 @@ def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
     x = np.tile(np.linspace(6.0, 30.0, 60), 3)
     y = np.repeat(side * width * np.array([-0.5, 0.5, 1.5]), 60)
     weight = np.repeat([1.0, 1.2, 1.1], 60)
-    best = _search_starts(x, y, weight, _CameraMount(1.2, 1.5, 5.0, width))[0]
+    best = _search_starts(x, y, weight, Pinhole(height=1.2), width)[0]
     assert best[1] == pytest.approx(0.0, abs=0.05)
 
 

@@ -14,6 +14,7 @@ from math import atan2, hypot, radians, tan
 from pathlib import Path
 from typing import Any
 
+from sideslip.envs.io import write_document
 from sideslip.envs.sensors.camera.images import (
     Appearance,
     Pinhole,
@@ -143,7 +144,8 @@ def test_what_is_behind_or_beside_is_not_seen() -> None:
 
 def test_a_file_of_a_camera_comes_back(tmp_path: Path) -> None:
     camera = Pinhole(tilt=0.1, height=1.1)
-    camera.write(tmp_path / "camera.json", rms_px=0.8, boards=6)
+    numbers = dataclasses.asdict(camera) | {"rms_px": 0.8, "boards": 6}
+    write_document(tmp_path / "camera.json", numbers)
     assert Pinhole.read(tmp_path / "camera.json") == camera
 
 
