@@ -281,14 +281,12 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     @property
     def rows(self) -> Array:
         """Fast rows of the newest record, of which `ticks_done` are there, (n, FAST_WIDTH)."""
-        rows: Array = self._row.rows
-        return rows
+        return np.asarray(self._row.rows)
 
     @property
     def packets(self) -> Array:
         """Packets of the newest record, of which `delivered` are there, (max, PACKET_WIDTH)."""
-        packets: Array = self._row.packets
-        return packets
+        return np.asarray(self._row.packets)
 
     @property
     def delivered(self) -> int:

@@ -1,12 +1,14 @@
 """`TensorVectorEnv`: what environments on tensors share, whichever engine steps their cars."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
 
 from ..engine.batch_env import BatchEnv
+from ..engine.config import EpisodeConfig
+from ..engine.step import get_start_variant
 from ..numerics.torch_backend import DTYPES, torch
 from ..task import REPORT, RUNNING, Infos, StepReport
 from ..validation import Mask, parse_actions, short_repr
@@ -21,8 +23,7 @@ class StepEnds(NamedTuple):
     rewards: Tensor
     terminated: Tensor
     truncated: Tensor
-    final_obs: Tensor | None = None  # (N, k)
-    final_report: Tensor | None = None  # (len(StepReport), N)
+    final: tuple[Tensor, Tensor] | None = None  # observations (N, k), reports (len(StepReport), N)
 
 
 class TensorVectorEnv(BatchEnv[Tensor]):
@@ -62,6 +63,16 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         self.metadata = env.metadata
         super().__init__(autoreset_mode, rows)
 
+    def _check_plants(self, configs: Iterable[EpisodeConfig]) -> None:
+        """Check that these episodes have the kind of plant of the env's own scenario."""
+        base = self.config.base.start
+        kind = get_start_variant(base), len(base.params)
+        for config in configs:
+            got = get_start_variant(config.start), len(config.start.params)
+            if got != kind:
+                rule = f"on a device all rows have one kind of plant, {kind}"
+                raise ValueError(f"{rule}; scenario {config.scenario.name!r} has {got}")
+
     def _read_reset(self, mask: Mask) -> tuple[Tensor, Infos]:
         obs, report, _ = self._get_outputs()
         return obs.clone(), _read_infos(report.clone())
@@ -73,8 +84,8 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         ends = self._advance(actions)
         obs, report, _ = self._get_outputs()
         infos: Infos = {}
-        if ends.final_obs is not None and ends.final_report is not None:
-            infos = {"final_obs": ends.final_obs, "final_info": _read_infos(ends.final_report)}
+        if ends.final is not None:
+            infos = {"final_obs": ends.final[0], "final_info": _read_infos(ends.final[1])}
             infos |= {f"_{key}": ends.terminated | ends.truncated for key in infos}
         infos |= _read_infos(report.clone())
         return obs.clone(), ends.rewards, ends.terminated, ends.truncated, infos

@@ -25,7 +25,6 @@ from numba import cuda, types
 
 from ..engine.batch import IntArray
 from ..engine.layout import Z
-from ..engine.step import get_start_variant
 from ..io import replace_file
 from ..numerics import kernel_cache
 from ..numerics.torch_backend import torch
@@ -67,22 +66,14 @@ def get_ptx(
     folder = kernel_cache.find_kernel_folder("envs")
     versions = version("numba-cuda"), version("numba"), NVVM().get_version()
     key = json.dumps([constants, real.__name__, capability, versions])
-    path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
+    path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()}.ptx" if folder else None
     if path and (data := kernel_cache.read_trusted(path)):
-        header, _, text = data.partition(b"\n")
-        if header == _make_header(key, text):  # else it is not whole, or another's
-            return text.decode()
+        return data.decode()
     ptx = _compile_ptx(constants, real, capability)
     if path:
-        text = ptx.encode()
         with contextlib.suppress(OSError), replace_file(path) as file:
-            file.write(_make_header(key, text) + b"\n" + text)
+            file.write(ptx.encode())
     return ptx
-
-
-def _make_header(key: str, text: bytes) -> bytes:
-    """Make the first line of a file: the key of its compilation, and its text's hash."""
-    return f"// {key} {hashlib.sha256(text).hexdigest()}".encode()
 
 
 def _compile_ptx(
@@ -248,13 +239,7 @@ class CudaVectorEnv(TensorVectorEnv):
     def _start_rows(self, chosen: IntArray, seeds: dict[int, int], options: dict[str, Any]) -> None:
         """Reset rows on the device, where their generators are."""
         configs, index = self._make_configs(options, chosen)
-        own_kind, own_width = self._constants.kind, self._constants.width
-        for config in configs:
-            kind, width = get_start_variant(config.start), len(config.start.params)
-            if kind != own_kind or width != own_width:
-                rule = f"all rows have one kind of plant, {own_kind} with {own_width} parameters"
-                got = f"scenario {config.scenario.name!r} has {kind} with {width}"
-                raise ValueError(f"on a device {rule}; {got}")
+        self._check_plants(configs)
         words = _read_words([seeding.np_random(seed)[0] for seed in seeds.values()])
         self._memory.generators[:, list(seeds)] = torch.as_tensor(words, device=self.device)
         start_index = np.zeros(self.num_envs, np.int64)  # 0: without options
@@ -283,8 +268,8 @@ class CudaVectorEnv(TensorVectorEnv):
         self._kernel(self.num_envs, False, memory)
         ends = memory.terminated.view(torch.bool), memory.truncated.view(torch.bool)
         is_same_step = self._mode == AutoresetMode.SAME_STEP
-        finals = (memory.final_obs, memory.final_reports) if is_same_step else (None, None)
-        return StepEnds(memory.rewards, *ends, *finals)
+        final = (memory.final_obs, memory.final_reports) if is_same_step else None
+        return StepEnds(memory.rewards, *ends, final)
 
     def _get_outputs(self) -> tuple[Tensor, Tensor, Tensor]:
         return self._memory.obs, self._memory.reports, self._memory.over

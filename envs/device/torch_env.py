@@ -20,11 +20,9 @@ from ..engine.batch import BatchArrays, IntArray, NumbaEngine
 from ..engine.batch_env import BatchEnv
 from ..engine.config import EpisodeConfig, make_car, make_task_params
 from ..engine.layout import P, Z
-from ..engine.step import get_start_variant
 from ..numerics.packed import read
 from ..numerics.torch_backend import torch
 from ..record import PACKET_WIDTH, Array
-from ..sensors.link import Link
 from ..sensors.slow import SLOW_NAMES
 from ..validation import check_mapping, check_number, describe_unknown
 from ..vehicle.dynamics import Motion
@@ -33,7 +31,7 @@ from .base import StepEnds, Tensor, TensorVectorEnv
 from .torch_sensors import PacketCapacity, read_packed, write_packed
 from .torch_step import StepOutcome, TorchReset, TorchState, TorchStep
 
-_Links = dict[int, set[Link]]  # by the sensor's place
+_Capacities = dict[int, PacketCapacity]  # by the sensor's place
 _FIELDS = [field.name for field in dataclasses.fields(Vehicle) if field.name != "name"]
 _RECORD = StepOutcome._fields.index("rows")  # from here on the rows are the last axis
 _MOTION, _DRIVE, _REFS, _LEAD, _ERRORS, _EFFORTS = (
@@ -171,7 +169,7 @@ class _DeviceRows:
     """
 
     def __init__(
-        self, episodes: BatchArrays, capacities: dict[int, PacketCapacity], device: torch.device,
+        self, episodes: BatchArrays, capacities: _Capacities, device: torch.device,
         dtype: torch.dtype, start: TorchReset | None,
     ) -> None:  # fmt: skip
         self.capacities, self._device, self._dtype = capacities, device, dtype
@@ -320,33 +318,29 @@ class DeviceVectorEnv(TensorVectorEnv):
             text = f"compile=True needs a C++ compiler on the CPU, and there is no {compiler!r}"
             warnings.warn(f"{text}: ticks are not compiled", RuntimeWarning, stacklevel=2)
             compile = False
-        self._compile, self._grad, config = compile, grad, self.config
-        self._kind = get_start_variant(config.base.start)
-        self._links: _Links = {i: set() for i, name in enumerate(SLOW_NAMES) if name in config.slow}
-        self._links, capacities = self._collect_links(self.configs)
-        self._build(capacities)
+        self._compile, self._grad, slow = compile, grad, self.config.slow
+        empty = {i: PacketCapacity(0, 0, 1) for i, name in enumerate(SLOW_NAMES) if name in slow}
+        self._build(self._extend_capacities(empty, self.configs))
 
-    def _collect_links(
-        self, configs: Iterable[EpisodeConfig]
-    ) -> tuple[_Links, dict[int, PacketCapacity]]:
-        """Collect the slow sensors' links, these configs' and those before, and their capacity."""
-        configs = list({id(config): config for config in configs}.values())
-        for config in configs:
+    def _extend_capacities(
+        self, capacities: _Capacities, configs: Iterable[EpisodeConfig]
+    ) -> _Capacities:
+        """Extend the slow sensors' capacities to what these configs need, which are checked."""
+        unique = list({id(config): config for config in configs}.values())
+        self._check_plants(unique)
+        extended = dict(capacities)
+        for config in unique:
             if config.scenario.steering in ("trace", "wander"):
                 label = f"{config.scenario.name!r}: no {config.scenario.steering}"
                 raise ValueError(f"{label} is driven on a device")
-            kind = get_start_variant(config.start)
-            if kind != self._kind:
-                reason = f"scenario {config.scenario.name!r} has {kind}, not {self._kind}"
-                raise ValueError(f"on a device all rows have one kind of plant: {reason}")
-        links = {
-            sensor: previous | {read(config.start.params, P.slow[sensor]) for config in configs}
-            for sensor, previous in self._links.items()
-        }
-        n = self.control_period
-        return links, {i: _compute_capacity(list(known), n) for i, known in links.items()}
+            for i, capacity in extended.items():
+                link = read(config.start.params, P.slow[i])
+                frames, copies = -int(-self.control_period // link.period), 1 + (link.duplicate > 0)
+                needed = frames, link.max_in_flight, copies
+                extended[i] = PacketCapacity(*map(max, capacity, needed))
+        return extended
 
-    def _build(self, capacities: dict[int, PacketCapacity]) -> None:
+    def _build(self, capacities: _Capacities) -> None:
         """Build the step with these capacities, and copy all rows to the device."""
         kinds = self.dtype, self.dtype if self._grad else torch.float32, self.device, self._compile
         self._step = TorchStep(self.config, capacities, *kinds)
@@ -360,7 +354,7 @@ class DeviceVectorEnv(TensorVectorEnv):
             place = self.config.base, self.num_envs, self._rows.params
             options, inputs = _split_inputs(options, *place)
         configs, index = self._make_configs(options, chosen)
-        links, capacities = self._collect_links(configs)
+        capacities = self._extend_capacities(self._rows.capacities, configs)
         needs_rebuild = capacities != self._rows.capacities
         if needs_rebuild and self._grad and len(chosen) < self.num_envs:
             reason = "these sensors take more room than any before"
@@ -368,7 +362,6 @@ class DeviceVectorEnv(TensorVectorEnv):
         if needs_rebuild:
             self._rows.download(host.arrays)
         self._restart_rows(chosen, configs, index, seeds)
-        self._links = links
         if needs_rebuild:
             self._build(capacities)
         self._rows.upload(host.arrays, chosen, self.configs, inputs)
@@ -390,7 +383,7 @@ class DeviceVectorEnv(TensorVectorEnv):
         if over_rows is not None:
             self._start_rows(over_rows.nonzero()[:, 0].cpu().numpy(), {}, {})
         if ended and self._mode == AutoresetMode.SAME_STEP:
-            ends = ends._replace(final_obs=outcome.obs, final_report=state.report.clone())
+            ends = ends._replace(final=(outcome.obs, state.report.clone()))
             self._start_rows(state.over.nonzero()[:, 0].cpu().numpy(), {}, {})
         return ends
 
@@ -418,16 +411,6 @@ class DeviceVectorEnv(TensorVectorEnv):
         return super().get_state()
 
     def _restore(self, snapshot: Mapping[str, Any]) -> None:
-        links, capacities = self._collect_links(snapshot["configs"])
+        capacities = self._extend_capacities(self._rows.capacities, snapshot["configs"])
         BatchEnv.set_state(self, snapshot)
-        self._links = links
         self._build(capacities)
-
-
-def _compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
-    """Compute the capacity for sensors with any of some links, in env-steps of n ticks."""
-    return PacketCapacity(
-        max(-int(-n // link.period) for link in links),
-        max(link.max_in_flight for link in links),
-        2 if any(link.duplicate > 0.0 for link in links) else 1,
-    )

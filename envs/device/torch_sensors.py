@@ -158,9 +158,8 @@ def _remove_first(queue: Tensor, count: Tensor) -> Tensor:
     is_gone = place >= len(queue)
     place = place.clamp(max=len(queue) - 1)
     remaining = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
-    before, after = remaining[:, : PACKET.arrived], remaining[:, PACKET.arrived + 1 :]
-    arrived = remaining[:, PACKET.arrived].masked_fill(is_gone, NEVER)
-    return torch.cat((before, arrived[:, None], after), 1)
+    remaining[:, PACKET.arrived].masked_fill_(is_gone, NEVER)
+    return remaining
 
 
 def read_packed(states: Tensor, capacity: int) -> SlowState:

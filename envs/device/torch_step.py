@@ -316,22 +316,22 @@ class TorchStep:
         cars, shown = tick_state.cars, _InfoValues(*tick_state.shown)
         failure_cost = self._functions.compute_failure_cost(duration, cars.tick)
         cost = tick_state.cost + self._select(cars.failure != RUNNING, failure_cost, 0.0)
-        return torch.stack(
-            StepReport(
-                t=cars.tick * TICK, beta=shown.beta, gamma=cars.motion[2], psi=cars.motion[3],
-                beta_ref=shown.beta_ref, gamma_ref=shown.gamma_ref, steer=shown.steer,
-                yaw_moment=shown.moment, cost=cost, failure=cars.failure,
-                packets=count.to(cost.dtype), reward=-cost,
-                ended=(cars.tick >= duration).to(cost.dtype),
-            )
-        )  # fmt: skip
+        values = {
+            "t": cars.tick * TICK, "beta": shown.beta, "gamma": cars.motion[2],
+            "psi": cars.motion[3], "beta_ref": shown.beta_ref, "gamma_ref": shown.gamma_ref,
+            "steer": shown.steer, "yaw_moment": shown.moment, "cost": cost, "failure": cars.failure,
+            "packets": count.to(cost.dtype), "reward": -cost,
+            "ended": (cars.tick >= duration).to(cost.dtype),
+        }  # fmt: skip
+        return torch.stack([values[name] for name in StepReport._fields])
 
     def _report_refusal(self, tick: Tensor, duration: Tensor, before: Tensor) -> Tensor:
         """Compute the reports of cars that fail by a non-finite action, from those before."""
         cost = self._functions.compute_failure_cost(duration, tick)
-        failure, packets = torch.full_like(cost, BAD_ACTION), torch.zeros_like(cost)
-        report = StepReport(*before)._replace(cost=cost, reward=-cost)
-        return torch.stack(report._replace(failure=failure, packets=packets))
+        report = before.clone()
+        report[REPORT.cost], report[REPORT.reward], report[REPORT.packets] = cost, -cost, 0.0
+        report[REPORT.failure] = BAD_ACTION
+        return report
 
 
 class TorchReset:

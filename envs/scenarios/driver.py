@@ -158,12 +158,10 @@ def write_steering(kind: int, d: Draws, profile: Vector) -> None:
         d: `Draws`.
         profile: Array for the profile, at least STEERING_WIDTH long.
     """
-    for i in range(SINES):
-        _write_sine(profile, i, 0.0, 0.0, 0.0, 0.0)
+    for i in range(STEERING_WIDTH):
+        profile[i] = 0.0
     for i in range(STEPS):
         _write_step(profile, i, 0.0, 0.0, 1.0)
-    for i in range(_RAMP_START, STEERING_WIDTH):
-        profile[i] = 0.0
     a = select(d.side < 0.5, -d.amplitude, d.amplitude)
     start = round_to_ticks(d.onset)
     if kind == SINE:

@@ -15,14 +15,7 @@ from ..record import Array
 from ..sensors.inertial import Noise
 from ..sensors.slow import HDOP_LAWS
 from ..ticks import TICK
-from ..validation import (
-    check_choice,
-    check_number,
-    describe_unknown,
-    is_finite,
-    quantity,
-    short_repr,
-)
+from ..validation import check_choice, describe_unknown, is_finite, quantity, short_repr
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import TYRE_LAWS
 from .driver import STEERING_KINDS
@@ -93,8 +86,8 @@ def _check_mapping(name: str, values: object) -> None:
         raise ValueError("vehicle has no friction here: the scenario's `friction` is the road's")
     if unknown := [key for key in values if key not in known]:
         raise TypeError(describe_unknown(f"parameter of {name}", unknown, known))
-    for key in values if name == "noise" else ():
-        check_number(f"noise {key}", values[key])
+    if name == "noise" and (bad := [key for key in values if not is_finite(values[key])]):
+        raise ValueError(f"noise {bad[0]} {short_repr(values[bad[0]])} is not finite")
 
 
 @dataclass(frozen=True, kw_only=True)

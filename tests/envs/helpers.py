@@ -27,22 +27,11 @@ SILENT: dict[str, float] = dict.fromkeys(Noise._fields, 0.0)
 """Sensors without noise."""
 
 LINEAR: dict[str, Any] = {
-    "base": "straight",
-    "mirror": False,
-    "speed": 25.0 / 3.6,
-    "friction": 0.9,
-    "front_stiffness": 1.0,
-    "rear_stiffness": 1.0,
-    "disturbance_force": 0.0,
-    "disturbance_moment": 0.0,
-    "small_angle": True,
-    "tyres": "linear",
-    "lags": False,
-    "roll": False,
-    "hdop": 1.0,
-    "hdop_spread": 0.0,
-    "noise": SILENT,
-}
+    "base": "straight", "mirror": False, "speed": 25.0 / 3.6, "friction": 0.9,
+    "front_stiffness": 1.0, "rear_stiffness": 1.0, "disturbance_force": 0.0,
+    "disturbance_moment": 0.0, "small_angle": True, "tyres": "linear", "lags": False,
+    "roll": False, "hdop": 1.0, "hdop_spread": 0.0, "noise": SILENT,
+}  # fmt: skip
 """The papers' plant: nothing drawn, nothing disturbed, sensors without noise."""
 
 BAD_ACTIONS: list[tuple[Any, str]] = [

@@ -1,5 +1,6 @@
 """`sideslip lane` on rendered pictures and films, whole and broken."""
 
+import dataclasses
 import json
 import os
 import struct
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
+from sideslip.envs.io import write_document
 from sideslip.envs.sensors.camera.images import Pinhole, RoadRenderer, RoadScene
 from tests.benchmarks.conftest import Run
 
@@ -24,7 +26,7 @@ WIDE = ("--lane-width", 3.5)
 
 @pytest.fixture
 def camera(tmp_path: Path) -> Path:
-    CAMERA.write(tmp_path / "camera.json")
+    write_document(tmp_path / "camera.json", dataclasses.asdict(CAMERA))
     return tmp_path / "camera.json"
 
 

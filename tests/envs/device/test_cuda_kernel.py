@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -85,27 +84,6 @@ def test_each_gpu_has_its_own_file(folder: Path) -> None:
     assert cuda_env.get_ptx(how(), np.float64, (8, 0)) == "text 2"
     assert cuda_env.get_ptx(how(), np.float32, H200) == "text 3"
     assert len(list(folder.iterdir())) == 3
-
-
-@pytest.mark.parametrize(
-    "left",
-    [
-        lambda whole: b"",
-        lambda whole: whole[:4],
-        lambda whole: whole[:-1],
-        lambda whole: whole[:-6] + b"\xfftext1",
-        lambda whole: b"\xff",
-        lambda whole: b"// another key\nPTX of another GPU",
-    ],
-)
-def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
-    folder: Path, left: Callable[[bytes], bytes]
-) -> None:
-    cuda_env.get_ptx(how(), np.float64, H200)
-    (path,) = folder.iterdir()
-    path.write_bytes(left(path.read_bytes()))
-    assert cuda_env.get_ptx(how(), np.float64, H200) == "text 2"
-    assert path.read_bytes().endswith(b"text 2")
 
 
 @pytest.mark.plain

@@ -162,7 +162,7 @@ def test_a_name_is_the_scenario_and_a_base(name: str) -> None:
         ({"speed": -1.0}, "speed must not be negative"),
         ({"speed": (9.0, 8.0)}, r"speed \(9.0, 8.0\)"),
         ({"front_stiffness": (-0.1, 1.0)}, "front_stiffness must be positive"),
-        ({"noise": {"gyro": math.nan}}, "noise gyro nan is no finite number"),
+        ({"noise": {"gyro": math.nan}}, "noise gyro nan is not finite"),
         ({"tyres": "magic"}, "unknown tyres 'magic'; known: linear, fiala, dugoff, magic-formula"),
         ({"tier": "3"}, "unknown tier '3'; known: , 1, 2a, 2b, 2c"),
         ({"hdop_law": "squared"}, "unknown hdop_law 'squared'; known: constant, half, table"),

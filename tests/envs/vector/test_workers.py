@@ -1,4 +1,4 @@
-"""Environments in other processes: spawned by hand, and by stable-baselines3's vector env."""
+"""Environments in other processes are the same."""
 
 import os
 import subprocess
@@ -39,34 +39,11 @@ if __name__ == "__main__":
     print("the same everywhere")
 """
 
-SUBPROC = """
-import numpy
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-def drive(name, kind, how):
-    env = make_vec_env("sideslip:" + name, n_envs=2, seed=5, vec_env_cls=kind, vec_env_kwargs=how)
-    rows = [env.reset()]
-    for k in range(30):
-        actions = numpy.full((2, *env.action_space.shape), 0.1 * k - 1.0, "f")
-        obs, rewards, dones, infos = env.step(actions)
-        rows += [obs, rewards.astype("f"), dones]  # one of the two keeps rewards in 32 bits
-    assert env.get_attr("control_period") == [10, 10]
-    env.close()
-    return [row.tobytes() for row in rows]
-
-if __name__ == "__main__":
-    for name in {ids}:
-        here = drive(name, DummyVecEnv, {})
-        assert drive(name, SubprocVecEnv, {"start_method": "{method}"}) == here
-    print("the same everywhere")
-"""
-
-
-def run(folder: Path, script: str, ids: tuple[str, ...], method: str) -> str:
-    """Run a script in a fresh interpreter that finds the same `sideslip`."""
+def run(folder: Path, ids: tuple[str, ...], method: str) -> str:
+    """Run the script in a fresh interpreter that finds the same `sideslip`."""
     path = folder / "script.py"
-    path.write_text(script.replace("{ids}", repr(ids)).replace("{method}", method))
+    path.write_text(SPAWN.replace("{ids}", repr(ids)).replace("{method}", method))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(
         [sys.executable, str(path)], cwd=folder, env=environment, capture_output=True, text=True
@@ -77,19 +54,10 @@ def run(folder: Path, script: str, ids: tuple[str, ...], method: str) -> str:
 
 @pytest.mark.smoke
 def test_a_spawned_process_makes_unpickles_and_drives_the_same(tmp_path: Path) -> None:
-    assert run(tmp_path, SPAWN, IDS[:1], "spawn") == "the same everywhere"
+    assert run(tmp_path, IDS[:1], "spawn") == "the same everywhere"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
 def test_so_does_every_id_and_way_of_starting(method: str, tmp_path: Path) -> None:
-    assert run(tmp_path, SPAWN, IDS, method) == "the same everywhere"
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("method", ["spawn", "forkserver"])
-def test_stable_baselines_subprocesses_equal_its_single_process(
-    method: str, tmp_path: Path
-) -> None:
-    pytest.importorskip("stable_baselines3")
-    assert run(tmp_path, SUBPROC, IDS, method) == "the same everywhere"
+    assert run(tmp_path, IDS, method) == "the same everywhere"
