@@ -244,9 +244,8 @@ def _to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
             _set_precision(rebuilt, real)
         return rebuilt if SIMULATED else _device_jit(rebuilt)
 
-    if not SIMULATED:
-        return as_python(function, _make_table(real), finish)
-    return as_python(function, _SINGLE if real is np.float32 else None, finish)
+    simulated = _SINGLE if real is np.float32 else None
+    return as_python(function, simulated if SIMULATED else _make_table(real), finish)
 
 
 _device_jit: Any = functools.partial(cuda.jit, device=True, forceinline=True)

@@ -1,10 +1,10 @@
 """Without a driver, without memory, on another GPU: the CUDA engine says what is missing."""
 
 import re
-from collections.abc import Callable
 from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -42,45 +42,29 @@ def test_rows_that_do_not_fit_are_refused_with_how_many_would(
 
 
 @pytest.fixture
-def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
-    """A driver that notes its calls, and answers with a code where it is asked to."""
-    from cuda.bindings import driver as real
-
-    fine = real.CUresult.CUDA_SUCCESS
-    calls: dict[str, Any] = {}
-
-    def fake(**codes: str) -> SimpleNamespace:
-        def answers(name: str, *result: Any) -> Callable[..., Any]:
-            def called(*arguments: Any) -> Any:
-                calls[name] = arguments
-                return (getattr(real.CUresult, codes[name]) if name in codes else fine, *result)
-
-            return called
-
-        return SimpleNamespace(
-            CUresult=real.CUresult,
-            calls=calls,
-            cuModuleLoadData=answers("cuModuleLoadData", "module"),
-            cuModuleGetFunction=answers("cuModuleGetFunction", "function"),
-            cuLaunchKernel=answers("cuLaunchKernel"),
-        )
+def driver(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A driver that agrees to everything and remembers what it was called with."""
+    from cuda.bindings.driver import CUresult
 
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     stream = SimpleNamespace(cuda_stream=77)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
     monkeypatch.setattr(torch, "empty", lambda *size, device: None)
+    fake = Mock(CUresult=CUresult)
+    fake.cuModuleLoadData.return_value = CUresult.CUDA_SUCCESS, "module"
+    fake.cuModuleGetFunction.return_value = CUresult.CUDA_SUCCESS, "function"
+    fake.cuLaunchKernel.return_value = (CUresult.CUDA_SUCCESS,)
     return fake
 
 
 def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(driver: Any) -> None:
-    fake = driver()
-    loaded = cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), fake)
-    assert fake.calls["cuModuleLoadData"] == (b"// PTX\0",)
-    assert fake.calls["cuModuleGetFunction"] == ("module", b"sideslip_step")
+    loaded = cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), driver)
+    driver.cuModuleLoadData.assert_called_once_with(b"// PTX\0")
+    driver.cuModuleGetFunction.assert_called_once_with("module", b"sideslip_step")
     arrays = [torch.zeros(3), torch.zeros(0)]
     loaded(cuda_env.BLOCK + 1, True, arrays)
-    function, *grid = fake.calls["cuLaunchKernel"]
+    function, *grid = driver.cuLaunchKernel.call_args.args
     assert function == "function"
     assert grid[:8] == [2, 1, 1, cuda_env.BLOCK, 1, 1, 0, 77]
     values, kinds = grid[8]
@@ -97,6 +81,6 @@ def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(drive
     ],
 )
 def test_what_the_driver_refuses_is_said(driver: Any, call: str, code: str, error: Any) -> None:
-    fake = driver(**{call: code})
+    getattr(driver, call).return_value = (getattr(driver.CUresult, code),)
     with pytest.raises(error, match=f"on cuda:0: {code}"):
-        cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])
+        cuda_env._DriverKernel("// PTX", torch.device("cuda:0"), driver)(5, False, [])
