@@ -142,14 +142,10 @@ class StabilityVectorEnv(VectorRenderMixin, BatchEnv[npt.NDArray[Any]]):
     _spec: EnvSpec | None = None
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        info: str = "all",
-        render_mode: str | None = None,
-        max_episode_steps: int | None = None,
+        self, num_envs: int = 1, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        info: str = "all", render_mode: str | None = None, max_episode_steps: int | None = None,
         **arguments: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if info not in ("all", "ends"):
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
         self._all_infos, self._max_steps = info == "all", max_episode_steps

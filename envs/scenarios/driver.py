@@ -244,13 +244,9 @@ class DriverParams(NamedTuple):
 
 @jit
 def compute_target_angle(
-    motion: Motion,
-    path: TrackPath,
-    road: RoadParams,
-    target: "ReferenceParams",
-    driver: DriverParams,
-    stop: Scalar,
-) -> Scalar:
+    motion: Motion, path: TrackPath, road: RoadParams, target: "ReferenceParams",
+    driver: DriverParams, stop: Scalar,
+) -> Scalar:  # fmt: skip
     """Compute the steering angle (rad) that brings the car onto the path, within +-stop.
 
     Args:
@@ -276,14 +272,9 @@ def compute_target_angle(
 
 @jit
 def compute_driver_angle(
-    angle: Scalar,
-    motion: Motion,
-    path: TrackPath,
-    road: RoadParams,
-    target: "ReferenceParams",
-    driver: DriverParams,
-    stop: Scalar,
-) -> Scalar:
+    angle: Scalar, motion: Motion, path: TrackPath, road: RoadParams, target: "ReferenceParams",
+    driver: DriverParams, stop: Scalar,
+) -> Scalar:  # fmt: skip
     """Compute the driver's steering angle (rad) a tick later.
 
     Args:

@@ -179,11 +179,9 @@ class RoadRenderer:
     """
 
     def __init__(
-        self,
-        camera: Pinhole,
-        appearance: Appearance | None = None,
+        self, camera: Pinhole, appearance: Appearance | None = None,
         rows: tuple[int, int] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.camera, self.appearance = camera, appearance or Appearance()
         self.rows = slice(*(rows or (0, camera.size[1])))
         self._rays = np.array(_compute_rays(camera, self.rows), np.float32)

@@ -200,13 +200,9 @@ class LaneFinder:
     """
 
     def __init__(
-        self,
-        camera: Pinhole,
-        lane_width: float = 3.5,
-        near: float = 3.5,
-        far: float = 24.0,
+        self, camera: Pinhole, lane_width: float = 3.5, near: float = 3.5, far: float = 24.0,
         view: FieldOfView | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not (0.0 < near < far and 0.0 < lane_width < _SEARCHED):
             rule = f"expected 0 < near < far, and a lane's width below {_SEARCHED} m"
             raise ValueError(f"{rule}, got {near}, {far} and {lane_width} m")
