@@ -219,7 +219,7 @@ def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> Infos:
         reports: Reports, shape (N, len(StepReport)).
         rows: Rows that are reported, shape (N,); the others have zeros.
     """
-    columns = np.where(rows, reports.T, 0.0)
+    columns = np.where(rows[:, None], reports, 0.0).T.copy()  # each key contiguous
     failure = columns[REPORT.failure].astype(np.int64)
     success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
     values = (*columns[: len(_NUMBERS)], failure, success)

@@ -11,7 +11,7 @@ from ..engine.config import EpisodeConfig
 from ..engine.step import get_start_variant
 from ..numerics.torch_backend import DTYPES, torch
 from ..task import REPORT, RUNNING, Infos, StepReport
-from ..validation import Mask, parse_actions, short_repr
+from ..validation import Mask, check_mapping, parse_actions, short_repr
 from ..vector import make_rows
 
 Tensor = torch.Tensor
@@ -44,8 +44,6 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         arguments: Arguments of `StabilityEnv`.
         is_uniform: Whether scenario and vehicle may not be lists (N,).
     """
-
-    _snapshot_type: type = Mapping
 
     def __init__(
         self, num_envs: int, device: str | torch.device, dtype: str | torch.dtype,
@@ -109,11 +107,7 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         Raises:
             ValueError: For one of other rows, sizes, plant or engine.
         """
-        kind = self._snapshot_type
-        if not isinstance(snapshot, kind):
-            what = f"a {kind.__name__ if issubclass(kind, tuple) else 'mapping'}"
-            raise ValueError(f"a snapshot of this engine is {what}, got {short_repr(snapshot)}")
-        self._restore(snapshot)
+        self._restore(check_mapping("a snapshot", snapshot))
 
     @abstractmethod
     def _advance(self, actions: Any) -> StepEnds:
@@ -148,7 +142,7 @@ class TensorVectorEnv(BatchEnv[Tensor]):
         """Get the true motion, (len(Motion), N)."""
 
     @abstractmethod
-    def _restore(self, snapshot: Any) -> None:
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this engine."""
 
     @abstractmethod

@@ -12,10 +12,10 @@ import ctypes
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -173,16 +173,6 @@ _NEW_ARRAYS = ("actions", "rewards", "terminated", "truncated", "final_obs", "fi
 _TORCH = {np.uint8: torch.uint8, np.int64: torch.int64, np.float32: torch.float32}
 
 
-class Snapshot(NamedTuple):
-    """Snapshot of all rows of a `CudaVectorEnv`."""
-
-    num_envs: int
-    constants: KernelConstants
-    dtype: torch.dtype
-    started: bool
-    memory: DeviceArrays
-
-
 class CudaVectorEnv(TensorVectorEnv):
     """`TensorVectorEnv` on a GPU, one CUDA thread a row and one kernel a step.
 
@@ -207,7 +197,6 @@ class CudaVectorEnv(TensorVectorEnv):
         MemoryError: Where the rows do not fit.
     """
 
-    _snapshot_type = Snapshot
     _has_over = True  # for all that the host knows
 
     def __init__(
@@ -290,17 +279,21 @@ class CudaVectorEnv(TensorVectorEnv):
         results = m.obs, m.rewards, m.terminated, m.truncated, m.rows, m.packets
         return (m.states, m.reports, m.over), results
 
-    def get_state(self) -> Snapshot:
+    def get_state(self) -> dict[str, Any]:
         """Copy the state of all rows, on the device."""
         memory = DeviceArrays(*(array.clone() for array in self._memory))
-        return Snapshot(self.num_envs, self._constants, self.dtype, self._started, memory)
+        return {"batch": self._describe_batch(), "started": self._started, "memory": memory}
 
-    def _restore(self, snapshot: Snapshot) -> None:
-        snapshot_facts, own_facts = snapshot[:3], (self.num_envs, self._constants, self.dtype)
-        if snapshot_facts != own_facts:
-            raise ValueError(f"the snapshot is of other rows, {snapshot_facts}, not {own_facts}")
-        self._memory = DeviceArrays(*(x.to(self.device, copy=True) for x in snapshot.memory))
-        self._started = snapshot.started
+    def _restore(self, snapshot: Mapping[str, Any]) -> None:
+        batch, own_batch = snapshot.get("batch"), self._describe_batch()
+        if batch != own_batch:
+            raise ValueError(f"the snapshot is of other rows, {batch}, not {own_batch}")
+        self._memory = DeviceArrays(*(x.to(self.device, copy=True) for x in snapshot["memory"]))
+        self._started = snapshot["started"]
+
+    def _describe_batch(self) -> tuple[int, KernelConstants, torch.dtype]:
+        """Describe what a snapshot has to have in common with the env."""
+        return self.num_envs, self._constants, self.dtype
 
 
 def _read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:

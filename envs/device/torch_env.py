@@ -411,6 +411,8 @@ class DeviceVectorEnv(TensorVectorEnv):
         return super().get_state()
 
     def _restore(self, snapshot: Mapping[str, Any]) -> None:
+        if "configs" not in snapshot:
+            raise ValueError("the snapshot is of engine='cuda'")
         capacities = self._extend_capacities(self._rows.capacities, snapshot["configs"])
         BatchEnv.set_state(self, snapshot)
         self._build(capacities)

@@ -143,7 +143,7 @@ def test_a_plant_of_another_kind_is_refused_and_nothing_is_reset() -> None:
         env.set_state(after)
     with pytest.raises(ValueError, match="the snapshot has 3 rows"):
         env.set_state(make_device_env(FUSION, 3).get_state())
-    with pytest.raises(ValueError, match=r"a snapshot of this engine is a mapping, got \(1, 2\)"):
+    with pytest.raises(TypeError, match=r"a snapshot is a mapping, got \(1, 2\)"):
         env.set_state((1, 2))
 
 
