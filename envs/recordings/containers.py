@@ -341,7 +341,8 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
             if connection.id not in decoders:
                 decoders[connection.id] = _make_decoder(connection)
             message = decoders[connection.id](data)
-            captured = _read_stamp(message) or logged
+            stamp = getattr(getattr(message, "header", None), "stamp", None)
+            captured = (stamp and stamp.sec * 10**9 + stamp.nanosec) or logged
             for name in fields[connection.topic]:
                 channel = channels[f"{connection.topic}:{name}"]
                 channel.values.append(_read_field(message, connection.topic, name))
@@ -349,16 +350,15 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
                 channel.late.append(1e-9 * (logged - captured))
     columns = {label: (x.stamps, x.values) for label, x in channels.items()}
     longest = max((max(map(abs, x.late)) for x in channels.values() if x.late), default=0.0)
-    for name, label in mapping.items():
+    is_live = longest <= _LONGEST_LATENCY  # no copy of a log, whose clock is another
+    for name, label in mapping.items() if is_live else ():
         stamps, late = channels[label].stamps, channels[label].late
-        for sensor, (first, *_) in SENSORS.items() if longest <= _LONGEST_LATENCY else ():
+        for sensor, (first, *_) in SENSORS.items():
             if name.startswith(f"{first}_") and any(late):
                 columns.setdefault(f"{LATENCIES[sensor]}_s", (stamps, late))
     table = _join_channels(columns, {}, [f"{topic}:..." for topic in topics])
-    if longest <= _LONGEST_LATENCY:
-        return table
     remark = f"The log's time is up to {longest:.6g} s beside the headers': samples are punctual."
-    return table._replace(remarks=[remark])
+    return table if is_live else table._replace(remarks=[remark])
 
 
 def _make_decoder(connection: "Connection") -> Callable[[bytes], Any]:
@@ -377,12 +377,6 @@ def _make_decoder(connection: "Connection") -> Callable[[bytes], Any]:
     decoder = DecoderFactory().decoder_for("cdr", schema)
     assert decoder is not None  # of this encoding there is one
     return decoder
-
-
-def _read_stamp(message: object) -> int:
-    """Read a header's stamp (ns), 0 without one."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return 0 if stamp is None else int(stamp.sec * 10**9 + stamp.nanosec)
 
 
 def _read_field(message: object, topic: str, field: str) -> float:

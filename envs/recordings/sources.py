@@ -116,11 +116,8 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
     if not counts.received:
         raise ValueError(f"{path}: the file is empty")
     if not counts.sentences:
-        raise ValueError(
-            f"{path}: no valid NMEA sentence in {counts.received} bytes; {counts.bad_checksum} "
-            f"with a bad checksum, {counts.unchecked} without a checksum, "
-            f"{counts.truncated} cut short, {counts.overlong} overlong"
-        )
+        received = ", ".join(f"{n} {what}" for what, n in counts.rows() if n)
+        raise ValueError(f"{path}: no valid NMEA sentence in {received}")
     if not any(epoch.has_fix and epoch.t == epoch.t for epoch in epochs):
         lacks = "both a fix and a time" if any(epoch.has_fix for epoch in epochs) else "a fix"
         kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.sentences.items()))

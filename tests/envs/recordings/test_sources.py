@@ -157,8 +157,11 @@ def test_a_text_of_another_form_is_refused(text: str) -> None:
     [
         (b"", "the file is empty"),
         (bytes(range(256)) * 100, "no valid NMEA sentence in 25600 bytes"),
-        (rmc().replace(b"48", b"49") * 3, "3 with a bad checksum"),
-        (gga().split(b"*")[0] + b"\r\n" + gga()[:30], "1 without a checksum, 1 cut short"),
+        (rmc().replace(b"48", b"49") * 3, "3 sentences with a bad checksum"),
+        (
+            gga().split(b"*")[0] + b"\r\n" + gga()[:30],
+            "1 sentences cut short, 1 sentences without a checksum",
+        ),
         (rmc(status="V") + gga(quality="0"), "none of 1 epochs has a fix; sentences: 1 GGA, 1 RMC"),
         (rmc("") + gga(""), "none of 1 epochs has both a fix and a time"),
         (sentence("GPGSV,1,1,00") * 3, "none of 0 epochs has a fix; sentences: 3 GSV"),
