@@ -132,10 +132,9 @@ class _AttachedParameters:
         selected[rows] = True
         for masks, *_ in self._held:
             masks.update({place: mask & ~selected for place, mask in masks.items()})
-        # under the right wheels the friction is the vehicle's where the scenario has none for them
-        is_single = [config.scenario.friction_right is None for config in configs]
         masks = dict.fromkeys(_find_places(parameters, configs[0]), selected)
-        if P.car.mu_r in masks:
+        if P.car.mu_r in masks:  # it is the vehicle's where the scenario has none of its own
+            is_single = [config.scenario.friction_right is None for config in configs]
             masks[P.car.mu_r] = selected & torch.tensor(is_single, device=rows.device)
         held = [*self._held, (masks, list(configs), parameters)]
         self._held = [entry for entry in held if any(mask.any() for mask in entry[0].values())]

@@ -144,11 +144,7 @@ def _sort_packets(queue: Tensor) -> Tensor:
     arrived = stamps[:, PACKET.arrived]
     key = (arrived << 32) + len(Z.slow) * stamps[:, PACKET.captured] + stamps[:, PACKET.sensor]
     key = torch.where(queue[:, PACKET.arrived] == NEVER, _NEVER_KEY, key)
-    place = torch.arange(len(queue), device=queue.device)[:, None]
-    row_key, column_key = key[:, None], key[None]
-    is_before = (column_key < row_key) | ((column_key == row_key) & (place[None] < place[:, None]))
-    rank = is_before.sum(1)
-    order = torch.empty_like(rank).scatter_(0, rank, place.expand_as(rank))
+    order = key.argsort(stable=True, dim=0)
     return queue.gather(0, order[:, None].expand(-1, PACKET_WIDTH, -1))
 
 

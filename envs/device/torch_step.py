@@ -386,18 +386,15 @@ class TorchReset:
 
     def _rewind_sensors(self, p: Tensor, keys: Tensor, slow: Tensor) -> Tensor:
         """Compute the slow sensors' state before tick 0 from that after it."""
-        sensors = list(slow.unbind(0))
-        for i in self._step.sensors:
-            after, sky = sensors[i], self._functions.read(p, P.sky)
-            period = self._functions.read(p, P.slow[i]).period
-            before = list(torch.zeros_like(after).unbind(0))
-            elapsed = after[SLOW_STATE.frames] * period
-            before[SLOW_STATE.next_capture] = after[SLOW_STATE.next_capture] - elapsed
-            before[SLOW_STATE.captured] = before[SLOW_STATE.captured] + NEVER
-            drift = self._functions.draw_first_drift(i, sky, *keys)
-            before[SLOW_STATE.drift] = before[SLOW_STATE.drift] + drift
-            sensors[i] = torch.stack(before)
-        return torch.stack(sensors)
+        functions, sensors, rewound = self._functions, list(self._step.sensors), slow.clone()
+        rewound[sensors] = 0.0
+        for i in sensors:
+            elapsed = slow[i, SLOW_STATE.frames] * functions.read(p, P.slow[i]).period
+            rewound[i, SLOW_STATE.next_capture] = slow[i, SLOW_STATE.next_capture] - elapsed
+            rewound[i, SLOW_STATE.captured] = NEVER
+            drift = functions.draw_first_drift(i, functions.read(p, P.sky), *keys)
+            rewound[i, SLOW_STATE.drift] = drift
+        return rewound
 
 
 def _make_tick_state(state: TorchState, alive: Tensor) -> _TickState:
