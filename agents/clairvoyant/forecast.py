@@ -121,14 +121,11 @@ class Forecast:
 
 
 def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
-    """Make the forecast of an episode whose lead-in, if it has one, just ended.
+    """Make the forecast of an episode, whose lead-in just ended if it has one, to its end.
 
     Args:
         base: Unwrapped env at the manoeuvre's start.
         actions: Actions of a run, shape (K, width), to which driver and place react; None: zeros.
-
-    Returns:
-        Forecast from the manoeuvre's start to the episode's end.
 
     Raises:
         ValueError: The env is elsewhere in its episode.
@@ -430,9 +427,6 @@ def linearise(problem: IlqrProblem, known: Array, run: PlanRun) -> Linearisation
         problem: Functions of the episode.
         known: Columns of `PreviewStep`, shape (len(PreviewStep), K + 1).
         run: States and actions.
-
-    Returns:
-        Derivatives along the run, in scaled states and fractions of full scale.
     """
     size, K = len(problem.names), problem.fixed.periods
     n_used, n = size + problem.fixed.width, size + N_INPUTS

@@ -284,9 +284,6 @@ def compute_clairvoyant(
         env: Single env.
         seed: Seed of the episode.
         starts: Actions after the lead-in, shape (K, width), by method; None: zeros alone.
-
-    Returns:
-        Actions of the least cost, and the costs of all candidates.
     """
     start_time, base, env = time.process_time(), _get_base(env), _ManoeuvreEnv(env)
     env.reset(seed=seed)

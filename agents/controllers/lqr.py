@@ -172,15 +172,12 @@ class Lqr(Controller):
         return ()
 
     def gains(self, speed: float, front: float | None = None, rear: float | None = None) -> Array:
-        """Compute the gains K, shape (m, n).
+        """Compute the gains K on the states of the design, shape (m, n).
 
         Args:
             speed: Speed (m/s).
             front: Front cornering stiffness of a tyre (N/rad) for scheduled gains; None: the car's.
             rear: Rear cornering stiffness of a tyre (N/rad), likewise.
-
-        Returns:
-            Gains on the states of the design.
         """
         stiffness = front or self.vehicle.front_stiffness, rear or self.vehicle.rear_stiffness
         return self._interpolate(speed, *stiffness)[:, : len(self.design_spec.states)]

@@ -403,9 +403,6 @@ class Nmpc(Lqr):
 
         Args:
             state: Memory, shape (N, memory).
-
-        Returns:
-            Names, one for each row.
         """
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 

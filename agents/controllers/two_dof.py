@@ -57,9 +57,6 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
             their damping would be below a half. "real": k k_p = pole (p_2 - pole) puts one of two
             real poles there, or both at p_2 / 2 where pole is beyond p_2.
 
-    Returns:
-        Gains k_p (N m/rad) and k_i (N m/(rad s)).
-
     Raises:
         ValueError: The placement is unknown, or the pole is not positive.
     """

@@ -117,15 +117,12 @@ class DesignModel:
 
 
 def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
-    """Make the model of a vehicle at a speed.
+    """Make the model of a vehicle at a speed, in steps of `design_spec.period` ticks.
 
     Args:
         vehicle: Vehicle of the design.
         speed: Speed (m/s).
         design_spec: Parameters of the design.
-
-    Returns:
-        Model in steps of `design_spec.period` ticks.
     """
     G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
@@ -281,7 +278,7 @@ def make_gain_table(
     vehicle: Vehicle, spec: DesignSpec, speeds: Sequence[float], fronts: Sequence[float],
     rears: Sequence[float],
 ) -> GainTables:  # fmt: skip
-    """Make the regulators of a car over speeds and stiffnesses.
+    """Make the regulators of a car over speed, front and rear stiffness.
 
     Args:
         vehicle: Vehicle of the design.
@@ -289,9 +286,6 @@ def make_gain_table(
         speeds: Speeds (m/s).
         fronts: Front stiffnesses (N/rad); empty: the vehicle's.
         rears: Rear stiffnesses (N/rad); empty: the vehicle's.
-
-    Returns:
-        Tables over speed, front and rear stiffness, in this order.
     """
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
     gains, terminal = [], []

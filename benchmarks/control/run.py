@@ -79,13 +79,10 @@ class DriveResult:
         return np.asarray(self["failure"] == 0.0)
 
     def mark_failures(self, cause: str) -> Array:
-        """Mark the episodes that ended by a failure.
+        """Mark the episodes that ended by a failure: 1, else 0, NaN where nothing was driven.
 
         Args:
             cause: Failure, of `FAILURES`.
-
-        Returns:
-            1 where it did, NaN where nothing was driven, shape (seeds,).
         """
         return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(cause))
 
@@ -138,13 +135,10 @@ class _MetricAccumulator:
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
-    """Drive one episode a seed.
+    """Drive one episode a seed; why an entry cannot be built or driven is the `error`.
 
     Args:
         chunk: Seeds of an entry.
-
-    Returns:
-        Episodes; why an entry cannot be built or driven is its `error`.
     """
     try:
         env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
@@ -169,7 +163,7 @@ def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
     return [float(step.info[name][0]) for name in _INFO] + place
 
 
-_STEPS = 200  # of a decision's time
+_STEPS = 200  # of which a decision's time is the median
 
 
 def _time_calls(owner: Any, name: str) -> list[float]:
@@ -187,13 +181,10 @@ def _time_calls(owner: Any, name: str) -> list[float]:
 
 
 def measure_decision_time(case: ControlCase) -> float:
-    """Measure the wall time of a decision of one car: predict, and the estimator's part.
+    """Measure the wall time (us) of a decision of one car: predict, and the estimator's part.
 
     Args:
         case: Task and who drives it.
-
-    Returns:
-        Wall time (us), of medians over _STEPS steps, the bare env stepped side by side.
     """
     env, agent = case.entry.make(case.task, 1)
     bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)

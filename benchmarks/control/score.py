@@ -43,9 +43,6 @@ def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
     Args:
         nominal: Costs of nominal on the same seeds, shape (n,).
         result: Episodes of at least as many seeds.
-
-    Returns:
-        Logarithms, shape (n,).
     """
     n = len(nominal)
     with np.errstate(invalid="ignore"):
@@ -82,14 +79,11 @@ class PairedDrives:
         return np.asarray(self.finished.all(axis=0))
 
     def compute_scores(self, loss: float = LOSS, floor_factor: float = 1.0) -> Array:
-        """Compute r of each drive.
+        """Compute r of each drive, shape (n,).
 
         Args:
             loss: r of a drive that nominal alone loses.
             floor_factor: Factor on J_0.
-
-        Returns:
-            Scores, shape (n,).
         """
         costs, nominal = self.costs + floor_factor * self.floor
         losses = loss * (self.finished[0].astype(np.float64) - self.finished[1])
@@ -128,14 +122,11 @@ class Standing:
         return {task: pair.compute_scores() for task, pair in self.pairs.items()}
 
     def compute_score(self, loss: float, floor_factor: float) -> float:
-        """Compute the score by other constants.
+        """Compute the score by other constants, NaN where nothing was driven.
 
         Args:
             loss: r of a drive that nominal alone loses.
             floor_factor: Factor on J_0.
-
-        Returns:
-            Mean of the tasks' means, NaN where none was driven.
         """
         means = [pair.compute_scores(loss, floor_factor).mean() for pair in self.pairs.values()]
         return float(np.mean(means)) if means else math.nan
@@ -190,13 +181,10 @@ class Standing:
         return sum(pair.n for pair in self.pairs.values())
 
     def mean(self, name: str) -> float:
-        """Average a metric over all tasks in which it means something.
+        """Average a metric over the tasks in which it means something, NaN without one.
 
         Args:
             name: Name of the metric, in `EPISODE`.
-
-        Returns:
-            Average; NaN without such a task.
         """
         turning = next(metric.turning for metric in EPISODE if metric.name == name)
         runs = self.drives.items()
@@ -236,14 +224,11 @@ def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
 
 
 def rank_entries(results: Results, tier: str | None) -> list[Standing]:
-    """Rank a tier's entries: last who leaves out tasks, then who surely loses more than nominal.
+    """Rank a tier's entries, the best first; last who surely loses more cars, or leaves out tasks.
 
     Args:
         results: Episodes.
         tier: Tier, None for all.
-
-    Returns:
-        Standings, the best first.
     """
     by_entry: dict[Entry, dict[ControlTask, DriveResult]] = {}
     for (task, entry), result in results.items():

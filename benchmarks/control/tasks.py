@@ -203,13 +203,10 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash of the entries' files, weights, the world's version and texts.
+    """Make the salt: a hash, in hexadecimal, of entries' files, weights, world version and texts.
 
     Args:
         more: Texts that belong to it.
-
-    Returns:
-        Hexadecimal digits.
     """
     digest = hashlib.sha256(str(WORLD_VERSION).encode())
     for folder, endings in _ENTRY_SOURCES.items():

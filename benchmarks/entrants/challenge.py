@@ -115,13 +115,10 @@ def make_user_entries(
 
 
 def choose_estimator(agent: str) -> str:
-    """Choose the estimator of an agent: a policy's own, none for what saw an env alone.
+    """Choose the estimator of an agent: a policy's own, "" for what saw an env alone.
 
     Args:
         agent: Name, file's class or path.
-
-    Returns:
-        Name of the estimator, "" for none.
     """
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
@@ -249,15 +246,12 @@ class BaselineRecord(TaskRecord):
 def make_baseline_cases(
     tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
 ) -> list[ControlCase]:
-    """Make the baselines' cases.
+    """Make the baselines' cases, task by task.
 
     Args:
         tasks: Tasks that every entry drives.
         agents: Whether an agent's rivals are among them.
         estimators: Whether an estimator's rivals are among them.
-
-    Returns:
-        Cases, task by task.
     """
     entries = (
         _BASELINES + (_AGENT_RIVALS if agents else ()) + (_FILTER_RIVALS if estimators else ())
@@ -275,7 +269,7 @@ def _read_baselines(path: Path = FILE) -> dict[tuple[ControlTask, Entry], Baseli
 def find_baselines(
     wanted: Sequence[ControlCase], n: int, **options: Any
 ) -> tuple[str, Results] | None:
-    """Find the stored episodes of baselines, if each baseline has n of them.
+    """Find the salt and stored episodes of baselines, if each baseline has n of them.
 
     None, too, if a sample driven again (`_SAMPLE` episodes of each case, of slow entries the first
     alone) no longer reproduces any stored cost of a baseline.
@@ -284,9 +278,6 @@ def find_baselines(
         wanted: Cases to look up.
         n: Number of episodes of each.
         options: Options of `measure`.
-
-    Returns:
-        Salt and episodes, or None.
     """
     records = _read_baselines(FILE) if FILE.is_file() else {}
     matches = {case: records[case] for case in wanted if case in records}

@@ -217,9 +217,6 @@ def score(
         limit: As in `ComparisonRequest`.
         trust: Whether a policy's zip may be read, which can run code.
         jobs: Number of processes, None for all processors.
-
-    Returns:
-        Score over all tasks, and that of each task.
     """
     is_single = isinstance(scenarios, str | os.PathLike | Mapping)
     scenario_list = (scenarios,) if is_single else tuple(scenarios)

@@ -258,13 +258,10 @@ class IsolatedDrive:
         return self._run(chunk)[0]
 
     def rehearse(self, chunk: Chunk) -> set[str]:
-        """Run a chunk.
+        """Run a chunk; return the files that its entries open.
 
         Args:
             chunk: Chunk whose entry has names and files.
-
-        Returns:
-            Files that its entries open.
         """
         return self._run(chunk)[1]
 

@@ -189,9 +189,6 @@ def simulate(
         title: Title of the progress bar.
         jobs: Processes, None for all processors.
         console: Where progress is shown.
-
-    Returns:
-        Drives of the first scenario, then those of the next one.
     """
     fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
