@@ -27,7 +27,6 @@ ENTRIES = (
     *(Entry(REFERENCE_CONTROLLER, name) for name in _FILTERS),
 )  # the entries whose order is checked
 FACTORS = (0.0, 2.0)  # of a group's ranges about the ideal
-EPISODES, TASKS = 16, 12
 
 
 def _compare_scores(results: Results) -> dict[tuple[str, str], Estimate]:
@@ -55,7 +54,7 @@ def _list_reversals(
 
 
 def _main(
-    episodes: int = EPISODES, tasks: int = TASKS, jobs: int | None = None, keep: Path | None = None
+    episodes: int = 16, tasks: int = 12, jobs: int | None = None, keep: Path | None = None
 ) -> None:
     """Drive all entries in the benchmark's world and in those of other ranges; list reversals."""
     console, scored = Console(), list_scored_tasks()

@@ -197,8 +197,6 @@ def measure_decision_time(case: ControlCase) -> float:
 
 
 CHUNK = 64  # episodes of a finished case at most: a longer run takes up the cases of a shorter one
-
-
 Results = dict[tuple[ControlTask, Entry], DriveResult]  # episodes by task and entry
 
 

@@ -235,13 +235,6 @@ class BaselineRecord(TaskRecord):
         """Who drove these episodes, in which task."""
         return ControlCase(self.task, Entry(self.controller, self.estimator))
 
-    def _make_drives(self, n: int) -> DriveResult:
-        """Make the first n episodes; what is not on file is NaN."""
-        numbers = np.full((n, len(NUMBERS)), np.nan)
-        numbers[:, NUMBERS.index("cost")] = self.costs[:n]
-        numbers[:, NUMBERS.index("failure")] = self.failures[:n]
-        return DriveResult(numbers)
-
 
 def make_baseline_cases(
     tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
@@ -253,9 +246,7 @@ def make_baseline_cases(
         agents: Whether an agent's rivals are among them.
         estimators: Whether an estimator's rivals are among them.
     """
-    entries = (
-        _BASELINES + (_AGENT_RIVALS if agents else ()) + (_FILTER_RIVALS if estimators else ())
-    )
+    entries = _BASELINES + _AGENT_RIVALS * agents + _FILTER_RIVALS * estimators
     return [ControlCase(task, entry) for task in tasks for entry in entries]
 
 
@@ -295,7 +286,13 @@ def find_baselines(
         # a controller changes every drive.
         if result.error or not same.any():
             return None
-    return salt, {case: record._make_drives(n) for case, record in matches.items()}
+    results: Results = {}
+    for case, record in matches.items():
+        numbers = np.full((n, len(NUMBERS)), np.nan)  # of all that is not on file
+        numbers[:, NUMBERS.index("cost")] = record.costs[:n]
+        numbers[:, NUMBERS.index("failure")] = record.failures[:n]
+        results[case] = DriveResult(numbers)
+    return salt, results
 
 
 def _write_baselines(path: Path = FILE) -> None:

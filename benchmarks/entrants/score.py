@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _NONE = Estimate(math.nan)
 _COLUMNS = dict(score="score", cost="cost_vs_nominal", won="share_won", failures="failure_rate")
+_MAX_SENTENCES = 4  # entries with a sentence
 _REHEARSED = 2  # episodes of a task in which entries show what they open
 
 
@@ -91,9 +92,6 @@ def _find_opened_files(
     chunks = [Chunk(*case, tuple(make_tuning_seeds(_REHEARSED))) for case in cases]
     opened = options.run_cases(IsolatedDrive(request.limit).rehearse, chunks, "rehearsal")
     return frozenset().union(*opened, map(os.path.realpath, request.files))
-
-
-_MAX_SENTENCES = 4  # entries with a sentence
 
 
 def _compose_verdict(comparison: Comparison) -> list[str]:
@@ -243,9 +241,6 @@ def score(
     return Score(*names, total, cost, won, failures, n, tasks, error, _make_sentence(standing))
 
 
-_TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
-
-
 def run(request: ComparisonRequest, options: Request) -> Suite:
     """Drive a request and make its suite.
 
@@ -254,7 +249,8 @@ def run(request: ComparisonRequest, options: Request) -> Suite:
         options: Processes, progress, and the folder of the baselines' finished cases.
     """
     comparison = _compare(request, options)
-    suite = Suite("control", "Your own beside the package's", _TEXT)
+    text = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
+    suite = Suite("control", "Your own beside the package's", text)
     suite.verdict = "\n".join(_compose_verdict(comparison))
     title = "Your entries and the package's"
     suite.tables = [

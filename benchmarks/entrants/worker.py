@@ -36,6 +36,7 @@ from ...estimators.vector.batch import ForeignBatch
 from ..control.run import NUMBERS, Chunk, DriveResult, run_chunk
 from .child import DONE, ChildSettings
 
+LIMIT = 600.0  # s of wall time a cell
 _GRACE = 60.0  # s to start in
 _LONGEST = 2**16  # bytes of an answer beside its numbers
 _START = f"from {__package__}.child import main; main()"
@@ -152,9 +153,6 @@ def _find_place(texts: Sequence[str], stack: str) -> str:
         if any(Path(file).name in text for text in texts):
             return f", still in {Path(file).name}, line {line}"
     return ""
-
-
-LIMIT = 600.0  # s of wall time a cell
 
 
 class _RemotePolicy:
