@@ -61,12 +61,7 @@ class _NativeVecEnv(VecEnv):
         self._actions: Any = None
         spaces = vector_env.single_observation_space, vector_env.single_action_space
         super().__init__(vector_env.num_envs, *spaces)
-        self.metadata = dict(vector_env.metadata)
-
-    @property
-    def spec(self) -> Any:
-        """Spec of the vector env, without its wrappers."""
-        return self.vector_env.spec
+        self.metadata, self.spec = dict(vector_env.metadata), vector_env.spec
 
     def reset(self) -> Observations:
         """Start an episode in every row, with the seeds and options that were set for it."""

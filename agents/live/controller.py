@@ -135,18 +135,14 @@ class OnboardController:
         self._refs = steady if before is None else _filter_reference(before, steady, *params)
         self.has_new_action = tick.number % n == 0
         if self.has_new_action:
-            self._compute_action(tick.number)
+            obs, start = self._make_observation(tick.number), self._start
+            self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
+            self.action = np.zeros(self.facts.width, np.float32)
+            if self.agent is not None:
+                prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
+                self.action, self._memory = prediction
         elif self._count == n:  # begun within a period
             self._count = 0
-
-    def _compute_action(self, number: int) -> None:
-        """Compute the action of a tick and begin the next period."""
-        obs, start = self._make_observation(number), self._start
-        self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
-        self.action = np.zeros(self.facts.width, np.float32)
-        if self.agent is not None:
-            prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
-            self.action, self._memory = prediction
 
     def _make_observation(self, number: int) -> npt.NDArray[np.float32]:
         """Make the observation (k,) that the env's agents would get at a tick."""

@@ -29,7 +29,7 @@ with require_extra("train", "training needs {}"):
     import torch
     import yaml
     from safetensors import SafetensorError, safe_open
-    from safetensors.torch import save
+    from safetensors.torch import load_file, save
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import KVWriter
     from stable_baselines3.common.utils import get_device, get_latest_run_id
@@ -64,14 +64,6 @@ class Evaluation(NamedTuple):
         return self.cost if self.of_start is None else self.of_start
 
 
-class Progress(NamedTuple):
-    """The progress of a training."""
-
-    steps: int  # so far
-    cost: float | None  # mean of the newest episodes with exploration; None before one ends
-    evaluations: list[Evaluation]  # so far
-
-
 @dataclass(frozen=True)
 class RunOptions:
     """The options of a run, which may change when a training resumes.
@@ -83,7 +75,7 @@ class RunOptions:
     eval_freq: int = 250_000  # steps between two evaluations
     device: str = "cpu"  # torch's name of the device
     tensorboard_log: str | None = None  # folder for TensorBoard
-    report: Callable[[Progress], None] | None = None  # called after every rollout
+    report: "Callable[[EvalCallback], None] | None" = None  # called after every rollout
     command: str = ""  # command line, for the policy's card
     track: str = ""  # project of Weights & Biases, "" for none
 
@@ -169,6 +161,12 @@ class EvalCallback(BaseCallback):
         """Evaluation whose model is saved."""
         return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
+    @property
+    def cost(self) -> float | None:
+        """Mean cost of the newest episodes with exploration; None before one ends."""
+        rewards = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        return -float(np.mean(rewards)) if rewards else None
+
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""
         k = max(len(self.task.scenarios), 1)
@@ -188,9 +186,7 @@ class EvalCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         if self.run_options.report is not None:
-            rewards = [episode["r"] for episode in self.model.ep_info_buffer or ()]
-            cost = -float(np.mean(rewards)) if rewards else None
-            self.run_options.report(Progress(self.model.num_timesteps, cost, self.evaluations[:]))
+            self.run_options.report(self)
 
     def check(self) -> None:
         """Check that the weights are finite; FloatingPointError otherwise."""
@@ -288,16 +284,15 @@ class EvalCallback(BaseCallback):
         parts: dict[str, Any] = {part: {} for part in self.model.get_parameters()}
         groups = read_checkpoint(path).groups
         parts |= {part: {"param_groups": group, "state": {}} for part, group in groups.items()}
-        with safe_open(path, "pt") as file:
-            for name in file.keys():  # noqa: SIM118  it is no mapping
-                part, key = name.split("/", 1)
-                if part == _VARIABLES:
-                    variables[key].data.copy_(file.get_tensor(name))
-                elif part in groups:
-                    i, key = key.split("/", 1)
-                    parts[part]["state"].setdefault(int(i), {})[key] = file.get_tensor(name)
-                else:
-                    parts[part][key] = file.get_tensor(name)
+        for name, tensor in load_file(path).items():
+            part, key = name.split("/", 1)
+            if part == _VARIABLES:
+                variables[key].data.copy_(tensor)
+            elif part in groups:
+                i, key = key.split("/", 1)
+                parts[part]["state"].setdefault(int(i), {})[key] = tensor
+            else:
+                parts[part][key] = tensor
         self.model.set_parameters(parts, device=self.model.device)
 
 

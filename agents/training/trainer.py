@@ -225,12 +225,10 @@ class Trainer:
             raise ValueError("a network reads what it was trained on: give reads or a network")
         if isinstance(agent, Path):
             check_zip(agent)
-        if self.run_options.tensorboard_log is not None and find_spec("tensorboard") is None:
-            raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-        try:
-            self._wandb: Any = import_module("wandb") if self.run_options.track else None
-        except ImportError:
-            raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
+        logs = {"tensorboard": self.run_options.tensorboard_log, "wandb": self.run_options.track}
+        for package, is_wanted in logs.items():
+            if is_wanted and find_spec(package) is None:
+                raise ModuleNotFoundError(f"a log there needs {package}: pip install {package}")
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
         self._state: Checkpoint | None = None
         if self.resume:
@@ -253,9 +251,9 @@ class Trainer:
         done = model.num_timesteps
         if done < self.steps:
             log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=self.task.algo)
-            if self._wandb is not None:
-                project, config = self.run_options.track, asdict(self.task)
-                run = self._wandb.init(project=project, name=self._folder.name, config=config)
+            if project := self.run_options.track:
+                names = dict[str, Any](project=project, name=self._folder.name)
+                run = import_module("wandb").init(**names, config=asdict(self.task))
                 callback.writers.append(_RunWriter(run))
             try:
                 model.learn(self.steps - done, callback=callback, **log)

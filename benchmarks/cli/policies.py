@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ...agents.learned.network import Network
     from ...agents.learned.policy import Policy
     from ...agents.training.callbacks import EvalCallback
-    from ...agents.training.callbacks import Progress as TrainingProgress
     from ...agents.training.config import TrainingTask
 
 EPISODES = 256  # of a policy's test
@@ -325,16 +324,15 @@ def _make_table(trained: "EvalCallback") -> Table:
     return table
 
 
-def _show(bar: Bar, now: "TrainingProgress") -> None:
+def _show(bar: Bar, now: "EvalCallback") -> None:
     """Show a training's newest episodes, and its newest and best evaluation."""
     text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-    last = now.evaluations[-1]
-    best = min(now.evaluations, key=lambda evaluation: evaluation.criterion)
+    last, best = now.evaluations[-1], now.best
     if last.of_start is None:
         text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
     else:
         text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
-    bar.update(bar.task_ids[0], completed=now.steps, description=text)
+    bar.update(bar.task_ids[0], completed=now.model.num_timesteps, description=text)
 
 
 def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Path | None) -> Path:

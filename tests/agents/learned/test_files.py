@@ -121,16 +121,6 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
     assert load_policy(file).network.mean[0] == a_network(1).mean[0]
 
 
-def test_a_failed_save_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        save_policy(tmp_path / "mine.safetensors", a_network(), CARD)
-    assert list(tmp_path.iterdir()) == []
-
-
 def edited(path: Path, edit: Callable[[Any, Any, Any], Any]) -> None:
     """Rewrite a file after edit(tensors, metadata, card)."""
     with safe_open(path, "numpy") as file:

@@ -57,27 +57,6 @@ def test_a_row_is_its_single_observation_to_rounding(policy: Policy) -> None:
     assert state.shape == (300, 0)
 
 
-def test_predict_is_pure(policy: Policy) -> None:
-    agent = PolicyController(gym.make(VISION), policy)
-    rng = np.random.default_rng(2)
-    x = rng.normal(size=(4, policy.network.inputs)).astype(np.float32)
-    kept = x.copy()
-    first, _ = agent.predict(x)
-    agent.predict(rng.normal(size=x.shape).astype(np.float32))
-    again, _ = agent.predict(x, episode_start=np.array([True, False, True, False]))
-    assert np.array_equal(first, again) and np.array_equal(x, kept)
-
-
-def test_actions_are_clipped_and_only_rows_with_a_nan_are_lost(policy: Policy) -> None:
-    agent = PolicyController(gym.make(VISION), policy)
-    x = np.random.default_rng(3).normal(size=(50, policy.network.inputs)) * 100.0
-    x[7, 3] = np.nan
-    action, _ = agent.predict(x.astype(np.float32))
-    assert np.isnan(action[7]).all()
-    rest = np.delete(action, 7)
-    assert rest.min() == -1.0 and rest.max() == 1.0
-
-
 def test_entries_are_read_by_name_from_a_wider_observation(policy: Policy) -> None:
     """YawFusion's observation holds all of YawVision's, and the GPS."""
     narrow, wide, steering = (gym.make(each) for each in (VISION, FUSION, STEERING))

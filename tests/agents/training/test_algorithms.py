@@ -18,7 +18,7 @@ from sideslip.agents.training.callbacks import (
     BEST,
     CHECKPOINT,
     POLICY,
-    Progress,
+    EvalCallback,
     RunOptions,
     read_checkpoint,
 )
@@ -132,8 +132,8 @@ def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.M
         built.append(real(self))
         return built[0]
 
-    def spoil(now: Progress) -> None:
-        if now.steps == 2 * ROLLOUT:
+    def spoil(now: EvalCallback) -> None:
+        if now.model.num_timesteps == 2 * ROLLOUT:
             with torch.no_grad():
                 next(built[0].model.policy.parameters()).fill_(float("nan"))
 

@@ -155,15 +155,6 @@ def test_what_is_read_has_no_correlation(monkeypatch: pytest.MonkeyPatch) -> Non
     assert about_one(mixing) >= read - 3 and about_one(None) < read / 2
 
 
-def test_a_network_reads_what_it_is_told_to_and_nothing_else() -> None:
-    env = TrainingTask().vector_env(1)
-    plain, some = (_measure_scaling(TrainingTask(reads=x)) for x in ([], ["gyro", "steer"]))
-    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
-    read = np.isin(names, ["gyro", "steer"])
-    assert np.array_equal(some[1], np.where(read, plain[1], 0.0)) and some[0] == plain[0]
-    assert np.count_nonzero(some[1]) == 2 < np.count_nonzero(plain[1])
-
-
 def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
     """In 0.4 s nobody steers: what was measured over steps was never read."""
     options = {"scenario": "sine-with-dwell", "control_period": 1}

@@ -94,19 +94,6 @@ def test_it_has_the_bits_of_the_single_environments(name: str, wish: Any, scenar
     assert bits(ours.reset()) == bits(theirs.reset())  # generators go on
 
 
-def test_it_has_the_bits_of_the_vector_env() -> None:
-    ours = native(FUSION, 4, ESTIMATE, scenario=SHORT)
-    alone = native(FUSION, 4, ESTIMATE, scenario=SHORT).vector_env
-    ours.seed(7)
-    assert bits(ours.reset()) == bits(alone.reset(seed=7)[0])
-    for step in range(60):
-        obs, rewards, dones, _ = ours.step(drawn(ours, step))
-        wanted = alone.step(drawn(ours, step))
-        assert bits(obs) == bits(wanted[0])
-        assert bits(rewards) == bits(wanted[1].astype(np.float32))
-        assert bits(dones) == bits(wanted[2] | wanted[3])
-
-
 def test_seeds_and_options_serve_one_reset_each_row_its_own() -> None:
     ours, theirs = native(FUSION, 3), dummy(FUSION, 3)
     options: list[dict[str, Any]] = [{}, {"friction": 0.5, "duration": 0.1}, {"duration": 0.5}]
