@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.core.typing.templates import signature
 from numba.np.arrayobj import make_array, populate_array
 
@@ -78,15 +78,6 @@ def mirror(array: Matrix, i: int, j: int) -> None:
     """
     block = array[i : i + 8, j : j + 8]
     array[j : j + 8, i : i + 8] = np.where(np.tri(8, k=-1), block.T, block) if i == j else block.T
-
-
-def prefetch(array: Matrix, *index: int) -> None:
-    """Prefetch the cache line of a number.
-
-    Args:
-        array: The matrix or vector.
-        index: Index of the number, which may lie beyond the array.
-    """
 
 
 def pad_to_cache_line(fields: Sequence[tuple[object, ...]]) -> np.dtype[np.void]:
@@ -223,16 +214,6 @@ def _lower_mirror(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _lower_prefetch(context, builder, sig, args):
-    byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
-    kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
-    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    pointer = locate_element(context, builder, sig.args[0], args[0], args[1:])
-    flags = [ir.Constant(flag, value) for value in (1, 3, 1)]  # to be written, to all caches, data
-    builder.call(function, [builder.bitcast(pointer, byte), *flags])
-    return context.get_dummy_value()
-
-
 def _infer_scratch(template, *shape):
     is_constant = all(isinstance(size, types.IntegerLiteral) for size in shape)
     made = types.Array(types.float64, template.ndim, "C")
@@ -259,5 +240,4 @@ register_primitive(load8_symmetric, _infer_load8, _lower_load8_symmetric)
 register_primitive(count_upper_rows, _infer_count_upper_rows, _lower_count_upper_rows)
 register_primitive(store8, _infer_store8, _lower_store8)
 register_primitive(mirror, _infer_in_place, _lower_mirror)
-register_primitive(prefetch, _infer_in_place, _lower_prefetch)
 register_primitive(allocate_scratch, _infer_scratch, _lower_scratch, prefer_literal=True)

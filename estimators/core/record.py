@@ -6,7 +6,6 @@ codes `kind`, `delay_rule`, `intersample_rule` and `periodic` say which fields a
 missing place is 0 where place 0 is always taken, else -1.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,7 +71,7 @@ COUNTERS, CAR = SkipCounters(), CarIndex()
 
 _INT, _FLOAT = np.int64, np.float64
 
-_FIELDS = [
+_FIELDS: list[tuple[Any, ...]] = [
     # model: dx = A x + B u on the first `dense` states; those behind them decay by themselves
     ("kind", _INT),
     ("n", _INT),  # states
@@ -264,21 +263,11 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 ]
 
 
-def _count_numbers(row: Any) -> int:
-    return math.prod(row[2]) if len(row) > 2 else 1
-
-
-_LEADING = (  # fields of a record that a tick in lanes reads or writes, side by side
-    *("n", "total", "periodic", "measured", "speed", "speed_before", "model_speed"),
+_LEADING = (  # what a tick in lanes reads or writes, side by side; x and P lie on cache lines
+    *("x", "P", "n", "total", "periodic", "measured", "speed", "speed_before", "model_speed"),
     *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
     *("y", "u", "counts"),
-    *("x", "P"),
 )
-_RANK = dict(zip(_LEADING, range(len(_LEADING)), strict=True))
-_ORDER = sorted(_FIELDS, key=lambda row: (_RANK.get(str(row[0]), len(_RANK)), _count_numbers(row)))
-_N_BEFORE_X = sum(_count_numbers(row) for row in _ORDER[: _RANK["x"]])
-_N_PADDING = 8 - _N_BEFORE_X % 8  # with it x and P begin on cache lines
-FILTER = pad_to_cache_line([("padding", _FLOAT, (_N_PADDING,)), *_ORDER, *_WINDOW])
-X_OFFSET = _N_PADDING + _N_BEFORE_X  # numbers before x
-_COUNTS = [_count_numbers(row) for row in _ORDER[len(_LEADING) :]]
-N_SMALL = sum(count for count in _COUNTS if count <= 64)  # behind P
+_RANKS = {name: rank for rank, name in enumerate(_LEADING)}
+_FIELDS.sort(key=lambda row: (_RANKS.get(row[0], len(_RANKS)), np.dtype([row]).itemsize))
+FILTER = pad_to_cache_line([*_FIELDS, *_WINDOW])

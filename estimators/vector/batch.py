@@ -18,7 +18,7 @@ from ...envs.numerics.jit import compile_call, jit, jit_nrt
 from ...envs.numerics.packed import count_lanes
 from ...envs.numerics.primitives import Matrix, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
-from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line, prefetch
+from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
 from ..core.filter import Observed, OutputTable, StepRecord, observe
 from ..core.innovation import BUFFER, LARSEN, NONE
@@ -28,10 +28,6 @@ from ..core.record import (
     N_CORE,
     N_FAST,
     N_INPUTS,
-    N_SMALL,
-    N_TOTAL,
-    X_OFFSET,
-    FilterRecord,
     FilterRecords,
 )
 from ..estimator import Estimator
@@ -118,25 +114,6 @@ def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
 
 
 @jit
-def _fetch(f: FilterRecord, template: FilterRecord) -> None:
-    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
-    for i in range(0, X_OFFSET + template.total, 8):
-        prefetch(f.padding, i)
-    for i in range(0, N_SMALL, 8):
-        prefetch(f.P, N_TOTAL, i)
-    for j in range(0, template.total, 8):
-        for i in range(template.total):
-            prefetch(f.P, i, j)
-    for j in range(0, template.n, 8):
-        for i in range(template.n):
-            prefetch(f.Q, i, j)
-            if i < template.dense:
-                prefetch(f.G, i, j)
-            if j < template.dense:
-                prefetch(f.GT, i, j)
-
-
-@jit
 def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
     """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
     n_rows, count = 0, 0
@@ -173,9 +150,6 @@ def _observe_batch(
                 f, gains = filters[i], get_gains(bank, i)
                 start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
                 outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
-                if n_done == 0 and i + 1 < len(filters):
-                    for layer in range(len(f)):
-                        _fetch(filters[i + 1, layer], f[layer])
                 row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
                 done[i] = observe(f, gains, row_record, start, outputs)
                 n_waiting += 1 if done[i] < rows[i] else 0

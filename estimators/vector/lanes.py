@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from ...envs.numerics.jit import jit, jit_nrt, noinline
 from ...envs.numerics.packed import count_lanes, load_element, store_element
-from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
-from ...envs.numerics.simd8 import prefetch
-from ...envs.record import FAST, FAST_WIDTH, PACKET, Array
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, select
+from ...envs.record import FAST, PACKET, Array
 from ..core.covariance import correct_scalar, project
 from ..core.filter import run_tick
 from ..core.innovation import store_due_captures
@@ -27,7 +26,7 @@ from ..core.predict import (
     propagate,
     read_fast_row,
 )
-from ..core.record import N_SLOW, WINDOW, X_OFFSET, FilterRecord, FilterRecords, GainTables
+from ..core.record import N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 
 LaneBlock = Any
 """One record of the dtype `batch.BLOCK`; `b` in compiled code."""
@@ -149,23 +148,6 @@ def _store_lane_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     store_due_captures(f, b.tick[lane])
     _load_states(b, lane, f)
     _load_clock(b, lane, f)
-
-
-@jit
-def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Matrix, j: int, rows: int) -> None:
-    """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
-    last = minimum(first + count_lanes(), len(filters))
-    for i in range(first, last):
-        for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
-            prefetch(fast, i, j, k)
-    for lane in range(count_lanes() * j // rows, count_lanes() * (j + 1) // rows):
-        if first + lane < last:
-            f = filters[first + lane, 0]
-            for k in range(0, X_OFFSET + b.total, 8):
-                prefetch(f.padding, k)
-            for i in range(b.total if b.periodic == 0 else 0):
-                for k in range(0, b.total, 8):
-                    prefetch(f.P, i, k)
 
 
 @jit
@@ -372,7 +354,6 @@ def advance_block(
             b.last[lane] = b.tick[lane] + rows
             _set_next_due(b, lane, packets[i], counts[i])
     for j in range(rows):
-        _fetch_next(b, first + count_lanes(), filters, fast, j, rows)
         _read_rows(b, first, fast, j)
         speed, is_outlier = _read_signals(b)
         has_outlier = any_lane(is_outlier)
