@@ -37,6 +37,14 @@ def _align_rows(rows: Array, lags: dict[int, int]) -> Array:
     return result
 
 
+def _advance(filters: FilterRecords, gains: Array, fast: Array, packets: Array) -> Array:
+    """Advance a filter by rows and packets; return the packets' NIS."""
+    packets = np.ascontiguousarray(packets[:, :PACKET_WIDTH])
+    record, nis = StepRecord(fast, len(fast), packets, len(packets)), np.full(len(packets), np.nan)
+    compile_advance()(filters, gains, record, 0, NO_OUTPUTS._replace(nis=nis))
+    return nis
+
+
 class _LatencySearch:
     """Search for the latency of `columns` of a fast row: least NIS, its variance by a parabola."""
 
@@ -119,12 +127,9 @@ class _LatencySearch:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
         fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
-        packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
-        is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
-        packets = np.ascontiguousarray(packets[is_past])
-        nis = np.full(len(packets), np.nan)
-        record = StepRecord(fast, count, packets, len(packets))
-        compile_advance()(filters, gains, record, 0, NO_OUTPUTS._replace(nis=nis))
+        packets = np.concatenate(self._packets)
+        packets = packets[packets[:, PACKET.arrived] <= filters[0].tick + count]
+        nis = _advance(filters, gains, fast, packets)
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
@@ -198,22 +203,15 @@ class LateEstimator(Estimator):
         # others are to be counted
         is_later = (arrived > now - len(rows) + n_due) & (arrived <= now)
         self._rows, self._waiting = rows[n_due:], pending[is_later]
-        self._process_delayed(_align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
+        due, fast_due = pending[~is_later], _align_rows(rows, self._lags)[:n_due]
+        due_nis = _advance(self.delayed_filters, self.gains, fast_due, due)
+        if len(nis):
+            is_new = due[:, _INDEX_COLUMN] >= 0.0
+            nis[due[is_new, _INDEX_COLUMN].astype(int)] = due_nis[is_new]
         if search:
             search.take(fast, packets)
             record = self.delayed_filters, self._rows, self._waiting, self.gains
             self.delayed_filters[:] = search.look(*record)
-
-    def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
-        """Pass rows and packets to `delayed_filters`."""
-        packets = np.ascontiguousarray(pending[:, :_INDEX_COLUMN])
-        pending_nis = np.full(len(pending), np.nan)
-        record = StepRecord(fast, len(fast), packets, len(packets))
-        outputs = NO_OUTPUTS._replace(nis=pending_nis)
-        compile_advance()(self.delayed_filters, self.gains, record, 0, outputs)
-        if len(nis):
-            is_new = pending[:, _INDEX_COLUMN] >= 0.0
-            nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
 
     def _predict_current(self) -> None:
         """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
@@ -222,11 +220,8 @@ class LateEstimator(Estimator):
         skip_history = self.config.delay == "clone" and not self._f.store_predictions
         end = _HISTORY_OFFSET if skip_history else None
         current[:, :end] = delayed[:, :end]
-        if len(self._rows):
-            rows = _align_rows(self._rows, self._lags)
-            packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
-            record = StepRecord(rows, len(rows), packets, len(packets))
-            compile_advance()(self.filters, self.gains, record, 0, NO_OUTPUTS)
+        rows = _align_rows(self._rows, self._lags)
+        _advance(self.filters, self.gains, rows, self._waiting)
 
     @property
     def latency(self) -> dict[str, float]:

@@ -215,24 +215,6 @@ def test_haras_error_map_is_the_single_rates(seed: Any) -> None:
     np.testing.assert_allclose(held, single, atol=1e-10)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_error_dynamics_as_with_fast_measurement_only_for_square_c(seed: Any) -> None:
-    """The paper's claim of section 3.2, and where it ends."""
-    rng = np.random.default_rng(seed)
-    m, r = int(rng.integers(2, 6)), int(rng.integers(3, 21))
-    a = rng.normal(size=(m, m))
-    a *= 0.98 / np.abs(np.linalg.eigvals(a)).max()
-    for q in (m, m - 1):
-        c = np.linalg.qr(rng.normal(size=(m, m)))[0][:q]
-        L = gain(np.eye(m), c, 4.0 * np.eye(q))
-        with_sample = np.eye(m) - L @ c
-        fast = a @ power(with_sample @ a, r - 1) @ with_sample
-        G = gains_31(a, c, [L] * r)
-        shares = np.array([L @ g for g in G])
-        difference = np.abs(frame_map(a, c, shares) - fast).max()
-        assert difference < 1e-12 if q == m else difference > 1e-2
-
-
 V = FIG6.speed
 SLALOM = type(FIG6)(duration=0.65, amplitude=0.1, frequency=1.0, real=7000.0)
 COURSE_10_HZ = SlowSensor(period=0.1)
