@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.numerics.jit import compile_call, jit, jit_nrt
-from ...envs.numerics.packed import count_lanes
-from ...envs.numerics.primitives import Matrix, Vector, maximum, minimum
+from ...envs.numerics.jit import compile_call
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.filter import Observed, OutputTable, StepRecord, observe
+from ..core.filter import Observed, OutputTable, StepRecord
 from ..core.innovation import BUFFER, LARSEN, NONE
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import (
@@ -32,13 +30,12 @@ from ..core.record import (
 )
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec, write_outputs
-from .lanes import FilterBank, LaneBlock, advance_block, get_gains
+from .lanes import FilterBank, observe_batch
 
 Build = Callable[..., AnyEstimator]
 _Mask = npt.NDArray[np.bool_]
 _Shape = tuple[bytes, ...] | None
 
-_MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 _MAX_STATES = 16  # states and clones
 _ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
 _FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
@@ -113,59 +110,16 @@ def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
     return blocks
 
 
-@jit
-def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
-    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
-    n_rows, count = 0, 0
-    for lane in range(count_lanes()):
-        i = first + lane
-        b.here[lane] = 0.0
-        if i < len(filters) and done[i] == -1 and rows[i] > 0:
-            f = filters[i, 0]
-            is_ready = b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
-            if is_ready and (count == 0 or rows[i] == n_rows):
-                b.here[lane], n_rows = 1.0, rows[i]
-                count += 1
-    return n_rows if count >= _MIN_LANES else 0
-
-
-@jit_nrt
-def _observe_batch(
-    bank: FilterBank, done: Vector, lanes: Vector, record: StepRecord, observed: Observed
-) -> int:
-    """Call `observe` for every filter that has rows to do; return how many still have."""
-    # record, observed: of N cars; done: rows done, -1 where a filter has not started, updated;
-    # filters of one shape go in lanes
-    fast, rows, packets, counts = record
-    obs, table, beta, gamma, out, summary = observed
-    filters, n_waiting = bank.filters, 0
-    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
-        b = lanes[first // LANES]
-        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
-        if n_rows > 0:
-            n_done = advance_block(b, first, bank, fast, n_rows, packets, counts)
-        for lane in range(minimum(count_lanes(), len(filters) - first)):
-            i = first + lane
-            if done[i] < rows[i]:
-                f, gains = filters[i], get_gains(bank, i)
-                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
-                outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
-                row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
-                done[i] = observe(f, gains, row_record, start, outputs)
-                n_waiting += 1 if done[i] < rows[i] else 0
-    return n_waiting
-
-
 @cache
 def _compile_observe_batch() -> Callable[..., int]:
-    """Return `_observe_batch` as a plain call, for the types that all banks and records have."""
+    """Return `observe_batch` as a plain call, for the types that all banks and records have."""
     counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
     bank = FilterBank(np.zeros((1, 1), FILTER), numbers, np.zeros((1, 4), np.int64))
     record, obs = StepRecord(cube, counts, cube, counts), np.zeros((1, 0), np.float32)
     blocks = allocate_aligned((1,), BLOCK)
     table = OutputTable(0, np.zeros((0, 3), np.int64), numbers)
     observed = Observed(obs, table, numbers, numbers, obs, np.zeros((1, 4)))
-    return compile_call(_observe_batch, bank, counts, blocks, record, observed)
+    return compile_call(observe_batch, bank, counts, blocks, record, observed)
 
 
 class BatchEstimator:

@@ -1,4 +1,4 @@
-"""The ticks of a block of filters, by lanes.
+"""The batch's part of an observation, compiled: filters of one shape by lanes, others alone.
 
 A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
 row is not sound. So is every packet, and what is stored of a capture.
@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from ...envs.numerics.jit import jit, jit_nrt, noinline
 from ...envs.numerics.packed import count_lanes, load_element, store_element
-from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, select
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
+from ...envs.numerics.simd import LANES
 from ...envs.record import FAST, PACKET, Array
 from ..core.covariance import correct_scalar, project
-from ..core.filter import run_tick
+from ..core.filter import Observed, StepRecord, observe, run_tick
 from ..core.innovation import store_due_captures
 from ..core.model import CURVATURE, LATERAL, is_finite
 from ..core.packets import process_packet
@@ -30,6 +31,7 @@ from ..core.record import N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTable
 
 LaneBlock = Any
 """One record of the dtype `batch.BLOCK`; `b` in compiled code."""
+MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 
 
 class FilterBank(NamedTuple):
@@ -41,13 +43,8 @@ class FilterBank(NamedTuple):
 
 
 @jit_nrt
-def get_gains(bank: FilterBank, i: int) -> GainTables:
-    """Return the table of gains of a filter, a view of shape (cells, rows, columns).
-
-    Args:
-        bank: Filters and gains.
-        i: Index of the filter.
-    """
+def _get_gains(bank: FilterBank, i: int) -> GainTables:
+    """Return the table of gains of a filter, a view of shape (cells, rows, columns)."""
     place = bank.places[i]
     start, cells, height, width = place[0], place[1], place[2], place[3]
     return bank.pool[start : start + cells * height * width].reshape((cells, height, width))
@@ -291,7 +288,7 @@ def _step_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: 
     for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
             i = first + lane
-            _step_filter(bank.filters[i, 0], get_gains(bank, i), fast[i, j])
+            _step_filter(bank.filters[i, 0], _get_gains(bank, i), fast[i, j])
             _load_lane(b, lane, bank.filters[i, 0])
 
 
@@ -321,7 +318,7 @@ def _process_packets(
 
 
 @jit_nrt
-def advance_block(
+def _advance_block(
     b: LaneBlock,
     first: int,
     bank: FilterBank,
@@ -330,20 +327,8 @@ def advance_block(
     packets: Matrix,
     counts: Vector,
 ) -> int:
-    """Advance the filters that are `here` from their first row on, as `core.filter.advance` does.
-
-    Args:
-        b: Block of lanes.
-        first: Index of the filter in the first lane.
-        bank: Filters and gains.
-        fast: Fast rows, shape (N, k, FAST_WIDTH).
-        rows: Number of fast rows, equal for these filters.
-        packets: Packets, shape (N, capacity, PACKET_WIDTH).
-        counts: Number of packets of each filter, shape (N,).
-
-    Returns:
-        Number of rows done by all alike: fewer than `rows` where one of them has no gains.
-    """
+    """Advance filters that are `here` by `rows` rows; return fewer where one has no gains."""
+    # first: filter in the first lane; fast (N, k, FAST_WIDTH), packets (N, capacity, PACKET_WIDTH)
     filters = bank.filters
     store_element(b.due, np.inf)
     for lane in range(count_lanes()):
@@ -369,7 +354,7 @@ def advance_block(
             for lane in range(count_lanes()):
                 if b.here[lane] == 1.0 and b.now[lane] >= b.due[lane]:
                     i = first + lane
-                    lane_args = filters[i, 0], get_gains(bank, i), packets[i], counts[i]
+                    lane_args = filters[i, 0], _get_gains(bank, i), packets[i], counts[i]
                     _process_packets(b, lane, *lane_args)
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
@@ -377,3 +362,52 @@ def advance_block(
             _store_lane(b, lane, f)
             f.cursor = b.cursor[lane]
     return rows
+
+
+@jit
+def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
+    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
+    n_rows, count = 0, 0
+    for lane in range(count_lanes()):
+        i = first + lane
+        b.here[lane] = 0.0
+        if i < len(filters) and done[i] == -1 and rows[i] > 0:
+            f = filters[i, 0]
+            is_ready = b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
+            if is_ready and (count == 0 or rows[i] == n_rows):
+                b.here[lane], n_rows = 1.0, rows[i]
+                count += 1
+    return n_rows if count >= MIN_LANES else 0
+
+
+@jit_nrt
+def observe_batch(
+    bank: FilterBank, done: Vector, lanes: Vector, record: StepRecord, observed: Observed
+) -> int:
+    """Call `observe` for every filter that has rows to do; return how many still have.
+
+    Args:
+        bank: Filters and gains.
+        done: Rows done, -1 where a filter has not started, updated, shape (N,).
+        lanes: Blocks of lanes, in which filters of one shape go.
+        record: Records of N cars.
+        observed: Observations and outputs of N cars.
+    """
+    fast, rows, packets, counts = record
+    obs, table, beta, gamma, out, summary = observed
+    filters, n_waiting = bank.filters, 0
+    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
+        b = lanes[first // LANES]
+        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
+        if n_rows > 0:
+            n_done = _advance_block(b, first, bank, fast, n_rows, packets, counts)
+        for lane in range(minimum(count_lanes(), len(filters) - first)):
+            i = first + lane
+            if done[i] < rows[i]:
+                f, gains = filters[i], _get_gains(bank, i)
+                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
+                outputs = Observed(obs[i], table, beta[i], gamma[i], out[i], summary[i])
+                row_record = StepRecord(fast[i], rows[i], packets[i], counts[i])
+                done[i] = observe(f, gains, row_record, start, outputs)
+                n_waiting += 1 if done[i] < rows[i] else 0
+    return n_waiting

@@ -332,5 +332,5 @@ def test_tyres_are_expanded_every_row_of_a_slow_log() -> None:
     """Every 4 ms, or every row where rows are further apart."""
     log = drive_linear()
     assert built("exact-kf", log, **WITH_TYRES).filters[0].linearise_every == 4
-    facts = {"sensors": {}, "slow": []}
+    facts: dict[str, Any] = {"sensors": {}, "slow": []}
     assert make_estimator("joint", dt=0.01, **facts).filters[0].linearise_every == 1

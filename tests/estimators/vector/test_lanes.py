@@ -13,7 +13,8 @@ from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.record import FILTER
-from sideslip.estimators.vector.batch import _MIN_LANES, BLOCK
+from sideslip.estimators.vector.batch import BLOCK
+from sideslip.estimators.vector.lanes import MIN_LANES
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.fleets import make_batch, states, step
@@ -146,9 +147,9 @@ def test_which_filters_are_in_lanes() -> None:
         assert (batch._lanes["shaped"][0] == 1).sum() == there
         assert (batch._lanes["here"][0] == 1.0).sum() == there
     few = make_batch(
-        "exact-kf", _MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
+        "exact-kf", MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
     )
-    feed(few, logs[: _MIN_LANES - 1], 10)
+    feed(few, logs[: MIN_LANES - 1], 10)
     assert (few._lanes["model_speed"] == 0.0).all()
 
 
