@@ -21,13 +21,7 @@ from ...envs.record import FAST, FAST_WIDTH
 from ..core.filter import Observed, OutputTable, StepRecord
 from ..core.innovation import BUFFER, LARSEN, NONE
 from ..core.model import KINEMATIC, VELOCITY_ROLL
-from ..core.record import (
-    FILTER,
-    N_CORE,
-    N_FAST,
-    N_INPUTS,
-    FilterRecords,
-)
+from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec, write_outputs
 from .lanes import FilterBank, observe_batch

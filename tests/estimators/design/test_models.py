@@ -12,10 +12,7 @@ from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import FAST
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.actuators import compute_yaw_moment
-from sideslip.envs.vehicle.linear import (
-    make_course_model,
-    make_vision_model,
-)
+from sideslip.envs.vehicle.linear import make_course_model, make_vision_model
 from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
