@@ -5,6 +5,7 @@ import shutil
 from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -14,7 +15,14 @@ from rich.table import Table
 
 from ..harness.parallel import Bar, use_shared_bar
 from ..harness.results import check_writable
-from .common import announce_torch, get_command_line, print_written, show_episode, write_output
+from .common import (
+    announce_torch,
+    get_command_line,
+    print_written,
+    refuse_unused_options,
+    show_episode,
+    write_output,
+)
 from .names import check_env
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
@@ -24,6 +32,7 @@ if TYPE_CHECKING:
     from ...agents.training.callbacks import EvalCallback
     from ...agents.training.config import TrainingTask
 
+_ENV = "sideslip/YawVision-v1"  # of a zip, which does not say
 EPISODES = 256  # of a policy's test
 
 
@@ -33,7 +42,7 @@ class _Export:
 
     zipped: Path = take_argument("Zip of stable-baselines3.", ..., metavar="ZIP")
     out: File = take("Default: NAME.safetensors beside it.", None, "--out", "-o")
-    env: str = take("The id that it was trained on.", "sideslip/YawVision-v1")
+    env: str = take("The id that it was trained on.", _ENV)
     estimator: str = take("The estimator around it.", "")
     option: Texts = take("NAME=VALUE of the environment; repeatable.")
     normalise: File = take("VecNormalize's pickle; default: NAME.pkl or vecnormalize.pkl beside.")
@@ -67,10 +76,10 @@ def _describe_sizes(network: "Network") -> str:
 class _Enjoy:
     """Drive a learned policy: its cost against no control and the best classical line.
 
-    `sideslip export` makes a file of a zip.
+    A zip drives the id that it was trained on (--env); `sideslip export` takes further options.
     """
 
-    policy: str = take_argument("A shipped policy's name, or a file's path.", ...)
+    policy: str = take_argument("A shipped policy's name, or a file's or zip's path.", ...)
     env: Text = take("Another id than the policy's own.")
     episodes: int = take("Number of episodes.", 256, min=1)
     scenario: Text = take("A scenario's name.")
@@ -81,8 +90,23 @@ class _Enjoy:
     plot: File = take("Write the first episode as a PNG.", ends=".png .pdf .svg")
     video: File = take("Write it as a film, .mp4 or .gif, no control beside it.")
     card: bool = take("Show the policy's card, no more.", False, "--card")
+    trust: bool
 
     def run(self) -> None:
+        if self.card:
+            refuse_unused_options(self, "policy env trust card", "--card")
+        if not self.policy.endswith(".zip"):
+            self._drive(self.policy)
+            return
+        from ...agents.training.export import export_zip
+
+        with TemporaryDirectory() as folder:
+            path = Path(folder, f"{Path(self.policy).stem}.safetensors")
+            export_zip(self.policy, path, self.env or _ENV, trust=self.trust)
+            self._drive(str(path))
+
+    def _drive(self, path: str) -> None:
+        """Drive the policy of a name or a path."""
         from ...agents.learned.policy import load_policy
         from ...agents.rollout import rollout
         from ..report.film import FilmDriver, check_film, write_film
@@ -91,10 +115,10 @@ class _Enjoy:
         console, options = Console(), {"env_id": self.env, "scenario": self.scenario}
         check_film(self.video)
         if self.card:
-            _show_card(console, load_policy(self.policy))
+            _show_card(console, load_policy(path))
             return
         with use_shared_bar(console, f"enjoy {self.policy}"):
-            evaluation = evaluate_policy(self.policy, self.episodes, seed=self.seed, **options)
+            evaluation = evaluate_policy(path, self.episodes, seed=self.seed, **options)
         write_output(console, [evaluation.make_suite()], vars(self))
         name, seed, task = evaluation.policy.name, evaluation.seeds[0], evaluation.task
         first = evaluation.entries[name]

@@ -95,7 +95,7 @@ def test_a_port_in_use_is_one_line(run: Run) -> None:
 
 
 sb3 = pytest.importorskip("stable_baselines3")
-GPS = "sideslip/YawGps-v0"
+HERE, GPS = "sideslip/YawVision-v0", "sideslip/YawGps-v0"
 
 
 @pytest.fixture
@@ -125,11 +125,25 @@ def test_a_zip_is_exported_and_drives(run: Run, zipped: Path, tmp_path: Path) ->
         assert status == 0 and "cost" in out, err
 
 
+def test_enjoy_takes_a_zip(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "mine.zip"
+    sb3.PPO("MlpPolicy", make_vec_env(HERE, 1), policy_kwargs={"net_arch": [8]}).save(path)
+    status, out, err = run("enjoy", path, "--trust", "--episodes", 2, "--scenario", "gust")
+    assert status == 0 and "mine" in out and "lqr on exact-kf" in out, err
+    status, out, err = run("enjoy", path, "--trust", "--card")
+    assert status == 0 and "22 x 8 x 1" in out and "ActorCriticPolicy" in out, err
+    assert [each.name for each in tmp_path.iterdir()] == ["mine.zip"]
+
+
 def test_a_mistake_is_one_line(run: Run, zipped: Path, tmp_path: Path) -> None:
     cases: list[tuple[tuple[object, ...], str]] = [
         (("export", zipped), "--trust"),
         (("run", "--agent", zipped), "--trust"),
-        (("enjoy", zipped), "is no safetensors file"),
+        (("enjoy", zipped), "--trust"),
+        (
+            ("enjoy", "distill-coms-yaw", "--card", "--json", tmp_path / "x.json"),
+            "json: of no use to --card",
+        ),
         (("export", tmp_path / "none.zip", "--trust"), "no such file"),
         (("export", zipped, "--trust"), "the observation here has 22: gyro,"),
         (("export", zipped, "--trust", "-o", tmp_path / "x.zip"), "NAME.safetensors, got"),
