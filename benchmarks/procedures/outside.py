@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...agents.rollout import rollout
-from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle
+from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, make_outside_vehicle
 from ...envs.record import Array
 from ...envs.scenarios import driver as profiles
 from ...envs.scenarios.scenario import Scenario
@@ -48,43 +48,28 @@ def _compute_limited_moment(motion: Motion, steer: float) -> float:
     return float(min(max(_GAIN * (goal - motion.gamma), -_LIMIT), _LIMIT))
 
 
-def _make_plant_drive(model: str, law: Law | None = None) -> DriveFunction:
-    """Make drives of an outside plant alone, its steering prescribed and no actuator's lag."""
+def _make_plant_drive(law: Law | None = None) -> DriveFunction:
+    """Make drives of the plant alone, straight ahead at first, its steering prescribed."""
 
     def run_drive(fields: Fields) -> Series:
-        scenario = Scenario(**(CALM | dict(fields)))
-        profile, hold = _make_steering_profile(scenario), scenario.acceleration is None  # 0: coasts
-
-        def steer(t: float) -> float:
-            return float(profiles.compute_steering(t / TICK, profile))
-
-        plant, speed = OUTSIDE_PLANTS[model](None), scenario.range("speed")[0]
-        return _simulate_plant(plant, steer, speed, scenario.duration, hold, law)
+        scenario, plant = Scenario(**(CALM | dict(fields))), OUTSIDE_PLANTS[MODEL](None)
+        profile, speed = _make_steering_profile(scenario), scenario.range("speed")[0]
+        hold = scenario.acceleration is None  # a force keeps the speed; 0: the car coasts
+        plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        rows = [[0.0, 0.0, *plant.motion[:POSE], 0.0]]  # no steering begins at once
+        for k in range(round(scenario.duration / TICK)):
+            t, motion = k * TICK, plant.motion
+            steer = float(profiles.compute_steering(t / TICK, profile))
+            moment = 0.0 if law is None else law(motion, steer)
+            push = plant.p.m * plant.p.R_w * _SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
+            turn = plant.p.R_w / plant.p.T_r * moment
+            plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
+            if not plant.is_finite:
+                break
+            rows.append([(k + 1) * TICK, steer, *plant.motion[:POSE], moment])
+        return replace(Series(*np.array(rows).T), failed=not plant.is_finite)
 
     return run_drive
-
-
-def _simulate_plant(
-    plant: OutsidePlant,
-    steering: Callable[[float], float],
-    speed: float,
-    duration: float,
-    hold: bool = False,  # a force keeps the speed (m/s); otherwise the car coasts
-    law: Law | None = None,
-) -> Series:
-    """Simulate an outside plant from straight ahead under a steering angle (rad) over time (s)."""
-    plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    rows = [[0.0, steering(0.0), *plant.motion[:POSE], 0.0]]
-    for k in range(round(duration / TICK)):
-        steer, motion = steering(k * TICK), plant.motion
-        moment = 0.0 if law is None else law(motion, steer)
-        push = plant.p.m * plant.p.R_w * _SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
-        turn = plant.p.R_w / plant.p.T_r * moment
-        plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
-        if not plant.is_finite:
-            break
-        rows.append([(k + 1) * TICK, steer, *plant.motion[:POSE], moment])
-    return replace(Series(*np.array(rows).T), failed=not plant.is_finite)
 
 
 def _make_steering_profile(scenario: Scenario) -> Array:
@@ -98,8 +83,8 @@ def _make_steering_profile(scenario: Scenario) -> Array:
 def run_check() -> list[fmvss126.SineDwellResult]:
     """Drive the check without control and with the law, to both sides; A is the former's."""
     car = TestCar(make_outside_vehicle(), 80.0 / 3.6, 16.0, 4.508, 0.8)  # a BMW 320i
-    none = _make_plant_drive(MODEL)
-    law = _make_plant_drive(MODEL, _compute_limited_moment)
+    none = _make_plant_drive()
+    law = _make_plant_drive(_compute_limited_moment)
     A = fmvss126.measure_reference_angle(none, car)
     pairs = ((none, _FAILS_AT), (law, _PASSES_AT))
     return [fmvss126.run(drive, car, A, [multiple]) for drive, multiple in pairs]

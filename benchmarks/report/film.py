@@ -114,9 +114,7 @@ def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:
     from PIL import Image
 
     pictures = [Image.fromarray(frame) for frame in frames]
-    chosen = pictures[:: len(pictures) // 6 or 1]
-    sample = np.concatenate([np.asarray(picture)[::2, ::2] for picture in chosen])
-    palette = Image.fromarray(sample).quantize(_COLOURS, Image.Quantize.MEDIANCUT)
+    palette = pictures[len(pictures) // 2].quantize(_COLOURS)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     durations = [round(1000.0 / rate)] * len(indexed)
     durations[-1] += 1500  # ms, before it begins anew

@@ -92,7 +92,7 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
             max_rows = _ROWS // len(suites)
             left = len(table.cells) - max_rows
             cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
-            part = _split_table(cut, console.width)[0]
+            part = _split_table(cut, console)[0]
             console.print(_make_rich_table(table.title, part, console.width))
             if left > 0:
                 console.print(f"[dim]and {left} rows more[/]\n", highlight=False)
@@ -122,7 +122,7 @@ def print_suite(console: Console, suite: Suite) -> None:
     console.print(f"{escape(suite.text)}\n", highlight=False)
     shown = [table for table in suite.tables if not table.detail]
     for table in shown:
-        for i, part in enumerate(_split_table(table, console.width)):
+        for i, part in enumerate(_split_table(table, console)):
             title = f"{table.title} (continued)" if i else table.title
             console.print(_make_rich_table(title, part, console.width))
         if table.note:
@@ -132,29 +132,16 @@ def print_suite(console: Console, suite: Suite) -> None:
         console.print(f"{count} in the report (--html).\n", highlight=False)
 
 
-def _split_table(table: ResultTable, width: int) -> list[list[TextColumn]]:
-    """Split a table into parts of as many columns as the width takes, the first in all."""
+def _split_table(table: ResultTable, console: Console) -> list[list[TextColumn]]:
+    """Split a table into parts of as many columns as the screen takes, the first in all."""
     first, *columns = format_columns(table)
-    start = min(_measure_width(first), _choose_width(width) + 2) + 2
-    parts, used = [[first]], start
+    parts, unlimited = [[first]], console.options.update(max_width=10**6)
     for column in columns:
-        added = _measure_width(column)
-        if used + added > width and len(parts[-1]) > 1:
+        wider = _make_rich_table("", [*parts[-1], column], console.width)
+        if len(parts[-1]) > 1 and console.measure(wider, options=unlimited).minimum > console.width:
             parts.append([first])
-            used = start
         parts[-1].append(column)
-        used += added
     return parts
-
-
-def _measure_width(column: TextColumn) -> int:
-    longest = max(map(len, [column.heading, *column.texts]))
-    return (longest if column.is_numeric else min(longest, _MIN_WIDTH)) + 2
-
-
-def _choose_width(width: int) -> int:
-    """Choose the maximum of letters in the first column by the width of the screen (letters)."""
-    return _NAME if width >= _NARROW else _MIN_WIDTH
 
 
 def _make_rich_table(title: str, columns: list[TextColumn], width: int) -> RichTable:
@@ -163,12 +150,13 @@ def _make_rich_table(title: str, columns: list[TextColumn], width: int) -> RichT
     shown = RichTable(title=title, title_justify="left", box=style, padding=(0, 1, 0, 0))
     for i, column in enumerate(columns):
         right = i > 0 and column.is_numeric
-        longest = max(map(len, column.texts), default=0)
+        longest = max(map(len, [column.heading, *column.texts]))
+        limit = _NAME if i == 0 and width >= _NARROW else _MIN_WIDTH
         shown.add_column(
             column.heading,
             justify="right" if right else "left",
             no_wrap=right,
-            min_width=min(longest, _choose_width(width)) if i == 0 else None,
+            min_width=longest if right else min(longest, limit),
             overflow="fold",  # a long word goes on in the next line
         )
     for line in zip(*(column.texts for column in columns), strict=True):

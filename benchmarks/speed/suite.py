@@ -198,11 +198,8 @@ def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, 
 _RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
 
 
-class _SpeedResults(NamedTuple):
-    """What was measured: CPU times a unit (us) by name, and their rows and tables."""
-
-    taken: Mapping[str, Taken]
-    measured: Suite
+_SpeedResults = tuple[Mapping[str, Taken], Suite]
+"""What was measured: CPU times a unit (us) by name, and their rows and tables."""
 
 
 def _measure(request: Request) -> _SpeedResults:
@@ -217,12 +214,13 @@ def _measure(request: Request) -> _SpeedResults:
             env_steps.add_filters(measured, effort)
     seconds, more_absent = _add_first_use(measured, request.quick)
     _add_targets(measured, taken | seconds, absent | more_absent)
-    return _SpeedResults(taken, measured)
+    return taken, measured
 
 
 def _add_tables(suite: Suite, results: _SpeedResults) -> None:
-    suite.rows += results.measured.rows
-    suite.tables += results.measured.tables
+    _, measured = results
+    suite.rows += measured.rows
+    suite.tables += measured.tables
 
 
 def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
@@ -249,5 +247,5 @@ STUDY = Study(
     "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
     (0, 0),
     _measure, _add_tables,
-    lambda results: _make_verdict(results.taken, results.measured.tables[0]),
+    lambda results: _make_verdict(results[0], results[1].tables[0]),
 )  # fmt: skip
