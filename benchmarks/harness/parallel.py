@@ -125,17 +125,6 @@ class Bar(progress.Progress):
         )
         self._speaks, self._over = console is not None and not shown, Event()
 
-    def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
-        """Add a task as rich does, and report it in a line.
-
-        Args:
-            args: Description, and what rich takes.
-            options: Options of rich's, and the `unit` of the count.
-        """
-        made = super().add_task(*args, **options)
-        self._say()
-        return made
-
     def start(self) -> None:
         """Start to draw or to print lines."""
         super().start()
@@ -149,9 +138,10 @@ class Bar(progress.Progress):
 
     def _speak(self) -> None:
         while not self._over.wait(_EVERY):
-            self._say()
+            self.report()
 
-    def _say(self) -> None:
+    def report(self) -> None:
+        """Print how far the newest task is where no bar is drawn."""
         for task in self.tasks[-1:] if self._speaks else ():
             text = ""
             if task.total is not None:
@@ -182,6 +172,7 @@ def use_shared_bar(
     """
     with Bar(console) as bar:
         bar.add_task(title, total=total, unit=unit)
+        bar.report()
         token = _SHARED.set(bar)
         try:
             yield bar
@@ -213,6 +204,7 @@ def run_cases(
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases), unit="cases")
+        bar.report()
         for place, result in _execute_cases(function, cases, jobs):
             results[place] = result
             bar.advance(task)
