@@ -92,7 +92,6 @@ def _compute_errors(
     return numbers
 
 
-SIGNALS = ("beta", "gamma", "yaw_moment")
 _ENTRIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "none": ("none", "", {}),
     "feedforward": ("feedforward", "", {}),
@@ -123,7 +122,7 @@ class _AgentSimulation(Simulation):
             if episode.failed:  # fewer ticks are no better drive
                 raise RuntimeError(f"{label}: the car of seed {seed} failed")
             numbers |= {(label, name): value for name, value in values.items()}
-            curves[label] = {name: episode[name] for name in SIGNALS}
+            curves[label] = {name: episode[name] for name in ("beta", "gamma", "yaw_moment")}
         curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
         return numbers, Example(episode["t"], curves)
 

@@ -295,11 +295,11 @@ def _add_figures(suite: Suite, done: CaseResults, draw: ModuleType) -> None:
             title = f"ISO 7401, {case.car}: response to steering, {unit}"
             suite.figures.append((title, figure, "Measured by a swept sine, no control."))
     for track, car in product(iso.TRACKS, CARS):
-        runs = {
-            case.agent: max((x for x in result if x.passed), key=lambda x: x.speed,
-                            default=result[0])
-            for case, result in done.items() if (case.procedure, case.car) == (track, car)
-        }  # fmt: skip
+        runs = dict[str, iso.TrackRun]()
+        for case, result in done.items():
+            if (case.procedure, case.car) == (track, car):
+                clean = (run for run in result if run.passed)
+                runs[case.agent] = max(clean, key=lambda run: run.speed, default=result[0])
         speeds = ", ".join(f"{agent} {3.6 * run.speed:.0f} km/h" for agent, run in runs.items())
         text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
         suite.figures.append((f"{track}, {car}: way and cones", _draw_cones(runs, draw), text))
@@ -307,13 +307,10 @@ def _add_figures(suite: Suite, done: CaseResults, draw: ModuleType) -> None:
 
 def _draw_cones(runs: Mapping[str, iso.TrackRun], draw: ModuleType) -> Any:
     """Draw the paths of the centre of gravity, from where the first lane begins, and the cones."""
-    starts = {agent: run.speed * iso.ONSET for agent, run in runs.items()}
-    figure = draw.draw_track(
-        {agent: (run.series.X - starts[agent], run.series.Y) for agent, run in runs.items()}
-    )
-    agent, run = list(runs.items())[-1]
+    paths = {x: (y.series.X - y.speed * iso.ONSET, y.series.Y) for x, y in runs.items()}
+    figure, run = draw.draw_track(paths), list(runs.values())[-1]
     places = [
-        (x - starts[agent], lane.offset + side * 0.5 * lane.width)
+        (x - run.speed * iso.ONSET, lane.offset + side * 0.5 * lane.width)
         for lane in run.lanes
         for x in np.linspace(lane.start, lane.start + lane.length, 5)
         for side in (-1.0, 1.0)
