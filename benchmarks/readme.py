@@ -1,38 +1,48 @@
-"""The tables of results in README.md and docs/results/benchmark.md.
+"""The tables of results in README.md, docs/results/benchmark.md and docs/PAPERS.md.
 
 `python -m sideslip.benchmarks.readme` drives the entries in every task with steering, and writes
-their rows to docs/first.json and both tables. The columns of transfer are those of
-docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes.
+their rows to docs/first.json and two tables. The columns of transfer are those of
+docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes. With
+--papers it drives each of the five papers' systems in its paper's simulation, beside the common
+score of the small car's tasks, and writes docs/own_ground.json and the table in docs/PAPERS.md.
 """
 
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from ..agents.baselines import FILTER
+from ..envs.record import Array
 from ..envs.scenarios.world import GROUPS, make_world
 from .control.entries import JOINT, LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Entry
-from .control.run import Results, measure
+from .control.run import NUMBERS, Results, measure
 from .control.score import CONSTANTS, Standing, rank_entries
 from .control.tasks import (
     NOMINAL,
     PARAMETERS,
     STATE,
     STEERING,
+    TIERS,
     TITLES,
     WORLD,
     ControlTask,
     list_scored_tasks,
     make_salt,
+    make_salted_seeds,
     make_task_seeds,
 )
 from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
+from .harness.stats import interval, ratio_of_roots
+from .papers import dakf_stability, double_layer, dual_rate, tie_vision, uneven_delay
+from .papers.ledger import PaperFilter
+from .papers.manoeuvres import EstimationSimulation
 
 README, PAGE = Path("README.md"), Path("docs/results/benchmark.md")
 ROWS, TRANSFER = Path("docs/first.json"), Path("docs/procedures.json")
@@ -65,13 +75,12 @@ _DOUBLED = ", ranges doubled"
 
 
 def _measure_entries(
-    jobs: int | None = None, console: Console | None = None, salt: str = "",
-    keep: Path | None = None,
-) -> list[ResultRow]:  # fmt: skip
+    salt: str, jobs: int | None = None, console: Console | None = None, keep: Path | None = None
+) -> list[ResultRow]:
     """Drive the entries and nominal in every scored task with steering; return their rows."""
     policies = {entry.agent: kind for kind, entries in LEARNED.items() for entry in entries}
     pairs = [(NOMINAL, ""), *(pair for pairs in PAGE_ENTRIES.values() for pair in pairs)]
-    salt, rows = salt or make_salt(), list[ResultRow]()
+    rows = list[ResultRow]()
     for changes, episodes in (({}, EPISODES), ({"world": _double_ranges()}, _DOUBLED_EPISODES)):
         cases = [
             (replace(task, changes=changes), Entry(*pair))
@@ -81,7 +90,7 @@ def _measure_entries(
         ]
         seeds = make_task_seeds(salt, episodes)
         results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
-        check_driven(results)
+        _check_driven(results)
         suite = Suite("control", "", "")
         for tier in TITLES:
             for standing in rank_entries(results, tier):
@@ -118,12 +127,8 @@ def _double_ranges() -> dict[str, Any]:
     return world.to_dict()
 
 
-def check_driven(results: Results) -> None:
-    """Raise ValueError for an entry that could not drive.
-
-    Args:
-        results: Episodes.
-    """
+def _check_driven(results: Results) -> None:
+    """Raise ValueError for an entry that could not drive."""
     for (task, entry), result in results.items():
         if result.error:
             raise ValueError(f"{entry.label} in {task.name}: {result.error}")
@@ -170,7 +175,7 @@ def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str
             line.append("" if value is None else f"{factor * value:{form}}")
         lines.append(line)
     tiers = (f"{tier}, {SPEEDS[tier]}" for tier in TITLES)
-    return format_table(lines, [*tiers, *_TRANSFER])
+    return _format_table(lines, [*tiers, *_TRANSFER])
 
 
 def _make_task_table(rows: Sequence[ResultRow]) -> str:
@@ -180,7 +185,7 @@ def _make_task_table(rows: Sequence[ResultRow]) -> str:
         [task.scenario, *(cells.format(task.name, pairs, True) for pairs in PAGE_ENTRIES.values())]
         for task in _list_tasks()
     ]
-    return format_table(lines, list(PAGE_ENTRIES))
+    return _format_table(lines, list(PAGE_ENTRIES))
 
 
 def _make_doubled_table(rows: Sequence[ResultRow]) -> str:
@@ -190,30 +195,17 @@ def _make_doubled_table(rows: Sequence[ResultRow]) -> str:
         [name, *(cells.format(x, pairs, True) for x in heads)]
         for name, pairs in PAGE_ENTRIES.items()
     ]
-    return format_table(lines, heads)
+    return _format_table(lines, heads)
 
 
-def format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
-    """Format a table whose first column has no head.
-
-    Args:
-        lines: Cells.
-        heads: Heads of the other columns.
-    """
+def _format_table(lines: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
+    """Format a table whose first column has no head."""
     body = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([f"| | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|", *body])
 
 
-def replace_table(text: str, new_table: str) -> str:
-    """Replace a page's table with the same first column head.
-
-    Args:
-        text: Page.
-        new_table: Markdown.
-
-    Raises:
-        ValueError: The page has no such table, or several.
-    """
+def _replace_table(text: str, new_table: str) -> str:
+    """Replace a page's table with the same first column head; ValueError for none or several."""
     first = re.escape(new_table.split(" | ")[1].split(",")[0])
     pattern = re.compile(rf"^\| \| {first}[^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
@@ -224,12 +216,150 @@ def replace_table(text: str, new_table: str) -> str:
 def _write_tables(rows: Sequence[ResultRow]) -> None:
     """Write rows and the tables made of them, in the repository's root."""
     transfer = read_json(TRANSFER) if TRANSFER.is_file() else []
-    readme = replace_table(README.read_text(encoding="utf-8"), _make_table(rows, transfer))
-    page = replace_table(PAGE.read_text(encoding="utf-8"), _make_task_table(rows))
-    page = replace_table(page, _make_doubled_table(rows))
+    readme = _replace_table(README.read_text(encoding="utf-8"), _make_table(rows, transfer))
+    page = _replace_table(PAGE.read_text(encoding="utf-8"), _make_task_table(rows))
+    page = _replace_table(page, _make_doubled_table(rows))
     write_json(ROWS, rows)
     write_text(README, readme)
     write_text(PAGE, page)
+
+
+PAPERS, SYSTEM_ROWS = Path("docs/PAPERS.md"), Path("docs/own_ground.json")
+_TIER = next(iter(TIERS))  # of the papers' car
+SYSTEM_EPISODES = 32  # a task
+_HEADS = ("the paper's", "ours", "the paper's / %", "ours / %", "its cost / %", "our cost / %")
+_RATIO, _COST = "ratio", "cost_vs_nominal"
+_RECOMMENDED = PaperFilter(JOINT, JOINT)
+_INFORMED = PaperFilter("informed", FILTER, vehicle="true")
+"""The filter against which those of papers without a controller stand: it knows the true car."""
+
+
+@dataclass(frozen=True)
+class _System:
+    """A paper's system, where it was shown and what counts there."""
+
+    paper: str  # short name of the paper
+    entry: Entry  # its controller on its filter; of a paper without a controller LQR on its filter
+    recommended: Entry  # what this project recommends instead
+    task: ControlTask  # the paper's simulation, with its sensors and its reference
+    metric: str  # metric of an episode, or estimate of the filter, whose root mean square counts
+    criterion: str  # the metric in words
+    simulations: Sequence[EstimationSimulation] = ()  # of a paper without a controller
+    label: str = ""  # the paper's filter among those of the simulations
+    # who drives the tasks where its own filter takes no lost or uneven frames
+    common_entry: Entry | None = None
+
+    @property
+    def scenario(self) -> str:
+        """Name of its rows."""
+        return f"{self.task.scenario}, {self.criterion}"
+
+    def measure(self, seeds: Sequence[int], jobs: int | None) -> tuple[Array, Array, Array]:
+        """Measure root mean squares (n,) of the paper's system, ours and a rival.
+
+        The rival is tuned LQG with the same sensors; a filter stands beside `_INFORMED` instead.
+        """
+        sensor = "camera" if "Vision" in self.task.env_id else "gps"
+        rival_entry = Entry(REFERENCE_CONTROLLER, f"{FILTER}, {sensor}")
+        entries = (self.entry, self.recommended, rival_entry)
+        if self.metric in NUMBERS:
+            driven = measure([(self.task, entry) for entry in entries], seeds, jobs=jobs)
+            first, second, rival = (driven[self.task, entry][self.metric] for entry in entries)
+            return first, second, rival
+        (drives,) = (x for x in self.simulations if x.name == self.task.scenario)
+        paper_filters = [x for x in drives.filters if x.label == self.label]
+        filters = (*paper_filters, _RECOMMENDED, _INFORMED)
+        numbers = replace(drives, filters=filters).measure(tuple(seeds)).numbers
+        original, recommended, rival = (numbers[x.label, self.metric] for x in filters)
+        return original, recommended, rival
+
+
+def _make_ground(sensors: str, scenario: str, reference: str = "", **changes: Any) -> ControlTask:
+    return ControlTask("", f"sideslip/{sensors}-v0", "coms", reference, scenario, changes=changes)
+
+
+_SLIP, _RECOMMENDED_ENTRY = "error of the sideslip angle", Entry("adaptive-lqr", JOINT)
+_FOLLOWING = (
+    dakf_stability.PAPER,
+    Entry("model-following", dakf_stability.DAKF),
+    _RECOMMENDED_ENTRY,
+    _make_ground("YawGps", dakf_stability.FIG7, steering=True, control_period=1),
+)
+_FIG5, _FIG9, _FIG4 = uneven_delay.FIG5, double_layer.FIG9, dual_rate.FIG4
+_OFFSET = "error of the lateral offset"
+_FILTERS = (
+    (uneven_delay, "uneven-delay-kf", "YawVision", _FIG5, uneven_delay.PROPOSED, ("y_l", _OFFSET)),
+    (double_layer, "double-layer", "YawGps", _FIG9, double_layer.PROPOSED, ("beta", _SLIP)),
+    (dual_rate, "dual-rate", "YawGps", _FIG4, dual_rate.PSEUDO, ("beta", _SLIP)),
+)
+SYSTEMS = (
+    _System(
+        "tie-vision",
+        Entry("two-dof", "multirate-residual-kf", {"filter": {}, "controller": {}}),  # untuned
+        _RECOMMENDED_ENTRY,
+        _make_ground("YawVision", tie_vision.FIG8, "zero-slip", control_period=1),
+        "rms_slip",
+        "sideslip angle",
+        common_entry=Entry("two-dof", REFERENCE_FILTER),
+    ),
+    _System(*_FOLLOWING, "rms_slip_error", _SLIP),
+    _System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
+    *(
+        _System(
+            module.PAPER,
+            Entry(REFERENCE_CONTROLLER, name),
+            Entry(REFERENCE_CONTROLLER, JOINT),
+            _make_ground(sensors, scenario),
+            *criterion,
+            module.SIMULATIONS,
+            label,
+        )
+        for module, name, sensors, scenario, label, criterion in _FILTERS
+    ),
+)
+
+
+def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[ResultRow]:
+    """Drive every system on its own ground and, beside nominal, in the small car's tasks."""
+    suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, SYSTEM_EPISODES)
+    for system in SYSTEMS:
+        original, recommended, rival = (x**2 for x in system.measure(seeds, jobs))
+        for entry, squares in ((system.entry, original), (system.recommended, recommended)):
+            labels = {"estimator": entry.estimator, "controller": entry.agent, "salt": salt}
+            labels |= {"scenario": system.scenario, "paper": system.paper}
+            ratio = {_RATIO: interval(squares, ratio_of_roots, rival)}
+            suite.add_rows([ratio], system.task.env_id, n=SYSTEM_EPISODES, **labels)
+    scored = [x for x in list_scored_tasks() if (x.tier, x.env_id) == (_TIER, STEERING)]
+    systems = [x for y in SYSTEMS for x in (y.common_entry or y.entry, y.recommended)]
+    drivers = dict.fromkeys((Entry(NOMINAL), *systems))
+    pairs = [(task, entry) for task in scored for entry in drivers]
+    seeds_by_task = make_task_seeds(salt, SYSTEM_EPISODES)
+    common = measure(pairs, seeds_by_task, jobs=jobs, console=console)
+    _check_driven(common)
+    for standing in rank_entries(common, _TIER):
+        standing.add_rows(suite, salt)
+    names = {_COST: f"tier {_TIER}"}
+    return [row for row in suite.rows if row.scenario == names.get(row.metric, row.scenario)]
+
+
+def _make_system_table(rows: Sequence[ResultRow]) -> str:
+    """Make the table of docs/PAPERS.md: a line a system and criterion."""
+    cells = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
+
+    def format_cell(scenario: str, entry: Entry, metric: str) -> str:
+        row = cells[scenario, entry.agent, entry.estimator, metric]
+        value, low, high = (100.0 * x for x in (row.value, row.low, row.high))
+        return f"{value:.0f} [{low:.0f}, {high:.0f}]"
+
+    lines = []
+    for system in SYSTEMS:
+        both = (system.entry, system.recommended)
+        ground = [format_cell(system.scenario, entry, _RATIO) for entry in both]
+        common_entries = (system.common_entry or system.entry, system.recommended)
+        common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in common_entries]
+        names = [f"`{x.agent}` on `{x.estimator}`" for x in both]
+        lines.append([f"{system.paper}, {system.scenario}", *names, *ground, *common])
+    return _format_table(lines, _HEADS)
 
 
 def _main(
@@ -237,10 +367,17 @@ def _main(
     keep: Annotated[Path | None, typer.Option(help="Folder for finished cases.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
     driven: Annotated[bool, typer.Option("--driven", help="Make the tables of old rows.")] = False,
+    papers: Annotated[bool, typer.Option("--papers", help="The table of docs/PAPERS.md.")] = False,
 ) -> None:
-    """Drive README's entries and write their rows and tables."""
-    console = Console(stderr=True)
-    _write_tables(read_json(ROWS) if driven else _measure_entries(jobs, console, salt, keep))
+    """Drive README's entries, or the papers' systems, and write their rows and tables."""
+    console, salt = Console(stderr=True), salt or make_salt()
+    if not papers:
+        _write_tables(read_json(ROWS) if driven else _measure_entries(salt, jobs, console, keep))
+        return
+    rows = read_json(SYSTEM_ROWS) if driven else _measure_systems(salt, jobs, console)
+    text = _replace_table(PAPERS.read_text(encoding="utf-8"), _make_system_table(rows))
+    write_json(SYSTEM_ROWS, rows)
+    write_text(PAPERS, text)
 
 
 if __name__ == "__main__":

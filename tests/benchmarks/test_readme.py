@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import own_ground, readme
+from sideslip.benchmarks import readme
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, read_json
@@ -29,12 +29,12 @@ def test_the_tables_are_made_from_their_files() -> None:
     pages = {readme.README: readme._make_table(rows, transfer)}
     doubled = readme._make_doubled_table(rows)
     pages[readme.PAGE] = readme._make_task_table(rows)
-    pages[own_ground.PAGE] = own_ground._make_table(read_json(ROOT / own_ground.ROWS))
+    pages[readme.PAPERS] = readme._make_system_table(read_json(ROOT / readme.SYSTEM_ROWS))
     for path, made in pages.items():
         text = (ROOT / path).read_text()
-        assert readme.replace_table(text, made) == text
-        assert path != readme.PAGE or readme.replace_table(text, doubled) == text
-        episodes = (own_ground if path == own_ground.PAGE else readme).EPISODES
+        assert readme._replace_table(text, made) == text
+        assert path != readme.PAGE or readme._replace_table(text, doubled) == text
+        episodes = readme.SYSTEM_EPISODES if path == readme.PAPERS else readme.EPISODES
         assert re.search(rf"\b{episodes} (drives|seeds)\b", text)
 
 
@@ -83,12 +83,12 @@ def test_a_line_has_cost_and_cars_lost_in_every_tier_and_what_is_transferred() -
     assert line == "| no control |  | 50 (7) |  | 3.5 |  |"
     assert any("`lqr` on" in line and line.endswith("| 100 |") for line in lines)
     with pytest.raises(ValueError, match="no table that begins with"):
-        readme.replace_table("# a README", line)
+        readme._replace_table("# a README", line)
 
 
 def test_a_paper_filter_is_measured_as_its_own_simulation_has_it() -> None:
     """On the paper's ground its error is the ledger's, and the informed filter errs least."""
-    system = next(x for x in own_ground.SYSTEMS if x.paper == "dual-rate")
+    system = next(x for x in readme.SYSTEMS if x.paper == "dual-rate")
     shown, joint, informed = system.measure(range(2), None)
     (drives,) = (x for x in system.simulations if x.name == "dual-rate-fig4")
     numbers = drives.measure((0, 1)).numbers
@@ -108,7 +108,7 @@ def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPat
     wrong = DriveResult(np.zeros((0, len(NUMBERS))), error="no action")
     monkeypatch.setattr(readme, "measure", lambda x, *_, **__: dict.fromkeys(x, wrong))
     with pytest.raises(ValueError, match=r"in .*: no action"):
-        readme._measure_entries()
+        readme._measure_entries("ab12")
 
 
 def _ratio(squares: Mapping[str, Any], of: str, to: str) -> float:
