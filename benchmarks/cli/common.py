@@ -93,7 +93,7 @@ def show_episode(
     if parquet is not None:
         drive.to_parquet(parquet)
     if kml is not None:
-        write_text(kml, make_track_kml(drive.log.name, {driver: (drive["X"], drive["Y"])}))
+        write_text(kml, make_track_kml(drive.log.name, driver, drive["X"], drive["Y"]))
     print_written(console, plot, parquet, kml)
 
 

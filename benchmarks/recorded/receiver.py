@@ -315,8 +315,7 @@ def write_kml(path: Path, replay: ReceiverReplay) -> None:
         replay: Results of a log.
     """
     track = replay.track
-    fixes = {"fixes": (track.east, track.north)}
-    write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
+    write_text(path, make_track_kml(replay.name, "fixes", track.east, track.north, track.origin))
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:

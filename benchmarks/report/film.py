@@ -1,4 +1,4 @@
-"""Films of drives, with other cars as ghosts, as MP4 or GIF; and tracks for map programs (KML)."""
+"""Films of drives, with other cars as ghosts, as MP4 or GIF; and a track for map programs (KML)."""
 
 import itertools
 import tempfile
@@ -128,40 +128,31 @@ _DOCUMENT = """\
 <kml xmlns="http://www.opengis.net/kml/2.2">
 <Document>
 <name>{title}</name>
-{places}
-</Document>
-</kml>
-"""
-_PLACE = """\
 <Placemark>
 <name>{name}</name>
-<Style><LineStyle><color>{colour}</color><width>3</width></LineStyle></Style>
+<Style><LineStyle><color>ffb27200</color><width>3</width></LineStyle></Style>
 <LineString><tessellate>1</tessellate><coordinates>
 {points}
 </coordinates></LineString>
-</Placemark>"""
+</Placemark>
+</Document>
+</kml>
+"""
 
 
 def make_track_kml(
-    title: str,
-    tracks: dict[str, tuple[Array, Array]],
-    colours: dict[str, str] | None = None,
-    origin: tuple[float, float] = ORIGIN,
+    title: str, name: str, X: Array, Y: Array, origin: tuple[float, float] = ORIGIN
 ) -> str:
-    """Make a KML document of tracks.
+    """Make a KML document of a track.
 
     Args:
         title: Title of the document.
-        tracks: Tracks, X east and Y north (m), by name.
-        colours: Colours, "#RRGGBB", by name.
+        name: Name of the track.
+        X: Places to the east (m), shape (n,).
+        Y: Places to the north (m), shape (n,).
         origin: Place of X = Y = 0 (deg north and east).
     """
-    places = []
-    for name, (X, Y) in tracks.items():
-        shown = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAX_POINTS)).round().astype(int))
-        latitude, longitude = to_degrees(X[shown], Y[shown], origin)
-        points = "\n".join(f"{e:.8f},{n:.8f}" for n, e in zip(latitude, longitude, strict=True))
-        rgb = (colours or {}).get(name, "#0072B2").lstrip("#")
-        bgr = "ff" + rgb[4:6] + rgb[2:4] + rgb[0:2]  # KML: alpha, blue, green, red
-        places.append(_PLACE.format(name=escape(name), colour=bgr.lower(), points=points))
-    return _DOCUMENT.format(title=escape(title), places="\n".join(places))
+    shown = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAX_POINTS)).round().astype(int))
+    latitude, longitude = to_degrees(X[shown], Y[shown], origin)
+    points = "\n".join(f"{e:.8f},{n:.8f}" for n, e in zip(latitude, longitude, strict=True))
+    return _DOCUMENT.format(title=escape(title), name=escape(name), points=points)
