@@ -117,11 +117,6 @@ def test_the_search_finds_the_table_at_25_kmh_among_others() -> None:
     assert ours.design.q_ratio == pytest.approx(25.12, abs=0.01)
 
 
-def test_an_unknown_placement_is_refused() -> None:
-    with pytest.raises(ValueError, match="placement is one of"):
-        design_pi(COMS, V, POLE, "both")
-
-
 # Margins: a loop with the factor applied has a pole on the unit circle, there.
 DT = 0.01
 
