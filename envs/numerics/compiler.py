@@ -24,12 +24,12 @@ from typing import Any, NamedTuple
 import llvmlite
 import numba
 from llvmlite import binding
-from numba.core import typed_passes, types, untyped_passes
+from numba.core import types
 from numba.core.base import BaseContext
 from numba.core.codegen import Codegen, JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult, StateDict, compile_result
+from numba.core.compiler import Compiler, CompileResult, compile_result
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.compiler_machinery import CompilerPass, PassManager
+from numba.core.compiler_machinery import PassManager
 from numba.core.dispatcher import _FunctionCompiler
 from numba.core.environment import Environment, lookup_environment
 from numba.core.funcdesc import PythonFunctionDescriptor, default_mangler
@@ -52,43 +52,30 @@ _Function = Callable[..., object]
 _Linked = tuple[CompileResult, dict[str, Environment], list[Path | None]]
 
 _FUNCTION: Any = types.Function  # operators and numba's own functions
-_resolve = _FUNCTION.get_call_type
 _signatures: dict[tuple[object, ...], Signature] = {}
-_UNTYPED = (
-    "TranslateByteCode FixupArgs IRProcessing RewriteSemanticConstants DeadBranchPrune "
-    "GenericRewrites RewriteDynamicRaises ReconstructSSA"
-)
-_TYPED = "NopythonTypeInference PreLowerStripPhis NativeLowering NoPythonBackend"
-_PASSES = [getattr(untyped_passes, name) for name in _UNTYPED.split()]
-_PASSES += [getattr(typed_passes, name) for name in _TYPED.split()]
-
-
-class _Passes(PassManager):
-    """Passes without numba's report of each, for which it writes out all types."""
-
-    def _runPass(self, index: int, step: CompilerPass, state: StateDict) -> None:
-        step.analysis = self._analysis
-        step.run_pass(state)
-
-
-def _resolve_call(
-    function: types.Function, context: BaseContext, args: _Types, kws: _Keywords
-) -> Signature:
-    """Signature of an operator or a function of numba's for argument types, looked up once."""
-    if kws:
-        return _resolve(function, context, args, kws)
-    key = function, context, args, ConfigStack.top_or_none().nrt
-    if key not in _signatures:
-        _signatures[key] = _resolve(function, context, args, kws)
-    return _signatures[key]
+_PASSES = {
+    "TranslateByteCode", "FixupArgs", "IRProcessing", "RewriteSemanticConstants", "DeadBranchPrune",
+    "GenericRewrites", "RewriteDynamicRaises", "ReconstructSSA", "NopythonTypeInference",
+    "PreLowerStripPhis", "NativeLowering", "NoPythonBackend",
+}  # fmt: skip
+"""numba's passes that a function needs which neither counts references nor holds another one."""
 
 
 @contextlib.contextmanager
 def _remember_signatures() -> Iterator[None]:
-    """Look up no call twice, and collect no garbage: each saves a fifth of the compiler's time."""
+    """Look up no call twice, and collect no garbage: each saves a tenth of the compiler's time."""
     enabled, resolve = gc.isenabled(), _FUNCTION.get_call_type
+
+    def resolve_once(
+        function: types.Function, context: BaseContext, args: _Types, kws: _Keywords
+    ) -> Signature:
+        key = function, context, args, *kws.items(), ConfigStack.top_or_none().nrt
+        if key not in _signatures:
+            _signatures[key] = resolve(function, context, args, kws)
+        return _signatures[key]
+
     gc.disable()
-    _FUNCTION.get_call_type = _resolve_call
+    _FUNCTION.get_call_type = resolve_once
     try:
         yield
     finally:
@@ -109,19 +96,31 @@ class _UnlinkedLibrary(JITCodeLibrary):
         self._finalize_dynamic_globals()
         self._finalized = True
 
-    def _get_own_module(self) -> binding.ModuleRef:
-        """The LLVM module of this function alone, for linking."""
-        return super()._get_module_for_linking()
+    def collect_callees(self) -> list[JITCodeLibrary]:
+        """All that it calls, callers first: LLVM's linker drops what nothing refers to yet."""
+        visited: dict[JITCodeLibrary, None] = {}
+
+        def visit(library: JITCodeLibrary) -> None:
+            if isinstance(library, _UnlinkedLibrary):
+                for callee in library._linking_libraries:
+                    if callee not in visited:
+                        visit(callee)
+            visited[library] = None
+
+        visit(self)
+        return list(reversed(visited))[1:]
+
+    def link_into(self, module: binding.ModuleRef) -> binding.ModuleRef:
+        """Link all that it calls into a module."""
+        for callee in self.collect_callees():
+            # of a part its function alone: those below it are in the list
+            kind = JITCodeLibrary if isinstance(callee, _UnlinkedLibrary) else type(callee)
+            module.link_in(kind._get_module_for_linking(callee), preserve=True)
+        return module
 
     def _get_module_for_linking(self) -> binding.ModuleRef:
         """The module of this function and all below it, which numba's own functions link."""
-        module = self._get_own_module().clone()
-        for callee in _collect_callees(self)[1:]:
-            if isinstance(callee, _UnlinkedLibrary):
-                module.link_in(callee._get_own_module(), preserve=True)
-            elif not isinstance(callee, _ExternalLibrary):
-                module.link_in(callee._get_module_for_linking(), preserve=True)
-        return module
+        return self.link_into(super()._get_module_for_linking().clone())
 
 
 class _KernelLibrary(JITCodeLibrary):
@@ -136,25 +135,13 @@ class _KernelLibrary(JITCodeLibrary):
         passes.run(self._final_module, options)
 
 
-class _BareLibrary:
-    """A part without those below it, which the kernel links itself."""
-
-    def __init__(self, part: JITCodeLibrary) -> None:
-        self._part, self._reload_init = part, part._reload_init
-
-    def _ensure_finalized(self) -> None:
-        self._part._ensure_finalized()
-
-    def _get_module_for_linking(self) -> binding.ModuleRef:
-        return self._part._get_own_module()
-
-
 class _ExternalLibrary:
     """A kernel that callers call as machine code: nothing is linked into them."""
 
+    _reload_init = frozenset[str]()  # numba reads it
+
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self._reload_init: set[str] = set()
 
     def _ensure_finalized(self) -> None:
         """Do nothing: numba asks before it links."""
@@ -167,13 +154,10 @@ class _ExternalLibrary:
 class _UnlinkedPipeline(Compiler):
     def define_pipelines(self) -> list[PassManager]:
         """numba's passes, but few for what neither counts references nor holds a function."""
-        if self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts)):
-            return super().define_pipelines()
-        passes = _Passes("part")
-        for pass_class in _PASSES:
-            passes.add_pass(pass_class, pass_class.__name__)
-        passes.finalize()
-        return [passes]
+        (pipeline,) = super().define_pipelines()
+        if not (self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts))):
+            pipeline.passes = [item for item in pipeline.passes if item[0].__name__ in _PASSES]
+        return [pipeline]
 
     def compile_extra(self, func: _Function) -> CompileResult:
         self.state.library = _UnlinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
@@ -310,14 +294,10 @@ def _link_library(part: CompileResult) -> _Linked:
     target = part.target_context
     library = _KernelLibrary(target.codegen(), part.library.name)
     library.enable_object_caching()
-    root, *callees = _collect_callees(part.library)
-    library.add_llvm_module(root._final_module.clone())  # where others find the function by name
-    library._reload_init.update(root._reload_init)
-    needs = [item.path for item in callees if isinstance(item, _ExternalLibrary)]
-    for item in callees:
-        if not isinstance(item, _ExternalLibrary):
-            is_part = isinstance(item, _UnlinkedLibrary)
-            library.add_linking_library(_BareLibrary(item) if is_part else item)
+    # the function's own module, not that for linking: others find its code by the name
+    library.add_llvm_module(part.library.link_into(part.library._final_module.clone()))
+    callees = part.library.collect_callees()
+    needs = [callee.path for callee in callees if isinstance(callee, _ExternalLibrary)]
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
     entry = target.get_executable(library, part.fndesc, part.environment)
     names = _list_environments(library)
@@ -325,21 +305,6 @@ def _link_library(part: CompileResult) -> _Linked:
     for name, environment in environments.items():
         library.codegen.set_env(name, environment)
     return part._replace(library=library, entry_point=entry), environments, needs
-
-
-def _collect_callees(library: JITCodeLibrary) -> list[JITCodeLibrary]:
-    """A part and all it calls, callers first: LLVM's linker drops what nothing refers to yet."""
-    visited: dict[JITCodeLibrary, None] = {}
-
-    def visit(node: JITCodeLibrary) -> None:
-        if isinstance(node, _UnlinkedLibrary):
-            for callee in node._linking_libraries:
-                if callee not in visited:
-                    visit(callee)
-        visited[node] = None
-
-    visit(library)
-    return list(reversed(visited))
 
 
 _RETURNS = {str(kind): kind for kind in (types.none, types.float64, types.int64, types.boolean)}
@@ -366,7 +331,7 @@ def _save(path: Path, key: str, linked: _Linked) -> None:
     library, descriptor = result.library, result.fndesc
     needs = [(need.parent.name, need.name) for need in needed_paths if need]
     constants = any(environment.consts for environment in environments.values())
-    if constants or library.has_dynamic_globals or result.reload_init:
+    if constants or library.has_dynamic_globals:
         return  # addresses and objects of this process
     own_name, returns = descriptor.env_name, str(result.signature.return_type)
     names = [own_name, *(name for name in _list_environments(library) if name != own_name)]

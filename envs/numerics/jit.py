@@ -24,7 +24,7 @@ config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _compile(function: F, apart: bool, **options_more: bool) -> F:
+def _compile(function: F, apart: bool = False, **options_more: bool) -> F:
     if config.DISABLE_JIT:
         return function
     make_kernel = _load_compiler()
@@ -43,15 +43,12 @@ def _load_compiler() -> Callable[..., object] | None:
     """The maker of our compiler's kernels; None for plain numba, on request or by its version."""
     if os.environ.get(_STOCK):
         reason = f"{_STOCK} is set"
-    elif not numba.__version__.startswith(f"{_SUPPORTED}."):
-        reason = f"our compiler is made for {_SUPPORTED}"
-    else:
-        try:
-            from .compiler import make_kernel
+    elif numba.__version__.startswith(f"{_SUPPORTED}."):
+        from .compiler import make_kernel
 
-            return make_kernel
-        except (ImportError, AttributeError) as error:
-            reason = f"our compiler cannot use it: {error}"
+        return make_kernel
+    else:
+        reason = f"our compiler is made for {_SUPPORTED}"
     text = "compiles by itself: longer, in every process, and for the same numbers"
     report_once("stock", f"numba {numba.__version__} {text} ({reason})")
     return None
@@ -63,19 +60,15 @@ class _Decorator(Protocol):
     def __call__(self, function: F) -> F: ...
 
 
-def _make_decorator(apart: bool = False, **options: bool) -> _Decorator:
-    return lambda function: _compile(function, apart, **options)
-
-
-jit = _make_decorator()
+jit: _Decorator = _compile
 """Compile with numba: IEEE arithmetic in the order written; stock numba has no disk cache."""
-jit_nrt = _make_decorator(_nrt=True)
+jit_nrt: _Decorator = functools.partial(_compile, _nrt=True)
 """Compile with reference counting: what allocates or reshapes arrays, and its callers. All others
 in `envs` and `estimators` do without it, which halves the time of a filter's tick."""
-inline = _make_decorator(forceinline=True)
+inline: _Decorator = functools.partial(_compile, forceinline=True)
 """Compile into the callers: what takes many numbers and is called often. A call of a plant's
 function passes some sixty numbers through memory, which takes as long as the function itself."""
-noinline = _make_decorator(apart=True)
+noinline: _Decorator = functools.partial(_compile, apart=True)
 """Compile once, to machine code that all callers call: what is long and called seldom. Stock numba
 compiles it as `jit` does."""
 
