@@ -21,7 +21,7 @@ PATHS = {
     "action": (
         Step("envs/stability.py", "StabilityEnv.step", "checks the action's shape",
              "fractions of full scale, shape (1,) or (2,)"),
-        Step("envs/engine/step.py", "step_workspace",
+        Step("envs/engine/step.py", "step_episode",
              "clips or refuses it, and holds it for n ticks of 1 ms",
              "yaw moment N_z (N m) and added steering (rad)"),
         Step("envs/engine/tick.py", "integrate_tick",

@@ -15,8 +15,8 @@ from .camera_simulator import CameraSimulator
 from .engine.config import EnvConfig
 from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
-from .engine.step import step_workspace
-from .engine.views import CarTruth, Episode, Workspace, compute_true_states
+from .engine.step import step_episode
+from .engine.views import CarTruth, Episode, compute_true_states, make_episode_arrays
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record
@@ -35,13 +35,15 @@ _SNAPSHOT = {
     "params": "p", "state": "z", "switches": "switches", "rows": "rows", "packets": "packets",
     "report": "report",
 }  # fmt: skip
-"""Arrays of the workspace by their names in a snapshot."""
+"""Arrays of the episode by their names in a snapshot."""
 
 
 @functools.cache
 def _compile_step() -> Callable[..., int]:
-    """Compile `step_workspace` for the types that every environment has."""
-    return compile_call(step_workspace, np.zeros(1), np.zeros(1, np.float32))
+    """Compile `step_episode` for the types that every environment has."""
+    vector, matrix, action = np.zeros(1), np.zeros((1, 1)), np.zeros(1, np.float32)
+    arrays = vector, vector, np.zeros(1, np.int64), action, matrix, matrix, vector, matrix, matrix
+    return compile_call(step_episode, EpisodeArrays(*arrays), action)
 
 
 class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
@@ -171,7 +173,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         self.observation_space, self.action_space = self.config.make_spaces()
         self._action_width = self.config.action_width
         self._fail_on_bad_action = on_bad_action == "fail"
-        self._workspace = Workspace(self.config)
+        self._row = make_episode_arrays(self.config)
         self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
@@ -192,17 +194,17 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
         self.final_rows[:], self.final_packets[:] = self.rows, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
-        self._workspace.allocate(len(config.start.params))
+        self._fit_params(len(config.start.params))
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._row)
         self._over = False
         self._start_episode()
         self.ticks_done, self.annotations = 1, {}
-        info = make_info(self._workspace.read_report())
+        info = make_info(self._row.report.tolist())
         if self.camera is not None:
             info |= self.camera.metadata_flags
         if self._traces:
             self._record_step()
-        return self._workspace.copy_observation(), info
+        return self._row.obs.copy(), info
 
     def step(
         self, action: npt.ArrayLike
@@ -222,7 +224,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
-        camera, row = self.camera, self._workspace.row
+        camera, row = self.camera, self._row
         before = row.z if camera is None else row.z.copy()
         done = self._advance(command)
         if done <= 0:
@@ -232,22 +234,27 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         elif camera is not None:
             camera.process_step(before, row, done)
         self.ticks_done = done
-        info = make_info(self._workspace.read_report())
+        info = make_info(self._row.report.tolist())
         if camera is not None:
             info |= camera.metadata_flags
         terminated, truncated = info["failure"] != RUNNING, info["is_success"]
         self._over = terminated or truncated
         if self._traces:
             self._record_step()
-        return self._workspace.copy_observation(), -info["cost"], terminated, truncated, info
+        return self._row.obs.copy(), -info["cost"], terminated, truncated, info
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Advance one control period; returns the ticks done, or the code of a refusal."""
-        done: int = _compile_step()(self._workspace.vector, command)
+        done: int = _compile_step()(self._row, command)
         if done >= WILD:
             done -= WILD
             warn_once(self, command)
         return done
+
+    def _fit_params(self, width: int) -> None:
+        """Make room for parameters with a trace behind them, or without."""
+        if len(self._row.p) != width:
+            self._row = self._row._replace(p=np.zeros(width))
 
     def _adapt_options(self, options: dict[str, Any]) -> dict[str, Any]:
         """Adapt options of reset to what a subclass drives; ValueError for one that it cannot."""
@@ -273,10 +280,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         if spec is not None and self.camera is not None and self.camera.metadata_flags:
             spec.nondeterministic = True
         self._spec = spec
-
-    @property
-    def _row(self) -> EpisodeArrays:
-        return self._workspace.row
 
     @property
     def rows(self) -> Array:
@@ -376,7 +379,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._workspace.allocate(len(snapshot["params"]))
+        self._fit_params(len(snapshot["params"]))
         for name, part in _SNAPSHOT.items():
             getattr(self._row, part)[:] = snapshot[name]
         self._episode = snapshot["config"]

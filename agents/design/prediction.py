@@ -48,7 +48,7 @@ from ...envs.vehicle.dynamics import (
     rk4,
 )
 from ...envs.vehicle.parameters import Vehicle
-from ...envs.vehicle.tyres import FIALA, MAGIC_FORMULA, TYRE_LAWS, has_load_shift
+from ...envs.vehicle.tyres import FIALA, MAGIC_FORMULA, TYRE_LAWS
 from ..env_info import PlantKind
 from .sampled_model import DesignSpec
 
@@ -139,10 +139,7 @@ def make_prediction(
     """
     law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
     law = FIALA if law == MAGIC_FORMULA else law  # plans know no relaxation: see `fit_fiala`
-    kind = StepVariant(
-        small, law, spec.kind, roll, has_driver=0, lag=2,
-        has_load_shift=has_load_shift(small, law, roll), road=0, has_errors=0,
-    )  # fmt: skip
+    kind = StepVariant(small, law, spec.kind, roll, has_driver=0, lag=2, road=0, has_errors=0)
     ticks, step = spec.period, spec.period * TICK
     disturbance_time = spec.disturbance_time if spec.disturbances == "forces" else math.inf
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if plant.lags else (0.0, 0.0)

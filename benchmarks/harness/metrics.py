@@ -11,14 +11,14 @@ import numpy as np
 
 from ...envs.engine.layout import P, Z
 from ...envs.engine.step import make_step_variant
-from ...envs.engine.tick import apply_tyre_change, compute_static_load
+from ...envs.engine.tick import apply_tyre_change
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import read
 from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.dynamics import compute_gravity
-from ...envs.vehicle.tyres import compute_tyre_forces
+from ...envs.vehicle.tyres import compute_tyre_forces, compute_tyre_load
 
 _FULL = 0.999  # fraction of full scale from which on an input counts as saturated
 
@@ -160,7 +160,7 @@ def _write(params: Matrix, states: Matrix, switches: Matrix, out: Vector) -> Non
         kind = make_step_variant(p, switches[i])
         car = apply_tyre_change(read(p, P.car), change, z[Z.clock.tick] >= change.tick)
         _, g_y = compute_gravity(motion, read(p, P.road), kind.small_angle)
-        load = compute_static_load(drive, car, kind)
+        load = compute_tyre_load(drive, car, kind)
         F_yf, F_yr, _, _ = compute_tyre_forces(motion, load, car, g_y, kind)
         sin_d, cos_d = sincos(drive.delta_f)
         front = (motion.v_y + car.l_f * motion.gamma) * cos_d - motion.v_x * sin_d

@@ -20,7 +20,14 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle import dynamics
 from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, PlantVariant, TyreInputs, compute_tyre_load
+from ...envs.vehicle.tyres import (
+    FIALA,
+    LINEAR,
+    TYRE_LAWS,
+    PlantVariant,
+    TyreInputs,
+    compute_tyre_load,
+)
 from .motion import LoggedMotion
 from .quality import find_saturated
 
@@ -70,7 +77,7 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
     j = min(max(int(np.floor(place)), 0), rows.shape[1] - 2)
     logged = rows[3, j] + (place - j) * (rows[3, j + 1] - rows[3, j])
     inputs = TyreInputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i])
-    return compute_tyre_load(inputs, car, 0, 1)
+    return compute_tyre_load(inputs, car, PlantVariant(0, FIALA, 1))  # no limit of drive force
 
 
 @jit

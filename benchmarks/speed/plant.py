@@ -25,7 +25,7 @@ from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
-from ...envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load, has_load_shift
+from ...envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load
 from .timing import AbsentError, Workload, WorkloadSet
 
 _FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
@@ -114,12 +114,12 @@ def _make_cars(count: int, seed: int = 0) -> Cars:
 @jit
 def _advance(lanes: Cars, ticks: int) -> None:
     """Move all cars by some ticks of Kutta's three stages, a block at a time."""
-    remaining, shifting = lanes.remaining, has_load_shift(0, FIALA, 1)
+    remaining, variant = lanes.remaining, PlantVariant(0, FIALA, 1)
     for b in range(len(lanes.cars)):
         car, road = read(lanes.cars[b], _CAR), read(lanes.roads[b], _ROAD)
         push, command = read(lanes.pushes[b], _PUSH), read(lanes.commands[b], _INPUTS)
         motion, applied = read(lanes.motions[b], _MOTION), read(lanes.acting[b], _INPUTS)
-        load = compute_tyre_load(applied, car, 0, shifting)
+        load = compute_tyre_load(applied, car, variant)
         for _ in range(ticks):
             between = TyreInputs(
                 apply_lag(command.delta_f, applied.delta_f, remaining[0]),
@@ -131,10 +131,10 @@ def _advance(lanes: Cars, ticks: int) -> None:
                 apply_lag(command.T_l, applied.T_l, remaining[3]),
                 apply_lag(command.T_r, applied.T_r, remaining[3]),
             )
-            middle = compute_tyre_load(between, car, 0, shifting)
-            first, load = load, compute_tyre_load(applied, car, 0, shifting)
+            middle = compute_tyre_load(between, car, variant)
+            first, load = load, compute_tyre_load(applied, car, variant)
             loads = (first, middle, load)
-            motion = kutta3(motion, loads, push, car, road, TICK, PlantVariant(0, FIALA, 1))
+            motion = kutta3(motion, loads, push, car, road, TICK, variant)
         write(lanes.motions[b], motion, _MOTION)
         write(lanes.acting[b], applied, _INPUTS)
 

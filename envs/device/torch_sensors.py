@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Z
-from ..engine.outputs import NEVER_DUE, make_measurement_context
+from ..engine.outputs import make_measurement_context
 from ..numerics.packed import read
 from ..numerics.primitives import select
 from ..numerics.torch_backend import to_torch, torch
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, sample_sensor
-from ..ticks import NEVER
+from ..ticks import FOREVER, NEVER
 from ..vehicle.dynamics import Motion
 
 Tensor = torch.Tensor
@@ -188,4 +188,4 @@ def write_packed(state: SlowState, states: Tensor) -> None:
     states[Z.queue : Z.queue + len(flat)] = flat
     arrived = state.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
-    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, NEVER_DUE, arrived[0])
+    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, FOREVER, arrived[0])

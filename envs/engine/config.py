@@ -253,10 +253,8 @@ class EnvConfig:
         for name in ("steering", "yaw_first", "with_map", "strict"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} is True or False, got {short_repr(getattr(self, name))}")
-        for name, choices in (("fast", ("summary", "all")), ("on_bad_action", ("raise", "fail"))):
-            value, rule = getattr(self, name), " or ".join(map(repr, choices))
-            if not isinstance(value, str) or value not in choices:
-                raise ValueError(f"{name} is {rule}, got {short_repr(value)}")
+        check_choice("fast", self.fast, ("summary", "all"))
+        check_choice("on_bad_action", self.on_bad_action, ("raise", "fail"))
         check_choice("vision", self.vision, VISIONS)
         if self.vision == "image" and "camera" not in SENSOR_SETS[self.sensors]:
             raise ValueError(f"vision='image' needs a camera, and {self.sensors!r} has none")

@@ -176,7 +176,6 @@ class StepVariant(NamedTuple):
     roll: int  # 1: the body rolls
     has_driver: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
-    has_load_shift: int  # 1 where the lateral acceleration shifts load between the wheels
     road: int  # place in `scenarios.road.ROADS`
     has_errors: int  # 1: a `World` that is not ideal
 

@@ -12,12 +12,10 @@ from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
 from ..task import AGE_CAP, N_SAMPLED, REPORT, compute_reference
-from ..ticks import NEVER, TICK
+from ..ticks import FOREVER, NEVER, TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import FLAGS, EpisodeArrays, P, Z
 from .window import WINDOW
-
-NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 
 @jit
@@ -74,7 +72,7 @@ def update_newest(z: Vector, packet: Vector, tick: Scalar) -> None:
 def _move_due_packets(z: Vector, tick: Scalar, packets: Matrix, count: int) -> int:
     """Move the packets that arrive at this tick into `packets`; return the new count."""
     while True:
-        best, best_rank, due = -1, NEVER_DUE, NEVER_DUE
+        best, best_rank, due = -1, FOREVER, FOREVER
         under_way = int(z[Z.under_way])
         for slot in range(under_way):
             offset = Z.queue + slot * PACKET_WIDTH

@@ -26,7 +26,7 @@ from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
 from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity
 from ..vehicle.parameters import GRAVITY, MIN_RELAXATION
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z
-from .outputs import NEVER_DUE, finish_reset
+from .outputs import finish_reset
 from .step import make_step_params, make_step_variant
 from .tick import StepParams
 from .window import compute_profile_angle
@@ -189,7 +189,7 @@ def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: Episode
     z[Z.drive.delta_f] = z[Z.driver] = steer
     z[Z.drive.F_d], z[Z.drive.N_d] = p[P.disturbance.force] * n[0], p[P.disturbance.moment] * n[1]
     z[Z.clock.key_low], z[Z.clock.key_high] = from_word(key_low), from_word(key_high)
-    z[Z.clock.redraws], z[Z.clock.next_due] = redraws, NEVER_DUE
+    z[Z.clock.redraws], z[Z.clock.next_due] = redraws, FOREVER
     for sensor in range(len(Z.slow)):
         link, column = read(p, P.slow[sensor]), Z.slow[sensor]
         share = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)[0]

@@ -26,7 +26,7 @@ from ..task import (
     select_failure,
 )
 from ..ticks import TICK
-from ..vehicle.tyres import has_load_shift
+from ..vehicle.tyres import compute_tyre_load
 from .layout import FLAGS, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import finish_step
 from .tick import (
@@ -35,10 +35,8 @@ from .tick import (
     StepState,
     TickInputs,
     apply_tyre_change,
-    compute_static_load,
     integrate_tick,
 )
-from .views import split_workspace
 from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
 
 SHARES = (0, 1)
@@ -83,10 +81,9 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
     flags = read(switches, FLAGS)
     n_lagging = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     has_driver = int(flags.steering == DRIVER)
-    load_shift = has_load_shift(flags.small_angle, flags.law, flags.roll)
     return StepVariant(
         flags.small_angle, flags.law, flags.reference, flags.roll, has_driver, n_lagging,
-        load_shift, flags.road, flags.has_errors,
+        flags.road, flags.has_errors,
     )  # fmt: skip
 
 
@@ -153,7 +150,7 @@ def integrate_step(
     while True:
         motion, drive, tick = read(z, Z.motion), read(z, Z.drive), first_tick
         car = apply_tyre_change(params.car, params.tyre_change, tick > params.tyre_change.tick)
-        tyre_load = compute_static_load(drive, car, variant)
+        tyre_load = compute_tyre_load(drive, car, variant)
         refs, nominal_motion = read(z, Z.refs), read(z, Z.nominal_motion)
         state = StepState(
             motion, drive, tyre_load, load_element(z, Z.driver), car, refs, nominal_motion,
@@ -301,16 +298,15 @@ def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
 
 
 @jit
-def step_workspace(workspace: Vector, action: Vector) -> int:
-    """Step the vehicle of a workspace.
+def step_episode(row: EpisodeArrays, action: Vector) -> int:
+    """Step one vehicle by a control period.
 
     Args:
-        workspace: Arrays of an episode in one vector, as in a `Workspace`.
+        row: Arrays of the episode.
         action: Fractions of full scale, shape (1,) or (2,).
 
     Returns:
         As `step_vehicle`, with WILD added for an action beyond its limit.
     """
-    row = split_workspace(workspace)
     done = int(step_vehicle(row, action, len(row.rows)))
     return done + check_action_range(action) if done > 0 else done

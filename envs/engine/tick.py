@@ -157,19 +157,6 @@ def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) ->
 
 
 @inline
-def compute_static_load(drive: ActuatorState, car: CarParams, variant: StepVariant) -> TyreLoad:
-    """Compute the `TyreLoad` of the actuators' present state; no wheel load at rest is meant.
-
-    Args:
-        drive: State of the actuators.
-        car: Parameters of the car.
-        variant: Variant of the tick.
-    """
-    inputs = TyreInputs(drive.delta_f, drive.T_l, drive.T_r)
-    return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
-
-
-@inline
 def compute_lagged_load(
     steer: Scalar, T_l: Scalar, T_r: Scalar, drive: Any, rest: Scalar, car: CarParams,
     variant: StepVariant,
@@ -186,7 +173,7 @@ def compute_lagged_load(
         variant: Variant of the tick.
     """
     inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
-    return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
+    return compute_tyre_load(inputs, car, variant)
 
 
 @inline
@@ -216,33 +203,25 @@ def compute_motor_torques(
 
 
 @inline
-def _apply_due_change(
+def _update_tyres(
     params: StepParams, state: StepState, tick: Scalar, variant: StepVariant
 ) -> StepState:
-    """Change the tyres if they are due to change at this tick."""
-    is_due, car, start = tick == params.tyre_change.tick, state.car, state.start
+    """Change the tyres if they are due to, and friction to that of the car's place, for a tick."""
+    change, car, start = params.tyre_change, state.car, state.start
+    is_due = tick == change.tick
     if any_lane(is_due):
-        car = apply_tyre_change(car, params.tyre_change, is_due)
-        start = compute_static_load(state.drive, car, variant)
+        car = apply_tyre_change(car, change, is_due)
+        start = compute_tyre_load(state.drive, car, variant)
+    if variant.has_errors:
+        wave = params.friction_wave
+        factor = 1.0 + wave.share * compute_sine(wave.rate * state.motion.s + wave.phase)
+        factor = factor * select(tick >= change.tick, change.friction, 1.0)
+        left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
+        car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
+        start = compute_tyre_load(state.drive, car, variant)
     return StepState(
         state.motion, state.drive, start, state.driver, car, state.refs, state.nominal_motion,
         state.errors,
-    )  # fmt: skip
-
-
-@inline
-def _apply_friction_wave(
-    params: StepParams, state: StepState, tick: Scalar, variant: StepVariant
-) -> StepState:
-    """Change the friction under the car to that of its place, held over the tick."""
-    wave, change, car = params.friction_wave, params.tyre_change, state.car
-    factor = 1.0 + wave.share * compute_sine(wave.rate * state.motion.s + wave.phase)
-    factor = factor * select(tick >= change.tick, change.friction, 1.0)
-    left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
-    car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
-    return StepState(
-        state.motion, state.drive, compute_static_load(state.drive, car, variant), state.driver,
-        car, state.refs, state.nominal_motion, state.errors,
     )  # fmt: skip
 
 
@@ -315,8 +294,7 @@ def _compute_loads(
     drive, car, start = state.drive, state.car, state.start
     steer, T_l, T_r = inputs.steer, inputs.T_l, inputs.T_r
     if variant.lag == _NO_LAG:
-        tyre_inputs = TyreInputs(steer, T_l, T_r)
-        load = compute_tyre_load(tyre_inputs, car, variant.small_angle, variant.has_load_shift)
+        load = compute_tyre_load(TyreInputs(steer, T_l, T_r), car, variant)
         return load, load, load
     # actuators that lag move continuously: a tick starts where the last one ended
     if variant.lag == _ONE_LAG:  # the one without lag jumps: its `Lag` is all 0
@@ -385,9 +363,7 @@ def integrate_tick(
         tick: Tick at which it starts.
         variant: Variant of the tick.
     """
-    state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion
-    if variant.has_errors:
-        state = _apply_friction_wave(params, state, tick, variant)
+    state, nominal_motion = _update_tyres(params, state, tick, variant), state.nominal_motion
     if variant.road == NOMINAL_PATH:
         params, nominal_motion = _follow_nominal_path(params, state, tick)
     plant = compute_inputs(params, inputs, state, tick, variant)

@@ -1,8 +1,4 @@
-"""Views of packed numbers: an episode's vehicle, slow sensors, true state and record; a workspace.
-
-A workspace is one vector that holds all arrays of one car's episode, since numba takes 0.04 us for
-every array passed.
-"""
+"""An episode's arrays, and views of their numbers: vehicle, slow sensors, true state, record."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..numerics.jit import as_python, jit
-from ..numerics.packed import make_offsets, make_view, read
-from ..numerics.primitives import Matrix, Scalar, Vector
+from ..numerics.jit import jit
+from ..numerics.packed import read
+from ..numerics.primitives import Matrix, Vector
 from ..record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Record
 from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
@@ -24,7 +20,7 @@ from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import MAGIC_FORMULA, fit_fiala
 from .config import EnvConfig, EpisodeConfig
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, P, Z
-from .window import WINDOW_HEIGHT, count_columns
+from .window import make_window
 
 
 class CarTruth(NamedTuple):
@@ -148,92 +144,16 @@ def _write_true_states(params: Vector, states: Vector, switches: Matrix, out: Ma
         out[i, TRUE_STATE.friction_factor] = change.friction if is_changed else 1.0
 
 
-class _WorkspaceSizes(NamedTuple):
-    """Sizes at the beginning of a workspace."""
-
-    n: Scalar  # ticks a step
-    n_entries: Scalar  # of an observation
-    max_packets: Scalar  # packets of a step
-
-
-_SIZES, _HEADER = make_offsets(_WorkspaceSizes)
-
-
-def _make_workspace(config: EnvConfig, trace_width: int = 0) -> Array:
-    """Make a workspace, in which `trace_width` values of a trace follow the parameters."""
-    n, k, max_packets = int(config.control_period), len(config.layout), config.max_packets
-    width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
-    width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * count_columns(n)
-    workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
-    workspace[:_HEADER] = n, k, max_packets
-    _split_workspace(workspace).bounds[:] = config.bounds
-    return workspace
-
-
-@jit
-def split_workspace(workspace: Vector) -> EpisodeArrays:
-    """Split a workspace into its parts.
-
-    Args:
-        workspace: Vector of a `Workspace`.
-    """
-    sizes = read(workspace, _SIZES)
-    n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
-    report = _HEADER + STATE_WIDTH
-    flags = report + len(REPORT)
-    bounds = flags + len(FLAGS)
-    window = bounds + 2 * k
-    rows = window + WINDOW_HEIGHT * count_columns(n)
-    packets = rows + n * FAST_WIDTH
-    obs = packets + max_packets * PACKET_WIDTH
-    return EpisodeArrays(
-        workspace[obs - (-k // 2) :], workspace[_HEADER:report],
-        make_view(workspace, flags, np.int64, len(FLAGS)),
-        make_view(workspace, obs, np.float32, k),
-        make_view(workspace, rows, np.float64, n, FAST_WIDTH),
-        make_view(workspace, packets, np.float64, max_packets, PACKET_WIDTH),
-        workspace[report:flags], make_view(workspace, bounds, np.float64, 2, k),
-        make_view(workspace, window, np.float64, WINDOW_HEIGHT, count_columns(n)),
-    )  # fmt: skip
-
-
-_split_workspace = as_python(split_workspace)
-
-
-class Workspace:
-    """The arrays of one car's episode, which are parts of one `vector`.
+def make_episode_arrays(config: EnvConfig) -> EpisodeArrays:
+    """Make the arrays of one car's episode, zeros but for the bounds.
 
     Args:
         config: Config of the environment.
-
-    Attributes:
-        vector: The vector; a copy of it is a copy of the episode.
-        row: Its parts.
-        read_report: Function that lists the report's numbers.
-        copy_observation: Function that copies the observation.
     """
-
-    def __init__(self, config: EnvConfig) -> None:
-        self._config = config
-        self._bind(_make_workspace(config))
-
-    def allocate(self, width: int) -> None:
-        """Make room for parameters with a trace, and lose all numbers, if the room is another.
-
-        Args:
-            width: Number of the parameters.
-        """
-        if len(self.row.p) != width:
-            self._bind(_make_workspace(self._config, width - PARAMS_WIDTH))
-
-    def _bind(self, vector: Array) -> None:
-        """Bind the vector's parts, and the calls that read them in every step."""
-        self.vector, self.row = vector, _split_workspace(vector)
-        self.read_report, self.copy_observation = self.row.report.tolist, self.row.obs.copy
-
-    def __getstate__(self) -> tuple[EnvConfig, Array]:
-        return self._config, self.vector
-
-    def __setstate__(self, state: tuple[EnvConfig, Array]) -> None:
-        self._config, vector = state
-        self._bind(vector)
+    n = int(config.control_period)
+    return EpisodeArrays(
+        p=np.zeros(PARAMS_WIDTH), z=np.zeros(STATE_WIDTH), switches=np.zeros(len(FLAGS), np.int64),
+        obs=np.zeros(len(config.layout), np.float32), rows=np.zeros((n, FAST_WIDTH)),
+        packets=np.zeros((config.max_packets, PACKET_WIDTH)), report=np.zeros(len(REPORT)),
+        bounds=config.bounds, window=make_window(n),
+    )  # fmt: skip

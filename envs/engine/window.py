@@ -66,16 +66,6 @@ TICK_COST = _TickCost(*WINDOW.cost_inputs[:4])
 _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
-@jit
-def count_columns(n: int) -> int:
-    """Count the columns of a window: whole lanes.
-
-    Args:
-        n: Ticks of a step.
-    """
-    return -(-n // LANES) * LANES
-
-
 def make_window(n: int, *lanes: int) -> Array:
     """Make a window of zeros.
 
@@ -86,7 +76,8 @@ def make_window(n: int, *lanes: int) -> Array:
     Returns:
         The window, shape (WINDOW_HEIGHT, columns, *lanes).
     """
-    return np.zeros((WINDOW_HEIGHT, count_columns(n), *lanes))
+    columns = -(-n // LANES) * LANES  # whole lanes
+    return np.zeros((WINDOW_HEIGHT, columns, *lanes))
 
 
 @jit

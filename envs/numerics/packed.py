@@ -7,16 +7,14 @@ more, the last, and the same functions read and write lanes there. Lanes that ar
 C-contiguous matrix of single numbers go along its row.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
-import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.base import BaseContext
 from numba.core.typing.templates import signature
-from numba.np.arrayobj import load_item, make_array, populate_array, store_item
+from numba.np.arrayobj import load_item, make_array, store_item
 
 from .primitives import Matrix, Scalar, Vector
 from .simd import FLOATS, INTS, LANES, register_primitive
@@ -102,20 +100,6 @@ def store_element(array: Vector, value: Scalar, *index: int) -> None:
         index: Index of the element, by axis.
     """
     array[index] = value
-
-
-def make_view(array: Vector, first: int, kind: type[np.generic], *shape: int) -> Matrix:
-    """View the bytes of a vector's numbers as an array of another type or shape.
-
-    Args:
-        array: Vector that holds the numbers.
-        first: Index of the first number.
-        kind: Type of the view's numbers; of np.float32 two lie in one number.
-        shape: Shape of the view.
-    """
-    count = math.prod(shape)
-    end = first - (-count * np.dtype(kind).itemsize // array.itemsize)
-    return array[first:end].view(kind)[:count].reshape(shape)
 
 
 def lane_width(array: Matrix) -> int:
@@ -263,22 +247,6 @@ def _lower_write(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-def _infer_make_view(vector, first, kind, *shape):
-    if vector != types.Array(types.float64, 1, "C"):
-        return None
-    made = types.Array(kind.dtype, len(shape), "C")
-    return signature(made, vector, types.intp, kind, *[types.intp] * len(shape))
-
-
-def _lower_make_view(context, builder, sig, args):
-    made, shape = make_array(sig.return_type)(context, builder), args[3:]
-    size = context.get_constant(types.intp, sig.return_type.dtype.bitwidth // 8)
-    first = locate_element(context, builder, sig.args[0], args[0], [args[1]])
-    strides = [builder.mul(size, size_of_axis) for size_of_axis in shape[1:]] + [size]
-    populate_array(made, builder.bitcast(first, made.data.type), shape, strides, size, None)
-    return made._getvalue()
-
-
 def _lower_lane_width(context, builder, sig, args):
     return context.get_constant(types.intp, LANES if sig.args[0].ndim == 2 else 1)
 
@@ -309,7 +277,6 @@ register_primitive(read, _infer_read, _lower_read)
 register_primitive(write, _infer_write, _lower_write)
 register_primitive(load_element, _infer_load_element, _lower_load_element)
 register_primitive(store_element, _infer_store_element, _lower_store_element)
-register_primitive(make_view, _infer_make_view, _lower_make_view)
 register_primitive(lane_width, lambda array: signature(types.intp, array), _lower_lane_width)
 register_primitive(load_lanes, _infer_load_lanes, _lower_load_lanes)
 register_primitive(count_lanes, lambda: signature(types.intp), _lower_count_lanes)

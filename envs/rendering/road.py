@@ -11,7 +11,7 @@ import numpy as np
 from ..engine.config import EpisodeConfig
 from ..engine.layout import P, Z
 from ..engine.step import make_step_params, make_step_variant
-from ..engine.tick import StepParams, apply_tyre_change, compute_static_load
+from ..engine.tick import StepParams, apply_tyre_change
 from ..numerics.jit import as_python
 from ..numerics.packed import read
 from ..numerics.primitives import ARRAYS
@@ -21,13 +21,13 @@ from ..scenarios.driver import compute_wind
 from ..sensors.slow import compute_lane_quality
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
 from ..vehicle.parameters import Vehicle
-from ..vehicle.tyres import LINEAR, compute_lateral_forces, compute_tyres
+from ..vehicle.tyres import LINEAR, compute_lateral_forces, compute_tyre_load, compute_tyres
 from .canvas import Box, Canvas
 from .palette import INK, PALETTE, mix_colours
 from .trace import TRACE_POINT, RenderState
 
 _make_step_params, _make_step_variant = as_python(make_step_params), as_python(make_step_variant)
-_compute_static_load, _compute_tyres = as_python(compute_static_load), as_python(compute_tyres)
+_compute_tyre_load, _compute_tyres = as_python(compute_tyre_load), as_python(compute_tyres)
 _compute_lateral_forces = as_python(compute_lateral_forces)
 _apply_tyre_change, _compute_gravity = as_python(apply_tyre_change), as_python(compute_gravity)
 _compute_lane_quality, _compute_wind = as_python(compute_lane_quality), as_python(compute_wind)
@@ -113,7 +113,7 @@ def make_car_scene(shot: RenderState) -> CarScene:
     params, variant = _make_step_params(p), _make_step_variant(p, switches)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), float(z[Z.clock.tick])
     car = _apply_tyre_change(params.car, params.tyre_change, tick >= params.tyre_change.tick)
-    load = _compute_static_load(drive, car, variant)
+    load = _compute_tyre_load(drive, car, variant)
     _, g_y = _compute_gravity(motion, params.road, variant.small_angle)
     a, b, c, d, F_x, N_z = _compute_tyres(motion, load, car, g_y, variant)
     tyres = a, b, c, d

@@ -15,7 +15,6 @@ from .parameters import GRAVITY
 from .tyres import (
     MAGIC_FORMULA,
     MIN_SPEED,
-    PlantVariant,
     TyreLoad,
     Variant,
     compute_slip_rates,
@@ -373,18 +372,6 @@ def kutta3(
         h: Length of the step (s).
         variant: `PlantVariant` or `StepVariant` of the plant.
     """
-    if variant.law == MAGIC_FORMULA:  # apart: the code of other laws stays short, and as fast
-        magic = PlantVariant(variant.small_angle, MAGIC_FORMULA, variant.roll)
-        return _integrate_stages(motion, load, disturbance, car, road, h, magic)
-    return _integrate_stages(motion, load, disturbance, car, road, h, variant)
-
-
-@inline
-def _integrate_stages(
-    motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
-    car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
-) -> Motion:  # fmt: skip
-    """`kutta3` of one law or of several."""
     gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)
     a = _compute_rates(start, load[0], disturbance, car, gravity, variant)

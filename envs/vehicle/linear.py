@@ -97,19 +97,6 @@ def write_roll(A: Matrix, B: Matrix, i: int, column: int, K: Scalar, C: Scalar, 
     B[i + 1, column] = S
 
 
-@jit
-def write_kinematic(A: Matrix, B: Matrix, gamma: Scalar) -> None:
-    """Write v_x and v_y, driven by a_x and a_y, into A and B: double-layer-gps (4)-(5).
-
-    Args:
-        A: State matrix, v_x and v_y first.
-        B: Input matrix, columns a_x and a_y.
-        gamma: Yaw rate (rad/s).
-    """
-    A[0, 1], A[1, 0] = gamma, -gamma
-    B[0, 0], B[1, 1] = 1.0, 1.0
-
-
 _write_lateral, _write_roll = as_python(write_lateral), as_python(write_roll)
 
 

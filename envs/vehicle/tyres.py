@@ -80,39 +80,30 @@ def _compute_squared_capacity(limit: Scalar, drive: Scalar) -> Scalar:
 
 
 @jit
-def has_load_shift(small_angle: int, law: int, roll: int) -> int:
-    """Check whether the tyres' limits depend on loads that the motion shifts, or on F_z itself.
-
-    Args:
-        small_angle: 1 for the small-angle plant, else 0.
-        law: Code of the tyre law, its place in `TYRE_LAWS`.
-        roll: 1 if the body rolls, else 0.
-
-    Returns:
-        1 if it does, else 0.
-    """
-    return int(small_angle == 0 and (law == MAGIC_FORMULA or (law != LINEAR and roll == 1)))
+def _has_load_shift(variant: Variant) -> bool:
+    """Whether the tyres' limits depend on loads that the motion shifts, or on F_z itself."""
+    is_limited = variant.law == MAGIC_FORMULA or (variant.law != LINEAR and variant.roll == 1)
+    return bool(variant.small_angle == 0 and is_limited)
 
 
 @inline
-def compute_tyre_load(
-    inputs: TyreInputs, car: Car, small_angle: int, load_shift: int = 0
-) -> TyreLoad:
+def compute_tyre_load(inputs: Any, car: Car, variant: Variant) -> TyreLoad:
     """Compute the tyres' load under the inputs of one instant.
 
     The front tyres have the mean friction of both sides. Each rear tyre's friction limits its
     motor's force, and drive force moves load between the axles, but not on the small-angle plant.
+    Where the motion shifts load, friction does not limit the drive force here, and the rear tyres'
+    limits are mu F_z.
 
     Args:
-        inputs: Steering and torques, `TyreInputs`.
+        inputs: Steering and torques: `TyreInputs`, or the actuators' state.
         car: Parameters, `CarParams`.
-        small_angle: 1 for the small-angle plant, else 0.
-        load_shift: Result of `has_load_shift`; with 1 friction does not limit the drive force here,
-            and the rear tyres' limits are mu F_z.
+        variant: `PlantVariant` or `StepVariant` of the plant.
 
     Returns:
         Forces and capacities, `TyreLoad`.
     """
+    small_angle = variant.small_angle
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
     rear_l, rear_r = car.mu * weight * car.l_f, car.mu_r * weight * car.l_f
@@ -132,7 +123,7 @@ def compute_tyre_load(
         load_r = minimum(1.0 + shift / (weight * car.l_f), _MAX_LOAD)
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
-    if not small_angle and not load_shift:
+    if not small_angle and not _has_load_shift(variant):
         F_l = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
         F_r = minimum(maximum(F_r, 0.0 - rear_r), rear_r)
         left = sqrt(_compute_squared_capacity(rear_l, F_l))
@@ -339,7 +330,7 @@ def compute_tyres(
     """
     if variant.law == MAGIC_FORMULA and not variant.small_angle:
         return _compute_magic_tyres(motion, load, car, g_y, variant)
-    if has_load_shift(variant.small_angle, variant.law, variant.roll):
+    if _has_load_shift(variant):
         return _compute_shifted_tyres(motion, load, car, g_y)
     if variant.law == MAGIC_FORMULA:
         t_f, t_r = _compute_relaxed_slips(motion, load, car, variant.small_angle)

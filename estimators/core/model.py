@@ -11,7 +11,7 @@ from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8
-from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
+from ...envs.vehicle.linear import write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
@@ -219,8 +219,9 @@ def _build_continuous(f: FilterRecord, V: Scalar, turning: Scalar) -> None:
     elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
         i = 0 if f.kind == ROLL else 2
         write_roll(A, B, i, f.inputs - 1, f.roll_stiffness, f.roll_damping, f.roll_arm)
-    if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:
-        write_kinematic(A, B, turning)
+    if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:  # v_x, v_y: double-layer-gps (4)-(5)
+        A[0, 1], A[1, 0] = turning, -turning
+        B[0, 0], B[1, 1] = 1.0, 1.0
         if f.kind == VELOCITY_ROLL:
             A[1, 2] = -GRAVITY  # double-layer-gps (5)
     if f.kind == YAW or f.kind == FORCES:

@@ -135,8 +135,8 @@ def test_an_array_that_cannot_be_written_compiles_nothing() -> None:
     env.reset(seed=0)
     action = np.array([0.1], np.float32)
     env.step(action)
-    known = len(getattr(kernel.step_workspace, "overloads", ()))
+    known = len(getattr(kernel.step_episode, "overloads", ()))
     action.setflags(write=False)
     env.step(action)
     env.step(np.broadcast_to(np.float32(0.1), (1,)))
-    assert len(getattr(kernel.step_workspace, "overloads", ())) == known
+    assert len(getattr(kernel.step_episode, "overloads", ())) == known

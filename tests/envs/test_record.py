@@ -85,7 +85,7 @@ def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
     for moment in play(env, np.random.default_rng(1).uniform(-1.0, 1.0, 30)):
         for tick, row in zip(moment.record.ticks, moment.record.fast.tolist(), strict=True):
             inputs = TyreInputs(row[FAST.steer], row[FAST.torque_left], row[FAST.torque_right])
-            load = compute_tyre_load(inputs, car, 1)
+            load = compute_tyre_load(inputs, car, PlantVariant(1, LINEAR_TYRES))
             blows = 100 < tick <= 250  # it acts from tick 100 to tick 250
             push = DisturbanceForces(200.0, 0.2 * 200.0) if blows else DisturbanceForces(0.0, 0.0)
             state = kutta3(state, (load, load, load), push, car, road, TICK, plant)

@@ -1,11 +1,13 @@
 """State by name: every number of an episode has one place, compiled code reads it there."""
 
+import copy
 from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pytest
 
+from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.layout import (
     FLAGS,
     PARAMS_WIDTH,
@@ -19,6 +21,8 @@ from sideslip.envs.numerics.jit import jit
 from sideslip.envs.numerics.packed import make_offsets, read, write
 from sideslip.envs.record import PACKET_WIDTH
 from sideslip.envs.sensors.link import MAX_IN_FLIGHT
+
+from ..helpers import bits
 
 QUEUE = len(Z.slow) * MAX_IN_FLIGHT * PACKET_WIDTH
 
@@ -86,3 +90,35 @@ def test_parts_are_read_and_written_by_name_in_compiled_loops() -> None:
     assert read(matrix, CART.wheels[0], 1) == Wheel(3.0, 5.0)
     write(matrix, (0.5, 0.25), CART.wheels[0], 1)
     assert matrix[1:3].tolist() == [[2.0, 0.5], [4.0, 0.25]]
+
+
+SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
+
+
+def test_a_copy_has_an_episode_of_its_own() -> None:
+    env = StabilityEnv("fusion")
+    env.reset(seed=1)
+    env.step([0.5])
+    other = copy.deepcopy(env)
+    before = bits(env.get_state()["state"])
+    obs = other.step([0.1])[0]
+    assert bits(env.get_state()["state"]) == before
+    assert bits(env.step([0.1])[0]) == bits(obs)
+
+
+@pytest.mark.parametrize("n", [7, 10, 50])
+def test_a_car_that_spins_within_a_step_ends_at_that_tick(n: int) -> None:
+    def driven(period: int) -> tuple[StabilityEnv, int]:
+        env = StabilityEnv("fusion", control_period=period)
+        env.reset(seed=4, options={"state": SPINS})
+        ticks = 0
+        while not env.step([0.0])[2]:
+            ticks += period
+        return env, ticks + env.ticks_done
+
+    (slow, last), (quick, same) = driven(1), driven(n)
+    assert same == last and last % n, "it is to end in mid-step"
+    assert quick.motion == slow.motion
+    assert bits(quick.rows[quick.ticks_done - 1]) == bits(slow.rows[0])
+    ours, theirs = quick.get_state()["report"], slow.get_state()["report"]
+    assert ours[[1, 9]].tolist() == theirs[[1, 9]].tolist() and ours[9] == 1.0

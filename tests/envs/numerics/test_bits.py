@@ -73,7 +73,7 @@ def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
     variant = PlantVariant(small_angle, law, roll)
 
     def load_of(function: Any, inputs: Any) -> Any:
-        return function(inputs, CARS[car], small_angle)
+        return function(inputs, CARS[car], variant)
 
     def derivative(function: Any, motion: Any, load: Any) -> Any:
         return function(motion, load, PUSH, CARS[car], ROAD, variant)
@@ -163,6 +163,6 @@ def test_whole_steps(arguments: dict[str, Any], name: str, monkeypatch: pytest.M
 
     compiled = episode()
     monkeypatch.setattr(stability, "reset_vehicle", as_python(restart.reset_vehicle))
-    step = as_python(kernel.step_workspace)
+    step = as_python(kernel.step_episode)
     monkeypatch.setattr(stability, "_compile_step", lambda: step)
     assert episode() == compiled

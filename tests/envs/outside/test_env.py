@@ -92,7 +92,7 @@ class OwnPlant(OutsidePlant):
 
     def step(self, acting: OutsideInputs, h: float) -> None:
         car = self.car._replace(mu=self.p.tire.p_dy1, mu_r=self.p.tire.p_dy1)
-        load = compute_tyre_load(TyreInputs(*acting[:3]), car, 0, 1)
+        load = compute_tyre_load(TyreInputs(*acting[:3]), car, PlantVariant(0, FIALA, 1))
         before, push, road = self.motion, DisturbanceForces(*acting[3:]), RoadParams(0.0, 0.0, 1.0)
         after = kutta3(before, (load, load, load), push, car, road, h, PlantVariant(0, FIALA, 1))
         self.x, self.specific_force = (

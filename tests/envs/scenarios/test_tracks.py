@@ -22,7 +22,7 @@ from sideslip.envs.scenarios.road import (
     transform_path,
 )
 from sideslip.envs.ticks import FOREVER
-from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
+from sideslip.envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load
 
 from ..helpers import FULL, LINEAR, bits, play
 
@@ -162,9 +162,13 @@ def test_the_env_tells_its_tyres_now() -> None:
 
 def test_each_rear_tyre_has_its_sides_grip_and_the_front_ones_the_mean() -> None:
     car = make_car(COMS)._replace(mu=0.9, mu_r=0.3)
-    load = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car, 0)
-    high = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car._replace(mu_r=0.9), 0)
-    low = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car._replace(mu=0.3), 0)
+    load = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car, PlantVariant(0, FIALA))
+    high = compute_tyre_load(
+        TyreInputs(0.0, -100.0, -100.0), car._replace(mu_r=0.9), PlantVariant(0, FIALA)
+    )
+    low = compute_tyre_load(
+        TyreInputs(0.0, -100.0, -100.0), car._replace(mu=0.3), PlantVariant(0, FIALA)
+    )
     assert (load.rear_l, load.limit_l, load.slope_l) == (high.rear_l, high.limit_l, high.slope_l)
     assert (load.rear_r, load.limit_r, load.slope_r) == (low.rear_r, low.limit_r, low.slope_r)
     assert load.limit_f == pytest.approx(0.5 * (high.limit_f + low.limit_f), rel=1e-14)

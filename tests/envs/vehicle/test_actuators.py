@@ -32,7 +32,6 @@ from sideslip.envs.vehicle.tyres import (
     TyreLoad,
     compute_tyre_forces,
     compute_tyre_load,
-    has_load_shift,
 )
 
 from ..helpers import FULL, LINEAR, bits, fast_rows, play
@@ -276,7 +275,8 @@ def test_the_axles_exchange_F_x_h_over_l(
 ) -> None:
     car = make_car(vehicle)._replace(mu=mu, mu_r=mu_r)
     still, load = (
-        compute_tyre_load(TyreInputs(0.0, *T), car, 0, 1) for T in ((0.0, 0.0), (T_l, T_r))
+        compute_tyre_load(TyreInputs(0.0, *T), car, PlantVariant(0, FIALA, 1))
+        for T in ((0.0, 0.0), (T_l, T_r))
     )
     moved = plain_shift(car, T_l, T_r)
     mean = 0.5 * (mu + mu_r)
@@ -294,9 +294,7 @@ def test_the_axles_exchange_F_x_h_over_l(
 
 def rear_force(car: CarParams, T: float, roll: int) -> float:
     """N of the rear axle's lateral force at a large slip, both motors at T."""
-    load: TyreLoad = compute_tyre_load(
-        TyreInputs(0.0, T, T), car, 0, has_load_shift(0, FIALA, roll)
-    )
+    load: TyreLoad = compute_tyre_load(TyreInputs(0.0, T, T), car, PlantVariant(0, FIALA, roll))
     sliding = Motion(15.0, -6.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return float(compute_tyre_forces(sliding, load, car, 0.0, PlantVariant(0, FIALA, roll))[1])
 
@@ -317,8 +315,8 @@ def test_without_a_height_and_at_small_angles_nothing_moves(
 ) -> None:
     inputs = TyreInputs(0.03, T_l, T_r)
     for flat, high in zip(FLAT, HIGH, strict=True):
-        none = compute_tyre_load(inputs, make_car(flat), small_angle, shifting)
-        some = compute_tyre_load(inputs, make_car(high), small_angle, shifting)
+        none = compute_tyre_load(inputs, make_car(flat), PlantVariant(small_angle, FIALA, shifting))
+        some = compute_tyre_load(inputs, make_car(high), PlantVariant(small_angle, FIALA, shifting))
         rests = small_angle or plain_shift(make_car(high), T_l, T_r) == 0.0
         assert (bits(none) == bits(some)) == bool(rests)
 

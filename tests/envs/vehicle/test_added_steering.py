@@ -203,7 +203,7 @@ def test_the_plant_rests_at_zero_slip(V_x: float) -> None:
     model, N_z = make_bicycle_model(COMS, V_x), gain(COMS, V_x) * DELTA
     gamma = -(model.B[1] @ [DELTA, N_z]) / model.A[1, 1]
     T = 0.5 * N_z * COMS.wheel_radius / (0.5 * COMS.rear_track)
-    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), 1)
+    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), PAPER)
     state = Motion(V_x, 0.0, gamma, *[0.0] * 6)
     rate = derivative(state, load, CALM, make_car(COMS), ROAD, PAPER)
     # sums of forces of some 10 N and moments of some 10 N m that cancel, over m and I
@@ -215,7 +215,7 @@ def test_the_plant_rests_at_zero_slip(V_x: float) -> None:
 def test_and_goes_there_from_straight_driving(V_x: float) -> None:
     N_z = gain(COMS, V_x) * DELTA
     T = 0.5 * N_z * COMS.wheel_radius / (0.5 * COMS.rear_track)
-    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), 1)
+    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), PAPER)
     state, most = Motion(V_x, *[0.0] * 8), 0.0
     for _ in range(10_000):
         state = kutta3(state, (load, load, load), CALM, make_car(COMS), ROAD, 0.001, PAPER)

@@ -30,7 +30,6 @@ from sideslip.envs.vehicle.tyres import (
     TyreInputs,
     compute_lateral_forces,
     compute_tyre_load,
-    has_load_shift,
 )
 
 pytestmark = pytest.mark.plain
@@ -50,14 +49,14 @@ def slope(state: Motion, steer: float = 0.0, T: Any = (0.0, 0.0), **how: Any) ->
     """The derivative of a state; `how` changes push, car, road, small_angle or law."""
     push, car, road = how.get("push", CALM), how.get("car", CAR), how.get("road", STRAIGHT)
     small_angle, law = how.get("small_angle", 0), how.get("law", FIALA)
-    load = compute_tyre_load(TyreInputs(steer, *T), car, small_angle)
+    load = compute_tyre_load(TyreInputs(steer, *T), car, PlantVariant(small_angle, LINEAR))
     return derivative(state, load, push, car, road, PlantVariant(small_angle, law))
 
 
 def drive(
     state: Motion, seconds: float, h: float, steer: float = 0.0, car: CarParams = CAR, **how: Any
 ) -> Motion:
-    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     road, law, rule = how.get("road", STRAIGHT), how.get("law", FIALA), how.get("rule", kutta3)
     for _ in range(round(seconds / h)):
         state = rule(state, (load, load, load), CALM, car, road, h, PlantVariant(0, law))
@@ -230,7 +229,7 @@ def test_the_rules_have_their_orders(rule: Any, order: int, car: CarParams, law:
 @pytest.mark.parametrize("mu", [1e-9, 0.9])
 def test_any_speed_and_hardly_any_friction_stay_finite(speed: float, mu: float) -> None:
     car = CAR._replace(mu=mu, mu_r=mu)
-    load = compute_tyre_load(TyreInputs(0.4, -100.0, 100.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.4, -100.0, 100.0), car, PlantVariant(0, LINEAR))
     state = motion(v_x=speed)
     for _ in range(3000):
         state = kutta3(state, (load, load, load), CALM, car, CIRCLE, 1e-3, PlantVariant(0, FIALA))
@@ -286,14 +285,13 @@ def relaxed_rates(t: float, x: Any, car: CarParams, steer: Any, roll: int) -> li
 def test_relaxing_tyres_by_an_independent_integration(vehicle: Any, V: float, roll: int) -> None:
     """Three seconds of a sine steer near the limit by DOP853; mirrored bit for bit."""
     car, variant = make_car(vehicle.replace(relaxation=0.3)), PlantVariant(0, MAGIC_FORMULA, roll)
-    shifts = has_load_shift(*variant)
 
     def drive_sine(amplitude: float) -> Motion:
         state = motion(v_x=V)
         for k in range(3000):
             angles = (amplitude * math.sin(3.0e-3 * (k + part)) for part in (0.0, 0.5, 1.0))
             a, b, c = (
-                compute_tyre_load(TyreInputs(angle, 10.0, 10.0), car, 0, shifts) for angle in angles
+                compute_tyre_load(TyreInputs(angle, 10.0, 10.0), car, variant) for angle in angles
             )
             state = kutta3(state, (a, b, c), CALM, car, STRAIGHT, 1e-3, variant)
         return state
@@ -318,7 +316,9 @@ def test_a_step_in_slip_reaches_63_percent_after_the_relaxation_length(small_ang
     V, delta, forces = 10.0, 0.01, []
     for relaxation in (0.4, 0.0):
         car = CAR._replace(m=1e12, I=1e12, relaxation=relaxation)
-        load = compute_tyre_load(TyreInputs(delta, 0.0, 0.0), car, small_angle)
+        load = compute_tyre_load(
+            TyreInputs(delta, 0.0, 0.0), car, PlantVariant(small_angle, LINEAR)
+        )
         variant, state = PlantVariant(small_angle, MAGIC_FORMULA), motion(v_x=V)
         for _ in range(40):  # 0.4 m
             state = kutta3(state, (load, load, load), CALM, car, STRAIGHT, 1e-3, variant)
@@ -333,7 +333,7 @@ def test_a_step_in_slip_reaches_63_percent_after_the_relaxation_length(small_ang
 
 def test_relaxing_tyres_are_stable_at_a_standstill_and_backwards() -> None:
     car = make_car(COMS.replace(relaxation=0.05))
-    load = compute_tyre_load(TyreInputs(0.5, 20.0, -20.0), car, 0, 1)
+    load = compute_tyre_load(TyreInputs(0.5, 20.0, -20.0), car, PlantVariant(0, FIALA, 1))
     for V in (0.0, 0.01, -3.0, 30.0):
         state = motion(v_x=V, v_y=0.3)._replace(slip_f=0.5, slip_r=-0.5)
         for _ in range(3000):

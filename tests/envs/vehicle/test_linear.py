@@ -58,7 +58,7 @@ def seen(
     v_x, v_y = (v, v * beta) if small_angle else (v * math.cos(beta), v * math.sin(beta))
     state = Motion(v_x, v_y, gamma, psi, 0.0, 0.0, 0.0, y_l - l_pre * psi + bend, 0.0)
     T = 0.5 * N_z * car.r / (0.5 * car.d_r)
-    load = compute_tyre_load(TyreInputs(delta_f, -T, T), car, small_angle)
+    load = compute_tyre_load(TyreInputs(delta_f, -T, T), car, PlantVariant(small_angle, LINEAR))
     rate = derivative(state, load, CALM, car, road, PlantVariant(small_angle, LINEAR))
     if small_angle:  # the held speed: tie-vision (1)
         dbeta = rate.v_y / v
@@ -205,7 +205,7 @@ def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:
     car = make_car(vehicle)
     state = Motion(x[0], x[1], gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x[2], x[3])
     T = 0.5 * car.r * u[0]
-    load = compute_tyre_load(TyreInputs(0.0, T, T), car, 1)
+    load = compute_tyre_load(TyreInputs(0.0, T, T), car, PlantVariant(1, LINEAR))
     road, push = RoadParams(0.0, 0.0, 1.0), DisturbanceForces(u[1], 0.0)
     rate = derivative(state, load, push, car, road, PlantVariant(1, LINEAR, 1))
     a_x = rate.v_x - gamma * x[1]  # double-layer-gps (4)

@@ -59,7 +59,9 @@ def slope(
 ) -> Any:
     small_angle, law = how.get("small_angle", 0), how.get("law", LINEAR)
     load = compute_tyre_load(
-        TyreInputs(how.get("steer", 0.0), *how.get("T", (0.0, 0.0))), car, small_angle
+        TyreInputs(how.get("steer", 0.0), *how.get("T", (0.0, 0.0))),
+        car,
+        PlantVariant(small_angle, LINEAR),
     )
     return derivative(state, load, push, car, road, PlantVariant(small_angle, law, 1))
 
@@ -100,7 +102,7 @@ def test_both_laws_hold_on_every_plant_and_on_a_bank(
     body = car.I_x * rate.phi_dot + car.C_x * phi_dot + car.K_x * phi
     # roundings of moments up to 1e5 N m
     assert body == pytest.approx(car.S * a_y + 25.0, abs=1e-9)
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, plant[0])
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(plant[0], LINEAR))
     F_yf, F_yr, _, _ = compute_tyre_forces(state, load, car, felt[1], PlantVariant(*plant, 1))
     a = rate.v_y + 0.2 * 9.0 + felt[1]
     assert car.m * a - car.S * rate.phi_dot == pytest.approx(F_yf + F_yr + 70.0, abs=1e-8)
@@ -142,7 +144,7 @@ def test_a_mirrored_bend_leans_to_the_other_side() -> None:
 
 def test_an_undamped_body_on_tyres_without_force_keeps_its_energy() -> None:
     car = CAR._replace(C_f=0.0, C_r=0.0, C_x=0.0)
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     state = Motion(7.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.5)
 
     def energy(x: Motion) -> float:
@@ -178,7 +180,7 @@ def test_the_rules_have_their_orders_with_roll(
 ) -> None:
     """Where no wheel's grip ends: there Fiala's curve has a jump in its third slope."""
     start = Motion(12.0, -0.2, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    load = compute_tyre_load(TyreInputs(0.06, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.06, 0.0, 0.0), car, PlantVariant(0, LINEAR))
 
     def drive(h: float) -> np.ndarray:
         state = start
@@ -217,7 +219,7 @@ def test_load_transfer_costs_tyres_with_a_limit_grip_and_nothing_else() -> None:
     upright = Motion(8.0, -0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     leaning = upright._replace(phi=0.15)
     for small_angle, law in PLANTS:
-        load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CAR, small_angle)
+        load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CAR, PlantVariant(small_angle, LINEAR))
         flat = compute_tyre_forces(upright, load, CAR, 0.0, PlantVariant(small_angle, law))
         held = compute_tyre_forces(upright, load, CAR, 0.0, PlantVariant(small_angle, law, 1))
         lost = compute_tyre_forces(leaning, load, CAR, 0.0, PlantVariant(small_angle, law, 1))
@@ -239,7 +241,7 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
     law: int, T_l: float, T_r: float, phi: float, v_y: float
 ) -> None:
     state = Motion(8.0, 10.0 * v_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi)
-    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), CAR, 0)
+    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), CAR, PlantVariant(0, LINEAR))
     _, F_yr, F_x, N_z = compute_tyre_forces(state, load, CAR, 0.0, PlantVariant(0, law, 1))
     share = _compute_load_transfer(state, CAR, 0.0)[1]
     left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)

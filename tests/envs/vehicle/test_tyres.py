@@ -29,7 +29,6 @@ from sideslip.envs.vehicle.tyres import (
     compute_tyre_load,
     compute_tyres,
     fit_fiala,
-    has_load_shift,
 )
 
 pytestmark = pytest.mark.plain
@@ -116,7 +115,7 @@ def test_all_laws_are_the_linear_one_at_small_slip(u: float, C: float, limit: fl
 @pytest.mark.smoke
 @pytest.mark.parametrize("car", CARS)
 def test_fiala_reaches_mu_F_z_exactly_and_no_more(car: CarParams) -> None:
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     for limit, slope in ((load.limit_f, load.slope_f), (load.limit_l, load.slope_l)):
         edge = 1.0 / slope
         assert lateral_force(1e9, limit, slope, FIALA) == limit
@@ -127,7 +126,7 @@ def test_fiala_reaches_mu_F_z_exactly_and_no_more(car: CarParams) -> None:
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("car", CARS)
 def test_initial_slope_is_the_cornering_stiffness(car: CarParams, law: int) -> None:
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     for C, limit, slope in (
         (car.C_f, load.limit_f, load.slope_f),
         (car.C_r, load.limit_r, load.slope_r),
@@ -165,8 +164,7 @@ def test_the_magic_formula_is_the_printed_one_at_every_load(
     """Of each of four tyres, on two frictions, with loads that roll and drive force shift."""
     car = car._replace(mu_r=0.5, h_x=h_x)
     state = motion(12.0, v_y, 0.3)._replace(phi=phi, phi_dot=-phi)
-    shifts = has_load_shift(0, MAGIC_FORMULA, roll)
-    load = compute_tyre_load(TyreInputs(steer, T, 50.0), car, 0, shifts)
+    load = compute_tyre_load(TyreInputs(steer, T, 50.0), car, PlantVariant(0, MAGIC_FORMULA, roll))
     found = compute_tyres(state, load, car, 0.0, PlantVariant(0, MAGIC_FORMULA, roll))
     a, b, c, d, F_x, N_z = found
     forces = compute_lateral_forces(a, b, c, d, MAGIC_FORMULA, 0)
@@ -189,7 +187,7 @@ def test_the_magic_formula_is_the_printed_one_at_every_load(
 
 @pytest.mark.parametrize("car", CARS)
 def test_the_magic_formula_peaks_at_mu_F_z(car: CarParams) -> None:
-    load: TyreLoad = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load: TyreLoad = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     for limit, slope in ((load.limit_f, load.slope_f), (load.limit_l, load.slope_l)):
         slips = np.linspace(0.0, 3.0, 3001) / slope
         forces = [lateral_force(t, limit, slope, MAGIC_FORMULA) for t in slips.tolist()]
@@ -208,7 +206,8 @@ def test_fialas_law_fits_the_magic_formula_of_both_axles(vehicle: Vehicle) -> No
     """The least squares up to the peak among its neighbours, and within 2.5 % of mu F_z."""
     fitted = fit_fiala(vehicle)
     ours, true = (
-        compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), make_car(car), 0) for car in (fitted, vehicle)
+        compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), make_car(car), PlantVariant(0, LINEAR))
+        for car in (fitted, vehicle)
     )
     for F, slope, F_0, slope_0 in (
         (ours.limit_f, ours.slope_f, true.limit_f, true.slope_f),
@@ -225,7 +224,7 @@ def test_fialas_law_fits_the_magic_formula_of_both_axles(vehicle: Vehicle) -> No
 
 
 def test_linear_tyres_have_no_limit() -> None:
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CARS[0], 1)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CARS[0], PlantVariant(1, LINEAR))
     # one rounding each for slope and product
     force = lateral_force(10.0, load.limit_f, load.slope_f, LINEAR, 1)
     assert force == pytest.approx(60000.0, rel=1e-15)
@@ -235,7 +234,7 @@ def test_linear_tyres_have_no_limit() -> None:
 
 @pytest.mark.parametrize("car", CARS)
 def test_the_four_wheels_carry_the_car_on_friction_mu(car: CarParams) -> None:
-    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     total = 2.0 * load.limit_f + load.limit_l + load.limit_r
     assert total == pytest.approx(car.mu * car.m * GRAVITY, rel=1e-15)
     # moments about the centre of gravity balance
@@ -249,8 +248,8 @@ def test_rear_tyres_stay_within_the_friction_circle(
     law: int, T_l: float, T_r: float, slip: float
 ) -> None:
     car = CARS[0]
-    still = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
-    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), car, 0)
+    still = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
+    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), car, PlantVariant(0, LINEAR))
     difference = 2.0 * load.N_z / car.d_r
     for along, limit, slope in (
         (0.5 * (load.F_x - difference), load.limit_l, load.slope_l),
@@ -263,8 +262,8 @@ def test_rear_tyres_stay_within_the_friction_circle(
 
 
 def test_the_small_angle_plant_knows_no_circle() -> None:
-    load = compute_tyre_load(TyreInputs(0.1, 1e4, -1e4), CARS[0], 1)
-    still = compute_tyre_load(TyreInputs(0.1, 0.0, 0.0), CARS[0], 1)
+    load = compute_tyre_load(TyreInputs(0.1, 1e4, -1e4), CARS[0], PlantVariant(1, LINEAR))
+    still = compute_tyre_load(TyreInputs(0.1, 0.0, 0.0), CARS[0], PlantVariant(1, LINEAR))
     assert load.limit_l == load.limit_r == still.limit_l
     assert load.F_x == 0.0
     assert load.N_z == pytest.approx(-1e4 / 0.22 * 0.82, rel=1e-15)
@@ -273,7 +272,7 @@ def test_the_small_angle_plant_knows_no_circle() -> None:
 def test_slip_angles_are_those_of_the_wheels_velocities() -> None:
     car, steer = CARS[0], 0.2
     state = motion(6.0, 0.8, 0.5)
-    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, PlantVariant(0, LINEAR))
     front = steer - math.atan2(0.8 + car.l_f * 0.5, 6.0)
     rear = -math.atan2(0.8 - car.l_r * 0.5, 6.0)
     expected = math.tan(front), math.tan(rear)
@@ -285,7 +284,9 @@ def test_slip_angles_are_those_of_the_wheels_velocities() -> None:
 @pytest.mark.smoke
 @pytest.mark.parametrize("small_angle", [0, 1])
 def test_nothing_divides_by_zero_at_any_speed(small_angle: int) -> None:
-    load = compute_tyre_load(TyreInputs(0.3, 50.0, -50.0), CARS[0], small_angle)
+    load = compute_tyre_load(
+        TyreInputs(0.3, 50.0, -50.0), CARS[0], PlantVariant(small_angle, LINEAR)
+    )
     for v_x in (-5.0, -MIN_SPEED, -1e-300, -0.0, 0.0, 1e-300, 1e-9, MIN_SPEED, 5.0):
         for v_y in (-3.0, 0.0, 1e-300, 3.0):
             state = motion(v_x, v_y, 0.7)

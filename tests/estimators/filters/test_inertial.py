@@ -32,7 +32,7 @@ def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
     beta, gamma, phi, phi_rate = x
     car = make_car(vehicle)
     at = Motion(V, V * beta, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_rate)
-    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 1)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, PlantVariant(1, LINEAR))
     push, road = DisturbanceForces(F_d, 0.0), RoadParams(0.0, 0.0, 1.0)
     rate = derivative(at, load, push, car, road, PlantVariant(1, LINEAR, 1))
     a_y = rate.v_y + V * gamma + GRAVITY * phi
