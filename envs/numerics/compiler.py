@@ -110,7 +110,7 @@ class _UnlinkedLibrary(JITCodeLibrary):
         visit(self)
         return list(reversed(visited))[1:]
 
-    def link_into(self, module: binding.ModuleRef) -> binding.ModuleRef:
+    def link_callees(self, module: binding.ModuleRef) -> binding.ModuleRef:
         """Link all that it calls into a module."""
         for callee in self.collect_callees():
             # of a part its function alone: those below it are in the list
@@ -120,7 +120,7 @@ class _UnlinkedLibrary(JITCodeLibrary):
 
     def _get_module_for_linking(self) -> binding.ModuleRef:
         """The module of this function and all below it, which numba's own functions link."""
-        return self.link_into(super()._get_module_for_linking().clone())
+        return self.link_callees(super()._get_module_for_linking().clone())
 
 
 class _KernelLibrary(JITCodeLibrary):
@@ -295,7 +295,7 @@ def _link_library(part: CompileResult) -> _Linked:
     library = _KernelLibrary(target.codegen(), part.library.name)
     library.enable_object_caching()
     # the function's own module, not that for linking: others find its code by the name
-    library.add_llvm_module(part.library.link_into(part.library._final_module.clone()))
+    library.add_llvm_module(part.library.link_callees(part.library._final_module.clone()))
     callees = part.library.collect_callees()
     needs = [callee.path for callee in callees if isinstance(callee, _ExternalLibrary)]
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
