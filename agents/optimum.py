@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.engine.config import EnvConfig
+from ..envs.numerics.functions import TICK
 from ..envs.numerics.jit import as_python
 from ..envs.record import PACKET_WIDTH, Array
 from ..envs.scenarios.driver import compute_wander_gains
 from ..envs.task import REFERENCES
-from ..envs.ticks import TICK
 from ..estimators.design.models import select_states
 from ..estimators.make import make_estimator
 from ..estimators.vector import estimate as vector

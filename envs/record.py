@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .numerics.functions import TICK
 from .sensors.link import SlowSensor
 from .sensors.slow import SLOW_NAMES, VALUES
-from .ticks import TICK
 
 Array = npt.NDArray[np.float64]
 

@@ -17,6 +17,7 @@ from .engine.layout import EpisodeArrays, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_episode
 from .engine.views import CarTruth, Episode, compute_true_states, make_episode_arrays
+from .numerics.functions import TICK
 from .numerics.jit import compile_call
 from .numerics.packed import read
 from .record import Array, Record
@@ -26,7 +27,6 @@ from .scenarios.scenario import Scenario
 from .scenarios.world import WorldSource, make_world
 from .sensors.link import SlowSensor
 from .task import REFUSED, REPORT, RUNNING, WILD, ObservationEntry, make_info
-from .ticks import TICK
 from .validation import parse_action, warn_once
 from .vehicle.dynamics import Motion
 from .vehicle.parameters import Vehicle, VehicleSource, make_vehicle

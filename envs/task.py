@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from .numerics.functions import TICK
 from .numerics.jit import jit
 from .numerics.primitives import Scalar, Vector, absolute, maximum, minimum, select
 from .record import FAST, FAST_UNITS, Array
 from .sensors.slow import SLOW
-from .ticks import TICK
 from .vehicle.actuators import apply_lag
 from .vehicle.parameters import GRAVITY, Vehicle
 

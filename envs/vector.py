@@ -13,11 +13,11 @@ from .engine.batch_env import BatchEnv
 from .engine.config import EnvConfig
 from .engine.layout import Z
 from .engine.views import Episode, compute_true_states
+from .numerics.functions import TICK
 from .record import Array
 from .rendering.renderer import VectorRenderMixin
 from .stability import StabilityEnv
 from .task import REFUSED, WILD, Infos, make_infos
-from .ticks import TICK
 from .validation import Mask, check_int, parse_actions, warn_once
 
 Observations = npt.NDArray[np.float32]

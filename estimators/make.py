@@ -15,8 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, overload
 
+from ..envs.numerics.functions import TICK
 from ..envs.sensors.link import SlowSensor
-from ..envs.ticks import TICK
 from ..envs.validation import describe_unknown
 from ..envs.vehicle.parameters import COMS, VehicleSource, make_vehicle
 from .delayed_channels import LateEstimator

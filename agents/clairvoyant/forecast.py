@@ -17,6 +17,7 @@ from ...envs.engine.step import make_step_variant, step_vehicle
 from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
 from ...envs.engine.window import compute_profile_angle, make_window
 from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
+from ...envs.numerics.functions import FOREVER, TICK
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
 from ...envs.numerics.primitives import Scalar
@@ -31,7 +32,6 @@ from ...envs.task import (
     compute_cost_rate,
     compute_reference,
 )
-from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, apply_lag, compute_yaw_moment, make_lag
 from ...envs.vehicle.dynamics import (
     CarParams,

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, maximum
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
-from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, make_vision_model
 from ...envs.vehicle.parameters import Vehicle
 from ..design.sampled_model import SPEEDS, DesignModel, interpolate_gains

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import copy_into, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
 from ...envs.record import Array
-from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
 from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_gain_table

@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.numerics import require_extra
-from ...envs.numerics.functions import sincos
+from ...envs.numerics.functions import TICK, sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference
-from ...envs.ticks import TICK
 from ...envs.validation import check_int
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle

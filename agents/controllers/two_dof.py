@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
-from ...envs.ticks import TICK
 from ...envs.validation import check_choice
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
-from ...envs.ticks import TICK
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
 from ...envs.vehicle.parameters import Vehicle
 from ..design.sampled_model import SPEEDS, find_cell

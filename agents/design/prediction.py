@@ -16,6 +16,7 @@ import numpy as np
 from ...envs.engine.config import make_car
 from ...envs.engine.layout import StepVariant
 from ...envs.engine.tick import compute_lagged_load
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import inline, noinline
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select
@@ -29,7 +30,6 @@ from ...envs.task import (
     ZERO_SLIP,
     ReferenceParams,
 )  # fmt: skip
-from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import (
     Lag,
     allocate_torques,

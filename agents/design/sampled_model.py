@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, RATE_TICKS, STEER_SCALE, ZERO_SLIP
-from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import make_lag
 from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle

@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 from ...envs.engine.layout import FLAGS, STATE_WIDTH, EpisodeArrays, P, Z
 from ...envs.engine.outputs import observe, update_newest
+from ...envs.numerics.functions import NEVER
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
 from ...envs.record import FAST, FAST_WIDTH
 from ...envs.task import REPORT, compute_reference, filter_reference
-from ...envs.ticks import NEVER
 from ...estimators.core.filter import NO_OUTPUTS, Observed, StepRecord
 from ...estimators.estimator import Estimator
 from ...estimators.protocol import compute_std

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ...envs.sensors.slow import CAMERA, GPS, SLOW
-from ...envs.ticks import TICK
 
 MAGIC, VERSION = b"SLIP", 1
 HEADER = struct.Struct("!4sBBHIq")

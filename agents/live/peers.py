@@ -27,9 +27,9 @@ import numpy.typing as npt
 
 from ...envs.engine.layout import Z
 from ...envs.numerics import require_extra
+from ...envs.numerics.functions import TICK
 from ...envs.record import FAST, PACKET
 from ...envs.sensors.slow import WIDTHS
-from ...envs.ticks import TICK
 from ...estimators.design.models import FOREIGN_STATE, STATES
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout

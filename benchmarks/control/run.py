@@ -23,10 +23,10 @@ from ...agents.env_info import list_configs
 from ...agents.learned.policy import hash_policy
 from ...agents.rollout import EpisodeStep, iterate_steps
 from ...envs.io import atomic_file
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import FAST, Array
 from ...envs.task import FAILURES
-from ...envs.ticks import TICK
 from ...envs.validation import parse_actions
 from ...envs.vehicle.dynamics import Motion
 from ...estimators.make import describe_error

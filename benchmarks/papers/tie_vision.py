@@ -20,9 +20,9 @@ from scipy.optimize import brentq
 from ...agents import make_agent
 from ...agents.controllers.two_dof import CAMERA_PERIOD, PLACEMENTS, POLE, design_pi
 from ...agents.rollout import rollout
+from ...envs.numerics.functions import TICK
 from ...envs.record import Array
 from ...envs.scenarios.world import KMH
-from ...envs.ticks import TICK
 from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ...envs.vehicle.parameters import COMS, Vehicle
 from ...estimators.design.gains import kalman_gain

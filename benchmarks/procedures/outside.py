@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ...agents.rollout import rollout
+from ...envs.numerics.functions import TICK
 from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, make_outside_vehicle
 from ...envs.record import Array
 from ...envs.scenarios import driver as profiles
 from ...envs.scenarios.scenario import Scenario
 from ...envs.scenarios.world import Draws
-from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.drives import make_env

@@ -15,9 +15,9 @@ from ...agents import Agent
 from ...agents.rollout import iterate_steps
 from ...envs.io import atomic_file
 from ...envs.numerics import require_extra
+from ...envs.numerics.functions import TICK
 from ...envs.record import Array
 from ...envs.recordings.dialect import to_degrees
-from ...envs.ticks import TICK
 from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
 

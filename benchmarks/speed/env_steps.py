@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.numerics.functions import TICK
 from ...envs.record import Array
-from ...envs.ticks import TICK
 from ...estimators.filters import FILTERS
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations

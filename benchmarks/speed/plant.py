@@ -18,11 +18,11 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs.engine.layout import P, Z
+from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import make_offsets, read, write
 from ...envs.numerics.simd import LANES
 from ...envs.record import Array
-from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
 from ...envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load

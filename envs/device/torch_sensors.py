@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Z
 from ..engine.outputs import make_measurement_context
+from ..numerics.functions import FOREVER, NEVER
 from ..numerics.packed import read
 from ..numerics.primitives import select
 from ..numerics.torch_backend import to_torch, torch
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, sample_sensor
-from ..ticks import FOREVER, NEVER
 from ..vehicle.dynamics import Motion
 
 Tensor = torch.Tensor

@@ -11,7 +11,7 @@ from ..engine.reset import compute_first_row
 from ..engine.step import get_start_variant, make_step_params
 from ..engine.tick import StepState, TickInputs, apply_tyre_change, integrate_tick
 from ..engine.window import compute_tick_cost
-from ..numerics.functions import CHANNELS, clip, draw_normals
+from ..numerics.functions import CHANNELS, NEVER, TICK, clip, draw_normals
 from ..numerics.packed import read
 from ..numerics.primitives import Scalar, select
 from ..numerics.torch_backend import GradientGate, compile_method, to_torch, torch
@@ -32,7 +32,6 @@ from ..task import (
     compute_reference,
     select_failure,
 )
-from ..ticks import NEVER, TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .torch_sensors import Delivered, PacketCapacity, SlowSensors, SlowState, TickWindow
 

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..numerics.functions import FOREVER, TICK, count_ticks
 from ..record import Array
 from ..scenarios.driver import STEERING_KINDS, STEERING_WIDTH, DriverParams, SpeedProfile, Wind
 from ..scenarios.manoeuvres import make_scenario
@@ -39,7 +40,6 @@ from ..task import (
     make_reference_params,
     make_space,
 )
-from ..ticks import FOREVER, TICK, count_ticks
 from ..validation import (
     check_choice,
     check_int,

@@ -4,7 +4,7 @@ Packets are captured at a tick and delivered at their arrival in the order (capt
 those under way lie in the state.
 """
 
-from ..numerics.functions import clip
+from ..numerics.functions import FOREVER, NEVER, TICK, clip
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import load_element, read, store_element, write
 from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select, to_word
@@ -12,7 +12,6 @@ from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
 from ..task import AGE_CAP, N_SAMPLED, REPORT, compute_reference
-from ..ticks import FOREVER, NEVER, TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import FLAGS, EpisodeArrays, P, Z
 from .window import WINDOW

@@ -1,6 +1,17 @@
 """Reset of an episode: its draws from a key, and tick 0; compiled."""
 
-from ..numerics.functions import CHANNELS, PI, draw_normals, draw_uniforms, exp, sincos
+from ..numerics.functions import (
+    CHANNELS,
+    FOREVER,
+    NEVER,
+    PI,
+    TICK,
+    draw_normals,
+    draw_uniforms,
+    exp,
+    round_to_ticks,
+    sincos,
+)
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
 from ..numerics.primitives import Scalar, Vector, floor, from_word, maximum, minimum, select
@@ -22,7 +33,6 @@ from ..sensors.inertial import (
     compute_fast_row,
 )
 from ..sensors.slow import GPS, draw_first_drift
-from ..ticks import FOREVER, NEVER, TICK, round_to_ticks
 from ..vehicle.dynamics import Motion, compute_car_curvature, compute_gravity
 from ..vehicle.parameters import GRAVITY, MIN_RELAXATION
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, StepVariant, Z

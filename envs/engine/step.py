@@ -8,7 +8,7 @@ car, `integrate_step` moves the car, `finish_step` does slow sensors, observatio
 
 from typing import NamedTuple
 
-from ..numerics.functions import clip
+from ..numerics.functions import TICK, clip
 from ..numerics.jit import inline, jit, noinline
 from ..numerics.packed import lane_width, load_element, load_lanes, read, store_element, write
 from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, select
@@ -25,7 +25,6 @@ from ..task import (
     compute_failure_cost,
     select_failure,
 )
-from ..ticks import TICK
 from ..vehicle.tyres import compute_tyre_load
 from .layout import FLAGS, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import finish_step

@@ -6,7 +6,7 @@ it serve outside plants too.
 
 from typing import Any, NamedTuple
 
-from ..numerics.functions import compute_sine
+from ..numerics.functions import TICK, compute_sine
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
@@ -31,7 +31,6 @@ from ..sensors.inertial import (
     compute_specific_force,
 )
 from ..task import ReferenceParams, compute_reference, filter_reference
-from ..ticks import TICK
 from ..vehicle.actuators import (
     Lag,
     allocate_torques,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..numerics.functions import TICK, count_ticks
 from ..numerics.jit import jit
 from ..numerics.packed import read
 from ..numerics.primitives import Matrix, Vector
@@ -14,7 +15,6 @@ from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..task import REPORT
-from ..ticks import TICK, count_ticks
 from ..vehicle.dynamics import compute_gravity, compute_sideslip_angle
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import MAGIC_FORMULA, fit_fiala

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..numerics.functions import CHANNELS, draw_normals
+from ..numerics.functions import CHANNELS, TICK, draw_normals
 from ..numerics.jit import inline, jit
 from ..numerics.packed import (
     count_lanes,
@@ -25,7 +25,6 @@ from ..scenarios.driver import WANDER_START, compute_steering, interpolate_trace
 from ..scenarios.road import TrackPath, compute_path_offset
 from ..sensors.inertial import NormalDraws
 from ..task import RATE_TICKS, compute_cost_rate
-from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import PARAMS_WIDTH, EpisodeArrays, P, StepVariant, TaskParams, Z
 

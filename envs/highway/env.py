@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..engine.layout import P, Z
 from ..engine.window import WINDOW
+from ..numerics.functions import TICK
 from ..numerics.jit import as_python
 from ..numerics.packed import read
 from ..outside.env import PlantEnv
@@ -37,7 +38,6 @@ from ..task import (
     compute_failure_cost,
     make_space,
 )
-from ..ticks import TICK
 from ..validation import check_choice, check_int, check_mapping, check_options
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import Vehicle, VehicleSource

@@ -1,4 +1,4 @@
-"""Elementary functions and counter-based random numbers with the same bits on every backend.
+"""Elementary functions, ticks and counter-based random numbers, of the same bits on every backend.
 
 Library functions differ in the last bit between platforms; these polynomials use only + - * / and
 correctly rounded square roots. A random number is a pure function of (key, tick, channel) by
@@ -8,7 +8,7 @@ words are signed 64-bit integers under masks.
 
 from typing import NamedTuple
 
-from .jit import jit
+from .jit import as_python, jit
 from .primitives import Scalar, absolute, floor, frexp, maximum, minimum, select, sqrt, to_float
 
 _Four = tuple[Scalar, Scalar, Scalar, Scalar]
@@ -207,6 +207,34 @@ def clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
         high: Upper limit, at least low.
     """
     return minimum(maximum(value, low), high)
+
+
+TICK = 0.001
+"""The base tick of the simulated car in seconds."""
+FOREVER = 1e15  # ticks
+NEVER = -1.0
+
+
+@jit
+def round_to_ticks(seconds: Scalar) -> Scalar:
+    """Round a time in seconds to whole ticks.
+
+    Args:
+        seconds: The time (s).
+    """
+    return floor(seconds / TICK + 0.5)
+
+
+_round_to_ticks = as_python(round_to_ticks)
+
+
+def count_ticks(seconds: float) -> float:
+    """Round a time in seconds to whole ticks, without the compiler.
+
+    Args:
+        seconds: The time (s).
+    """
+    return float(_round_to_ticks(seconds))
 
 
 _MASK = 0xFFFFFFFF

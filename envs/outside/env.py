@@ -15,6 +15,7 @@ from ..engine.layout import P, StepVariant, Z
 from ..engine.outputs import finish_step
 from ..engine.tick import StepParams, StepState, TickInputs, compute_inputs, measure_tick
 from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
+from ..numerics.functions import TICK
 from ..numerics.jit import as_python
 from ..numerics.packed import load_element, read, write
 from ..record import FAST
@@ -22,7 +23,6 @@ from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
 from ..task import RUNNING, select_failure
-from ..ticks import TICK
 from ..validation import check_choice, check_mapping, is_finite, short_repr, warn_once
 from ..vehicle.dynamics import Motion
 from .plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, make_outside_vehicle

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..numerics.functions import TICK
 from ..record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Fast, Log, Record
 from ..sensors.link import SlowSensor
 from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
-from ..ticks import TICK
 from .dialect import LATENCIES, LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
 from .tables import name_log, read_quantities
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..engine.layout import FLAGS, P
+from ..numerics.functions import TICK
 from ..record import Array
 from ..task import FAILURES, ZERO_SLIP
-from ..ticks import TICK
 from ..vehicle.parameters import GRAVITY
 from . import road
 from .canvas import Box, Canvas, pygame

@@ -9,8 +9,8 @@ from gymnasium.error import ResetNeeded
 
 from ..engine.layout import P, Z
 from ..engine.views import Episode
+from ..numerics.functions import TICK
 from ..record import Array
-from ..ticks import TICK
 from ..validation import check_choice
 from .trace import EpisodeTrace, RenderState, RoadPainter
 

@@ -9,11 +9,10 @@ is the nominal car's for it in the steady state, behind a first-order lag and a 
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..numerics.functions import PI, exp, sincos, smoothstep
+from ..numerics.functions import FOREVER, PI, TICK, exp, round_to_ticks, sincos, smoothstep
 from ..numerics.jit import inline, jit
 from ..numerics.packed import load_element
 from ..numerics.primitives import Scalar, Vector, any_lane, floor, maximum, minimum, select, sqrt
-from ..ticks import FOREVER, TICK, round_to_ticks
 from ..vehicle.actuators import apply_lag, limit_rate
 from ..vehicle.dynamics import Motion, RoadParams, compute_curvature
 from ..vehicle.tyres import MIN_SPEED

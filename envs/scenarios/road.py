@@ -8,10 +8,9 @@ offset of 3.5 m is taken between the lanes' right edges; the last's is in line w
 from itertools import pairwise
 from typing import NamedTuple
 
-from ..numerics.functions import PI, sincos, smoothstep
+from ..numerics.functions import PI, TICK, sincos, smoothstep
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, any_lane, floor, maximum, select
-from ..ticks import TICK
 from ..vehicle.linear import Bicycle, compute_bicycle_coefficients
 
 ROADS = ("straight", "nominal-path")

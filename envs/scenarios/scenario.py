@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..io import write_document
+from ..numerics.functions import TICK
 from ..record import Array
 from ..sensors.inertial import Noise
 from ..sensors.slow import HDOP_LAWS
-from ..ticks import TICK
 from ..validation import check_choice, describe_unknown, is_finite, quantity, short_repr
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import TYRE_LAWS

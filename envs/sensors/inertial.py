@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..numerics.functions import compute_sine
+from ..numerics.functions import TICK, compute_sine
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
-from ..ticks import TICK
 from ..vehicle.actuators import apply_lag
 from ..vehicle.dynamics import Motion, RoadParams, compute_gravity
 from ..vehicle.parameters import GRAVITY

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ..numerics.functions import draw_uniforms
+from ..numerics.functions import NEVER, TICK, count_ticks, draw_uniforms
 from ..numerics.jit import jit
 from ..numerics.primitives import Scalar, any_lane, floor, select, to_int
-from ..ticks import NEVER, TICK, count_ticks
 from ..validation import is_finite, short_repr
 
 MAX_IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included

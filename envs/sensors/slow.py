@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..numerics.functions import CHANNELS, PI, compute_sine, draw_normals, exp, sincos, wrap
+from ..numerics.functions import CHANNELS, PI, TICK, compute_sine, draw_normals, exp, sincos, wrap
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import (
     Scalar,
@@ -28,7 +28,6 @@ from ..numerics.primitives import (
     to_float,
     to_int,
 )
-from ..ticks import TICK
 from ..validation import check_mapping, describe_unknown
 from ..vehicle.dynamics import (
     CarParams,

@@ -1,5 +1,5 @@
 """The car: parameters, equations of motion, tyres, actuators and its linear models.
 
 `parameters.Vehicle` is what users write; `dynamics`, `tyres` and `actuators` are the plant,
-functions of numbers alone. It imports `numerics` and `ticks`.
+functions of numbers alone. It imports `numerics`.
 """

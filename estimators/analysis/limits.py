@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.numerics.functions import TICK
 from ...envs.record import Array, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
-from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import COMS, Vehicle
 from ..core.filter import reset_filters
 from ..design.assemble import assemble

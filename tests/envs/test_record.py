@@ -8,6 +8,7 @@ import pytest
 from sideslip.envs import COMS, Log, Record, StabilityEnv
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import Z
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.record import (
     FAST,
     FAST_UNITS,
@@ -18,7 +19,6 @@ from sideslip.envs.record import (
     concatenate,
 )
 from sideslip.envs.sensors.slow import SLOW, VALUES
-from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
 from sideslip.envs.vehicle.tyres import PlantVariant, TyreInputs, compute_tyre_load

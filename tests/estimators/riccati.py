@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.parameters import Vehicle
 from sideslip.estimators.design.gains import joseph_form, kalman_gain

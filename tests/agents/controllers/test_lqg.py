@@ -15,7 +15,7 @@ import pytest
 from scipy.stats import norm
 
 from sideslip.agents import Lqr, make_agent
-from sideslip.envs.ticks import TICK
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model
 from sideslip.estimators import EstimateObservation
 from tests.estimators.riccati import riccati

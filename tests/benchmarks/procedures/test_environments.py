@@ -9,8 +9,8 @@ from sideslip.benchmarks.procedures import fmvss126, iso
 from sideslip.benchmarks.procedures.drive import CALM, CARS, ENTRIES, DriveFunction
 from sideslip.benchmarks.procedures.outside import _make_steering_profile
 from sideslip.envs import Scenario
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.scenarios.driver import compute_steering
-from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.parameters import GRAVITY
 
 EACH = pytest.mark.parametrize("name", CARS)

@@ -12,11 +12,11 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import COMS, StabilityEnv
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.sensors.slow import CAMERA, GPS
-from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model
 
 from ..batches import batch

@@ -12,13 +12,13 @@ from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.numerics import functions
 from sideslip.envs.numerics import functions as noise
+from sideslip.envs.numerics.functions import FOREVER
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
 from sideslip.envs.scenarios import driver as programme
 from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle
 from sideslip.envs.scenarios.road import make_path, transform_path
 from sideslip.envs.task import make_reference_params
-from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle import dynamics, tyres
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams
 from sideslip.envs.vehicle.tyres import TYRE_LAWS, PlantVariant, TyreInputs

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
 from sideslip.envs.engine.config import make_car
+from sideslip.envs.numerics.functions import FOREVER, TICK
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.scenarios.driver import (
     STEERING_KINDS,
@@ -21,7 +22,6 @@ from sideslip.envs.scenarios.driver import (
     write_steering,
 )
 from sideslip.envs.scenarios.world import DRAWS_WIDTH, Draws, _is_stable
-from sideslip.envs.ticks import FOREVER, TICK
 
 from ..helpers import FULL, LINEAR, fast_rows, packets, play
 

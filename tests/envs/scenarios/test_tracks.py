@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import P
+from sideslip.envs.numerics.functions import FOREVER
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
 from sideslip.envs.scenarios.road import (
@@ -21,7 +22,6 @@ from sideslip.envs.scenarios.road import (
     make_sections,
     transform_path,
 )
-from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load
 
 from ..helpers import FULL, LINEAR, bits, play

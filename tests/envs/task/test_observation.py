@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sideslip.envs import Record, SlowSensor, StabilityEnv
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.record import FAST, PACKET, Fast
 from sideslip.envs.sensors.slow import SENSOR_SETS, SLOW, SLOW_NAMES
 from sideslip.envs.task import AGE_CAP, N_SAMPLED
-from sideslip.envs.ticks import TICK
 
 from ..helpers import FULL, IDS, LINEAR, play, unwrapped
 

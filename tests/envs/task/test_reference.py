@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, PASSENGER_CAR, StabilityEnv, Vehicle
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.record import FAST
 from sideslip.envs.task import (
     LAGGED,
@@ -22,7 +23,6 @@ from sideslip.envs.task import (
     filter_reference,
     make_reference_params,
 )
-from sideslip.envs.ticks import TICK
 
 from ..helpers import FULL, IDS, LINEAR, bits, fast_rows, play, unwrapped
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.tick import compute_motor_torques
+from sideslip.envs.numerics.functions import FOREVER, TICK
 from sideslip.envs.record import FAST
 from sideslip.envs.scenarios.driver import SpeedProfile
-from sideslip.envs.ticks import FOREVER, TICK
 from sideslip.envs.vehicle.actuators import (
     Lag,
     allocate_torques,

@@ -10,8 +10,8 @@ import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, Vehicle
 from sideslip.envs.engine.config import make_car
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.record import FAST, concatenate
-from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative, kutta3
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES

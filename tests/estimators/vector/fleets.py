@@ -10,8 +10,8 @@ from gymnasium.vector import SyncVectorEnv
 
 import sideslip  # noqa: F401  registers the environments
 from sideslip.envs import COMS
+from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
-from sideslip.envs.ticks import TICK
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.filter import Observed, OutputTable, StepRecord
 from sideslip.estimators.vector.estimate import EstimateObservation, _build_batch
