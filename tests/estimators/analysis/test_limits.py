@@ -1,4 +1,4 @@
-"""The bound by Riccati, Monte Carlo and dense conditioning; what sensors can see, by definition and by the filter itself."""
+"""The bound by Riccati, Monte Carlo and dense conditioning; what sensors can see."""
 
 import dataclasses
 import itertools
