@@ -179,8 +179,31 @@ def _make_oracle_table(matrix: Matrix) -> ResultTable:
     )
     if not matrix.foresight:
         note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
+    upsets = _list_upsets(matrix) or ["no entry above oracle-state, nor it above the clairvoyant"]
+    note += f" Surely above what knows more: {'; '.join(upsets)}."
     lines = [_make_oracle_line(matrix, task) for task in matrix.tasks]
     return ResultTable("The oracles", _BASELINES, lines, note, keyed=False)
+
+
+def _list_upsets(matrix: Matrix) -> list[str]:
+    """List who is surely above a reference: a finding, for then that reference does not hold."""
+    from scipy.stats import ttest_1samp
+
+    leads = {f"oracle-state in {task.name}": -gain for task, gain in matrix.foresight.items()}
+    for tier, ranked in matrix.by_tier.items():
+        best = next((x.scores for x in ranked if x.entry == Entry(STATE)), {})
+        for item in (x for x in ranked if x.entry != Entry(STATE)):
+            both = [(r, best[task]) for task, r in item.scores.items() if task in best]
+            if both:
+                lead = np.concatenate([a[: len(b)] - b[: len(a)] for a, b in both])
+                leads[f"{item.label} in tier {tier}"] = lead
+    tested = {text: lead for text, lead in leads.items() if len(lead) > 1 and np.ptp(lead) > 0.0}
+    level = 0.05 / max(len(tested), 1)  # Bonferroni's
+    return [
+        text
+        for text, lead in tested.items()
+        if ttest_1samp(lead, 0.0, alternative="greater").pvalue < level
+    ]
 
 
 def _make_oracle_line(matrix: Matrix, task: ControlTask) -> Line:

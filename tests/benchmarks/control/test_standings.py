@@ -12,6 +12,7 @@ from sideslip.benchmarks.control.suite import _compose_verdict, _name_agent, _ra
 from sideslip.benchmarks.control.tables import (
     _LINE,
     Matrix,
+    _list_upsets,
     _make_motion_table,
     _make_oracle_table,
     make_failure_tables,
@@ -186,6 +187,27 @@ def test_what_is_too_close_is_said() -> None:
         found[contest, Entry(NOMINAL)].numbers[:, slip] += np.radians(0.3)
     line = texts(_make_oracle_table(Matrix(found)))[0]
     assert line[4] == "0.30" and "less than" not in _compose_verdict(Matrix(found))
+
+
+def test_who_is_surely_above_what_knows_more_is_a_finding() -> None:
+    rng, found = np.random.default_rng(0), results()
+    level = {ONE: rng.normal(0.0, 0.3, 64), TWO: rng.normal(0.3, 0.3, 64)}
+    assert _list_upsets(Matrix(found, foresight=level)) == []
+    for contest in (ONE, TWO):
+        found[contest, Entry("lqr", "dakf")] = episodes(5.0)
+    beaten = Matrix(found, foresight={ONE: -level[TWO], TWO: level[TWO]})
+    upsets = [f"oracle-state in {ONE.name}", "lqr on dakf in tier road"]
+    assert _list_upsets(beaten) == upsets
+    assert f"Surely above what knows more: {'; '.join(upsets)}." in _make_oracle_table(beaten).note
+
+
+def test_chance_upsets_no_reference_in_19_of_20_tables() -> None:
+    rng = np.random.default_rng(1)
+    tasks = [replace(ONE, scenario=str(k)) for k in range(40)]
+    tables = [
+        Matrix({}, foresight={x: rng.normal(0.0, 0.3, 64) for x in tasks}) for _ in range(100)
+    ]
+    assert sum(bool(_list_upsets(one)) for one in tables) <= 10  # 5 of 100 expected; P(> 10) = 1 %
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
