@@ -15,10 +15,17 @@ from ..envs.numerics.jit import compile_call
 from ..envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord, advance, reset_filters
+from .core.filter import (
+    NO_OUTPUTS,
+    FilterOutputs,
+    StepRecord,
+    advance,
+    reset_filters,
+    write_estimate,
+)
 from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
-from .core.update import compute_excess, is_healthy
+from .core.update import is_healthy
 from .design import periodic
 from .design.models import STATES
 from .design.options import FilterConfig
@@ -34,6 +41,12 @@ def compile_advance() -> Callable[..., int]:
     filters, gains, matrix = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
     record, outputs = StepRecord(matrix, 0, matrix, 0), FilterOutputs(matrix, matrix, matrix[0])
     return compile_call(advance, filters, gains, record, 0, outputs)
+
+
+@cache
+def _compile_write_estimate() -> Callable[..., bool]:
+    filters, gains, matrix = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
+    return compile_call(write_estimate, filters, gains, matrix[0], matrix)
 
 
 class Estimator:
@@ -259,27 +272,19 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The present states, shape (n,)."""
-        return np.concatenate([f["x"][: f["n"]] for f in self.filters])
+        return self._read_estimate(0)[0]
 
     @property
     def P(self) -> Array:
-        """Their present covariance, shape (n, n); with periodic gains that of the settled cycle.
+        """Their present covariance, shape (n, n); with periodic gains that of the settled cycle."""
+        return self._read_estimate(len(self.names))[1]
 
-        Of a filter that is lost it is larger by its surprise.
-        """
-        P, first = np.zeros((len(self.names),) * 2), 0
-        for f in self.filters:
-            n, growth = int(f.n), max(float(compute_excess(f)), 1.0)
-            block = f.P[:n, :n]
-            if f.periodic:  # a table holds one triangle
-                if self.gains[f.cell, 0, 0] == 0.0:
-                    self._design_cell(int(f.cell))
-                row, upper = 1 + f.at * max(f.fasts, 1), np.triu_indices(n)
-                block = np.empty((n, n))
-                block[upper] = block.T[upper] = self.gains[f.cell, row, f.total :]
-            P[first : first + n, first : first + n] = growth * block
-            first += n
-        return P
+    def _read_estimate(self, width: int) -> tuple[Array, Array]:
+        """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
+        x, P = np.empty(len(self.names)), np.zeros((width, width))
+        while not _compile_write_estimate()(self.filters, self.gains, x, P):
+            self._design_cell(int(self._f.cell))
+        return x, P
 
     @property
     def tick(self) -> int:

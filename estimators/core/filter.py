@@ -239,6 +239,34 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
             column += 1
 
 
+@jit
+def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
+    """Write the states of all layers and their covariance.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        x: Output for the states, shape (n,).
+        P: Output for the covariance, zeros of shape (n, n), or (0, 0).
+
+    Returns:
+        False where P is to be read from gains that are missing.
+    """
+    offset, f = 0, layers[0]
+    if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
+        return False
+    for layer in range(len(layers)):
+        f = layers[layer]
+        growth = maximum(compute_excess(f), 1.0)  # as `_compute_deviation`: lost, it is less sure
+        for i in range(f.n):
+            x[offset + i] = f.x[i]
+            for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
+                row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
+                P[offset + i, offset + j] = growth * _read_covariance(f, gains, row, column)
+        offset += f.n
+    return True
+
+
 @noinline
 def advance(
     layers: FilterRecords, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
