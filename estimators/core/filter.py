@@ -241,16 +241,13 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
 
 @jit
 def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
-    """Write the states of all layers and their covariance.
+    """Write the states of all layers and their covariance; False where gains for P are missing.
 
     Args:
         layers: Memory of the estimator, shape (layers,).
         gains: Tables of gains, shape (cells, rows, columns).
         x: Output for the states, shape (n,).
         P: Output for the covariance, zeros of shape (n, n), or (0, 0).
-
-    Returns:
-        False where P is to be read from gains that are missing.
     """
     offset, f = 0, layers[0]
     if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
@@ -271,7 +268,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
 def advance(
     layers: FilterRecords, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
 ) -> int:
-    """Process the fast rows of a record from `start` on, and its packets.
+    """Process a record's rows from `start` on and its packets; return rows done, to go on there.
 
     Args:
         layers: Memory, shape (1,); or (2,), of which the second measures what the first estimates.
@@ -279,9 +276,6 @@ def advance(
         record: Rows and packets.
         start: Number of rows that are done already.
         outputs: Arrays to fill.
-
-    Returns:
-        Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
     fast, rows, packets, count = record
     X, S, nis = outputs

@@ -22,10 +22,8 @@ stored: the residual against the prediction at the capture is used as if it were
 (15)-(16). constant: the same, for an assumed delay. larsen: the covariance takes it at its capture,
 the states when it arrives (Larsen 1998), exact for one under way and none lost. buffer: the window
 is filtered anew (`packets`), exact. literal, lag: late states follow by one step or a lag."""
-CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
-"""Codes of the field `late`."""
-NONE, PSEUDO, DUAL_RATE = range(3)
-"""Codes of the field `between`, the rule between samples."""
+CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)  # of the field `delay_rule`
+NONE, PSEUDO, DUAL_RATE = range(3)  # of the field `intersample_rule`
 
 DIRECT = -1  # a sample measures the states as they are
 DROPPED = -2  # it is not used
@@ -137,15 +135,12 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
 
 @jit
 def find_clone(f: FilterRecord, s: int, captured: int) -> int:
-    """Find what a sample measures, and mark it as taken: a second call finds nothing.
+    """Find a sample's first clone, or DIRECT, STORED_ONE, DROPPED (counted); mark it as taken.
 
     Args:
         f: Memory of the filter.
         s: Index of the slow sensor.
         captured: Captured tick of the sample.
-
-    Returns:
-        Index of its first clone; DIRECT, STORED_ONE, or DROPPED (and counted).
     """
     if is_duplicate(f, s, captured):
         return DROPPED
@@ -168,8 +163,7 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
     return target
 
 
-MAX_SURPRISE = 50.0
-"""Squared innovation over its variance, of which more says no more."""
+MAX_SURPRISE = 50.0  # squared innovation over its variance, of which more says no more
 
 
 @jit
@@ -190,9 +184,7 @@ _AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agre
 
 @jit
 def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
-    """Interpolate the factor on a sensor's standard deviations at the HDOP of its packet.
-
-    The filter's table, linear between its knots; 1 without a table or an HDOP.
+    """Interpolate the factor on deviations at a packet's HDOP; 1 without a table or an HDOP.
 
     Args:
         f: Memory of the filter.

@@ -16,13 +16,9 @@ from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
-LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES = range(6)
-"""Kinds of models."""
-BETA, GAMMA, PSI, Y_L = range(4)
-"""Places of a bicycle's states."""
-CURVATURE = 2
-"""Place of the road's curvature among a bicycle's inputs."""
-
+LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES = range(6)  # kinds of models
+BETA, GAMMA, PSI, Y_L = range(4)  # places of a bicycle's states
+CURVATURE = 2  # place of the road's curvature among a bicycle's inputs
 MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
 _FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness

@@ -86,9 +86,7 @@ def find_next_cell(f: FilterRecord, row: Vector) -> Scalar:
 
 @jit
 def read_fast_row(f: FilterRecord, row: Vector) -> None:
-    """Read a fast row: its inputs (the last finite ones), measurements and speed.
-
-    The model is built anew where it has to be.
+    """Read a fast row: inputs (the last finite ones), measurements, speed, perhaps a new model.
 
     Args:
         f: Memory of the filter.

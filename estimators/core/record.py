@@ -31,13 +31,9 @@ SNAPSHOT_INTERVAL = 16  # ticks between two snapshots of the rule "buffer"
 N_SNAPSHOTS = WINDOW // SNAPSHOT_INTERVAL
 N_RECENT = 64  # packets within the window
 
-FilterRecord = Any
-"""One record of the dtype `FILTER`; `f` in all compiled code."""
-FilterRecords = npt.NDArray[Any]
-"""(layers,) or (filters, layers) of the dtype `FILTER`."""
-GainTables = Any
-"""(cells, rows, columns): a table of gains for each cell of speed; `design.periodic` has its
-rows. Zeros where they are computed from P."""
+FilterRecord = Any  # one record of the dtype `FILTER`; `f` in all compiled code
+FilterRecords = npt.NDArray[Any]  # (layers,) or (filters, layers) of the dtype `FILTER`
+GainTables = Any  # (cells of speed, rows, columns), see `design.periodic`; zeros where P gives them
 
 
 class SkipCounters(NamedTuple):

@@ -266,20 +266,16 @@ def compute_excess(f: FilterRecord) -> Scalar:
 
 @jit
 def is_healthy(f: FilterRecord) -> Scalar:
-    """Return whether a filter's innovations are about as large as it expects.
+    """Return whether a filter is neither lost nor reverses; it is True where noise is fixed.
 
     Args:
         f: Memory of the filter.
-
-    Returns:
-        False if it is lost or the car reverses; True where noise is fixed, without an account.
     """
     is_known = f.speed > 0.0 - MIN_SPEED or f.r_share == 0.0
     return is_known and compute_excess(f) < 1.0
 
 
-FIRST_VARIANCE = 100.0
-"""Variance of a fast sensor over the configured one until its first block is over."""
+FIRST_VARIANCE = 100.0  # of a fast sensor over the configured one until its first block is over
 
 
 @jit
