@@ -209,13 +209,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     def step(
         self, action: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Hold the action for one control period.
+        """Hold the action for one control period; returns what `gymnasium.Env.step` does.
 
         Args:
             action: Fractions of full scale, shape (1,), or (2,) with `steering`.
-
-        Returns:
-            Observation, reward, terminated, truncated and info.
 
         Raises:
             ResetNeeded: If no episode is running.
@@ -361,14 +358,10 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         }  # fmt: skip
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env, or of one like it: until the next reset car, scenario and
-        clocks are the snapshot's.
+        """Restore a snapshot of such an env, whose car, scenario and clocks hold until a reset.
 
         Args:
-            snapshot: Return value of `get_state`.
-
-        Raises:
-            ValueError: If it is of another control period, sensors or observation.
+            snapshot: From `get_state`; ValueError if control period, sensors or observation differ.
         """
         self._restore(snapshot)
 

@@ -179,13 +179,11 @@ def parse_action(action: object, width: int, fail: bool) -> Actions:
 def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
     """Parse actions of several rows to float32, shape (count, width).
 
-    ValueError, with the rows, for a wrong shape or no numbers, unless `fail` is set.
-
     Args:
         actions: Numbers of all rows, shape (count, width).
         count: Number of rows.
         width: Numbers of a row.
-        fail: Whether rows of a wrong shape or without numbers become NaN.
+        fail: Whether rows of wrong shape or without numbers become NaN; else ValueError names them.
     """
     try:
         array = np.array(actions, np.float32)  # a copy: contiguous whatever came

@@ -223,11 +223,7 @@ class Stream:
         self._base += drop
 
     def estimate(self) -> SideslipEstimate | None:
-        """Estimate the sideslip angle at the newest sample.
-
-        Returns:
-            The estimate; None as long as a channel that is no slow sensor's has not come.
-        """
+        """Estimate the sideslip angle at the newest sample; None before all fast channels come."""
         end = self._newest + 1
         self._fill(self._changed, end)
         if not self._restart():

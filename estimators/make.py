@@ -42,13 +42,12 @@ def is_user_file(text: str) -> bool:
 
 
 def find_class(text: str) -> tuple[Path, str]:
-    """Find the class of a user's file without running it; FileNotFoundError if there is none.
+    """Find file and name of the class that a text means in a user's file, without running it.
+
+    FileNotFoundError without it; ValueError if it is no Python or has no such or no single class.
 
     Args:
         text: "FILE.py:Name", or "FILE.py" for its only class.
-
-    Returns:
-        File and name of the class; ValueError if it is no Python or has no such or no single class.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
@@ -239,7 +238,8 @@ def make_estimator(
 
     Args:
         name: Name of `FILTERS`, registered name, entry point "package.module:Name", class in a
-            file, "FILE.py:Name", or a factory. A factory is called with the arguments below.
+            file, "FILE.py:Name", or a factory, called with the arguments below; what that
+            builds comes as a `ForeignEstimator`.
         vehicle: The filter's vehicle, as `make_vehicle` takes it.
         sensors: Available slow sensors by name ("camera", "gps").
         dt: Tick (s).
@@ -247,9 +247,6 @@ def make_estimator(
         present: Columns that the record carries, as `Record.present`; None: all. A filter of
             `FILTERS` does without absent fast sensors, unless `fast` names them.
         **options: Options of a filter of `FILTERS`, which `FilterOptions` lists, or of the factory.
-
-    Returns:
-        The estimator; what a factory builds comes as a `ForeignEstimator`.
     """
     available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:

@@ -84,10 +84,8 @@ EstimatorFactory = Callable[..., EstimatorLike]
 class ForeignEstimator:
     """A user's estimator behind the names that it shares with `Estimator`, its states checked.
 
-    TypeError says that `inner` lacks a member, ValueError that its names are not distinct words.
-
     Args:
-        inner: The user's object.
+        inner: User's object; TypeError without a member, ValueError if names are no distinct words.
         name: Name for messages.
         dt: Tick (s).
         sensors: Slow sensors of this episode by name.

@@ -20,16 +20,13 @@ def make_device_env(
 ) -> TensorVectorEnv:
     """Make the environments of an id on a device.
 
+    ValueError for an unknown engine, an id without such an env, `compile` or `grad` with "cuda".
+
     Args:
         env_id: Id that Gymnasium has registered.
         num_envs: Number of environments.
-        engine: "torch" makes a `DeviceVectorEnv`, the gradient engine, "cuda" a `CudaVectorEnv`,
-            one kernel a step.
+        engine: "torch" for a `DeviceVectorEnv` (with gradients), "cuda" for a `CudaVectorEnv`.
         arguments: Arguments of that class, which replace those of the id.
-
-    Raises:
-        ValueError: For an unknown engine, an id without an environment on the device, and `compile`
-            or `grad` of the engine "cuda".
     """
     check_choice("engine", engine, ("torch", "cuda"))
     spec = gym.spec(env_id)

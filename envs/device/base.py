@@ -102,10 +102,7 @@ class TensorVectorEnv(BatchEnv[Tensor]):
 
         Args:
             snapshot: Return value of `get_state`; the gradient engine also takes that of a
-                `StabilityVectorEnv`.
-
-        Raises:
-            ValueError: For one of other rows, sizes, plant or engine.
+                `StabilityVectorEnv`. ValueError for one of other rows, sizes, plant or engine.
         """
         self._restore(check_mapping("a snapshot", snapshot))
 

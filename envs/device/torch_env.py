@@ -162,10 +162,7 @@ class _AttachedParameters:
 
 
 class _DeviceRows:
-    """Parameters, keys, state and last outcome of episodes, as tensors; `start` is for gradients.
-
-    They come from the compiled engine's arrays, and go back there.
-    """
+    """Parameters, keys, state and last outcome of episodes as tensors; `start` is for gradients."""
 
     def __init__(
         self, episodes: BatchArrays, capacities: _Capacities, device: torch.device,

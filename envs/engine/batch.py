@@ -178,13 +178,10 @@ def _step_rows(
 
 @jit
 def read_ends(report: Vector) -> tuple[float, bool, bool]:
-    """Read how a step ended from its report.
+    """Read how a step ended from its report: (reward, terminated, truncated).
 
     Args:
         report: Report of the step, shape (len(StepReport),).
-
-    Returns:
-        (reward, terminated, truncated).
     """
     terminated = report[REPORT.failure] != RUNNING
     return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated

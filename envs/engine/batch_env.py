@@ -57,17 +57,13 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
     ) -> tuple[ArrayT, Infos]:
-        """Start episodes; where it raises, everything stays as it was.
+        """Start episodes; returns observations (N, width) and the infos of the rows that are reset.
+
+        Where it raises, nothing changes; ResetNeeded if a mask leaves out rows that never started.
 
         Args:
             seed: An int s (row i gets s + i), or a list (N,) of int or None.
             options: Options of `StabilityEnv`, each one or a list (N,), and `reset_mask`.
-
-        Returns:
-            Observations (N, width), and the infos of the rows that were reset.
-
-        Raises:
-            ResetNeeded: If a mask leaves out rows that were never started.
         """
         N, remaining = self.num_envs, dict(options or {})
         seeds, mask = _parse_seeds(seed, N), _parse_reset_mask(remaining.pop("reset_mask", None), N)
@@ -80,13 +76,10 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         return self._read_reset(mask)
 
     def step(self, actions: npt.ArrayLike) -> tuple[ArrayT, ArrayT, ArrayT, ArrayT, Infos]:
-        """Hold each row's action for one control period.
+        """Hold each row's action for one control period; rewards and both flags have shape (N,).
 
         Args:
             actions: Fractions of full scale, shape (N, 1), or (N, 2) with `steering`.
-
-        Returns:
-            Observations, rewards (N,), terminated (N,), truncated (N,) and infos.
 
         Raises:
             ResetNeeded: If no episode was started, or a row that ended waits for its reset.
@@ -179,10 +172,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
         """Restore a snapshot of this env or of one built with the same arguments.
 
         Args:
-            snapshot: Return value of `get_state`.
-
-        Raises:
-            ValueError: If it has another number of rows, control period or observation.
+            snapshot: From `get_state`; ValueError if N, control period or observation differ.
         """
         shape, own_shape = np.shape(snapshot["rows"]), self.engine.arrays.rows.shape
         if shape != own_shape:

@@ -388,13 +388,10 @@ class EnvConfig:
         return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)
 
     def apply_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
-        """Make an episode with options of reset.
+        """Make an episode with options of reset; ValueError for an unknown option or state.
 
         Args:
             options: Options by name, as `StabilityEnv` lists them.
-
-        Raises:
-            ValueError: For an unknown option or state.
         """
         if not options:
             return self.base

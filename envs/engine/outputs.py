@@ -146,15 +146,12 @@ def observe(row: EpisodeArrays, n: int, count: int, refs: Vector) -> None:
 
 @jit
 def observe_fast(row: EpisodeArrays, n: int, refs: Vector) -> int:
-    """Write the observation's first entries, of fast rows, and its last two, the references.
+    """Write the observation's fast entries, whose number it returns, and last the two references.
 
     Args:
         row: Arrays of the episode, or of a block.
         n: Number of fast rows.
         refs: (beta_ref, gamma_ref) (rad, rad/s).
-
-    Returns:
-        Number of first entries.
     """
     rows, bounds, switches, obs, k = row.rows, row.bounds, row.switches, row.obs, 0
     for column in range(N_SAMPLED):
@@ -246,7 +243,7 @@ def _find_next_due(z: Vector, tick: Scalar) -> Scalar:
 
 @jit
 def sample_slow_ticks(row: EpisodeArrays, first: int, last: int, count: int, done: int) -> int:
-    """Sample the slow sensors at the ticks of a step's rows first to last - 1.
+    """Sample the slow sensors at the ticks of rows first to last - 1; returns the new `count`.
 
     Args:
         row: Arrays of the episode.
@@ -254,9 +251,6 @@ def sample_slow_ticks(row: EpisodeArrays, first: int, last: int, count: int, don
         last: The row behind the last one.
         count: Number of packets of the step that were delivered before.
         done: Ticks integrated in the step.
-
-    Returns:
-        Number of packets of the step that are delivered by then.
     """
     z = row.z
     start_tick = z[Z.clock.tick] - done

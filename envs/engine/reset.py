@@ -127,7 +127,7 @@ def compute_first_row(
     motion: Motion, steer: Scalar, params: StepParams, draws: NormalDraws, errors: ErrorState,
     variant: StepVariant,
 ) -> Vector:  # fmt: skip
-    """Compute the fast sensors at tick 0, when only the steering has acted.
+    """Compute the fast row at tick 0, shape (FAST_WIDTH,), when only the steering has acted.
 
     Args:
         motion: Motion of the car.
@@ -136,9 +136,6 @@ def compute_first_row(
         draws: Random numbers of the tick.
         errors: State of the sensors' errors.
         variant: Variant of the ticks.
-
-    Returns:
-        The fast row, FAST_WIDTH numbers.
     """
     road = params.road
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))

@@ -221,13 +221,10 @@ def write_final_state(
 
 @jit
 def clip_action(action: Vector) -> tuple[float, float]:
-    """Clip an action to +-1; NaN where it is not finite.
+    """Clip an action to +-1, as (yaw moment, added steering); NaN where it is not finite.
 
     Args:
         action: Fractions of full scale, shape (1,) or (2,).
-
-    Returns:
-        (yaw moment, added steering) as fractions of full scale.
     """
     # in plain Python a float32 would make float32 of all that follows
     yaw_share = float(action[0])
@@ -240,13 +237,10 @@ def clip_action(action: Vector) -> tuple[float, float]:
 
 @jit
 def check_action_range(action: Vector) -> int:
-    """Check whether a number of an action is finite and beyond WILD_LIMIT.
+    """Check an action's range: WILD where a number is finite and beyond WILD_LIMIT, else 0.
 
     Args:
         action: Fractions of full scale, shape (1,) or (2,).
-
-    Returns:
-        WILD where one is, else 0.
     """
     for share in action:
         if (share > WILD_LIMIT or share < -WILD_LIMIT) and share - share == 0.0:
@@ -256,13 +250,10 @@ def check_action_range(action: Vector) -> int:
 
 @jit
 def reject_action(row: EpisodeArrays) -> int:
-    """Refuse an action that is not finite, or end the episode as a failure (`fail_bad`).
+    """Refuse an action that is not finite (REFUSED), or fail the episode by `fail_bad` (0 ticks).
 
     Args:
         row: Arrays of the episode.
-
-    Returns:
-        REFUSED, or 0: no tick was done.
     """
     z, report = row.z, row.report
     if row.switches[FLAGS.fail_bad] == 0:
@@ -276,15 +267,12 @@ def reject_action(row: EpisodeArrays) -> int:
 
 @noinline
 def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
-    """Step one vehicle by n ticks, fewer where the episode ends.
+    """Step a vehicle by n ticks, fewer at the end; returns how many, or what `reject_action` does.
 
     Args:
         row: Arrays of the episode.
         action: Fractions of full scale of the yaw moment and, if there are two, the added steering.
         n: Ticks of a control period.
-
-    Returns:
-        Ticks integrated; for an action that is not finite REFUSED, or 0 with `fail_bad`.
     """
     shares = clip_action(action)
     if shares[0] != shares[0]:
@@ -298,14 +286,11 @@ def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
 
 @jit
 def step_episode(row: EpisodeArrays, action: Vector) -> int:
-    """Step one vehicle by a control period.
+    """Step by a control period as `step_vehicle`, WILD added for an action beyond its limit.
 
     Args:
         row: Arrays of the episode.
         action: Fractions of full scale, shape (1,) or (2,).
-
-    Returns:
-        As `step_vehicle`, with WILD added for an action beyond its limit.
     """
     done = int(step_vehicle(row, action, len(row.rows)))
     return done + check_action_range(action) if done > 0 else done

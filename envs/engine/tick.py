@@ -180,7 +180,7 @@ def compute_motor_torques(
     N_z: Scalar, tick: Scalar, v_x: Scalar, integral: Scalar, profile: SpeedProfile, car: CarParams,
     yaw_first: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
-    """Compute the motors' commands for yaw moment and driver's acceleration.
+    """Compute left and right torque (N m), acceleration command and its next integral part (m/s2).
 
     Args:
         N_z: Commanded yaw moment (N m).
@@ -190,9 +190,6 @@ def compute_motor_torques(
         profile: The driver's speed profile.
         car: Parameters of the car.
         yaw_first: 1 where the yaw moment comes before acceleration.
-
-    Returns:
-        Left and right torque (N m), acceleration command (m/s2), its next integral part (m/s2).
     """
     max_torque = compute_torque_limit(v_x, car)
     limit = 2.0 * max_torque / (car.m * car.r)
@@ -310,7 +307,7 @@ def measure_tick(
     params: StepParams, motion: Motion, accel: Vector, applied: AppliedInputs, refs_before: Vector,
     inputs: TickInputs, variant: StepVariant,
 ) -> tuple[Scalar, Measurements]:  # fmt: skip
-    """Compute the driver's command and the measurements at the end of a tick.
+    """Compute the driver's steering command (rad) and the measurements at the end of a tick.
 
     Args:
         params: Parameters of the step.
@@ -320,9 +317,6 @@ def measure_tick(
         refs_before: References of beta and gamma at the start (rad, rad/s).
         inputs: Inputs of the tick.
         variant: Variant of the tick.
-
-    Returns:
-        The driver's steering command (rad), and the measurements.
     """
     task = params.task
     row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, inputs.draws)

@@ -111,15 +111,12 @@ TRUE_STATE = TrueState()
 
 
 def compute_true_states(params: Array, states: Array, switches: npt.NDArray[np.int64]) -> Array:
-    """Compute the `TrueState` of N episodes now.
+    """Compute the `TrueState` of N episodes now, shape (N, len(TrueState)).
 
     Args:
         params: Packed parameters, a row for each.
         states: Packed states likewise.
         switches: `Switches` likewise.
-
-    Returns:
-        True states, shape (N, len(TrueState)).
     """
     out = np.empty((len(params), len(TRUE_STATE)))
     _write_true_states(params, states, switches, out)

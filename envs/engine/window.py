@@ -66,14 +66,11 @@ _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
 def make_window(n: int, *lanes: int) -> Array:
-    """Make a window of zeros.
+    """Make a window of zeros, shape (WINDOW_HEIGHT, columns, *lanes).
 
     Args:
         n: Ticks of a step.
         lanes: Number of lanes, for a block.
-
-    Returns:
-        The window, shape (WINDOW_HEIGHT, columns, *lanes).
     """
     columns = -(-n // LANES) * LANES  # whole lanes
     return np.zeros((WINDOW_HEIGHT, columns, *lanes))
@@ -81,14 +78,11 @@ def make_window(n: int, *lanes: int) -> Array:
 
 @jit
 def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
-    """Compute the steering angle of a profile, or of the trace behind `EpisodeParams`.
+    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`.
 
     Args:
         p: Packed parameters.
         tick: Tick of the angle.
-
-    Returns:
-        The angle (rad).
     """
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])

@@ -247,10 +247,7 @@ class _KeepingPlant:
         _, self.y, self.theta, self.curvature = locate_on_lane(self.env.lane, x, -y, -heading)
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """Step the car over a tick of h seconds, and integrate its place on the lane.
-
-        A control period's first tick is highway-env's own `step`; the others only move the car.
-        """
+        """Step the car over a tick of h seconds, and integrate its place on the lane."""
         action = np.array([-inputs.steer / self.env.action_type.steering_range[1]])
         before = self.motion
         if self._is_full_step:
@@ -358,8 +355,7 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
 
     Args:
         env: A `KeepingEnv`.
-        returned: Whether it is the one that highway-env's `step` returns, from before the step;
-            else the newest.
+        returned: Whether it is what `step` returns, from before the step; else the newest.
     """
 
     def __init__(self, env: gym.Env[Any, Any], returned: bool) -> None:

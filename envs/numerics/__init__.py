@@ -12,14 +12,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def require_extra(name: str, needs: str) -> Iterator[None]:
-    """Require an extra around imports: where a package is missing, the error names the extra.
+    """Require an extra around imports: ModuleNotFoundError names it where a package is missing.
 
     Args:
         name: Name of the extra.
         needs: Message, "pictures need pygame"; {} stands for the missing module's name.
-
-    Raises:
-        ModuleNotFoundError: For a missing package.
     """
     try:
         yield

@@ -45,9 +45,6 @@ def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
 
     Args:
         x: Angle (rad).
-
-    Returns:
-        (sin x, cos x).
     """
     k = floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
@@ -77,13 +74,10 @@ def _atan_kernel(t: Scalar) -> Scalar:
 
 @jit
 def atan(x: Scalar) -> Scalar:
-    """Compute arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, series.
+    """Compute arctan x (rad), error below 5e-16: reciprocal above 1, two half-angle steps, series.
 
     Args:
         x: Tangent of the angle.
-
-    Returns:
-        The angle (rad).
     """
     steep = absolute(x) > 1.0
     u = select(steep, -1.0, x) / select(steep, x, 1.0)
@@ -94,13 +88,10 @@ def atan(x: Scalar) -> Scalar:
 
 @jit
 def compute_arctan_gap(x: Scalar) -> Scalar:
-    """Compute 1 - arctan(x) / x for |x| < 1e30, error below 3e-11 (1 + |x|), with one quotient.
+    """Compute 1 - arctan(x) / x, 0 to 1, for |x| < 1e30, error below 3e-11 (1 + |x|), one quotient.
 
     Args:
         x: Tangent of the angle.
-
-    Returns:
-        The gap, 0 to 1.
     """
     s, z = absolute(x), x * x
     q = z * z  # short chains: a plant's stage waits for them
@@ -131,16 +122,13 @@ def compute_sine(x: Scalar) -> Scalar:
 
 @jit
 def atan2(y: Scalar, x: Scalar) -> Scalar:
-    """Compute the angle of (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
+    """Compute the angle of (x, y) in [-pi, pi] (rad), error below 1e-15; 0 at the origin.
 
     The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
 
     Args:
         y: Ordinate of the point.
         x: Abscissa of the point.
-
-    Returns:
-        The angle (rad).
     """
     wide, high = absolute(x), absolute(y)
     steep = high > wide
@@ -155,13 +143,10 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
 
 @jit
 def wrap(angle: Scalar) -> Scalar:
-    """Wrap an angle into [-pi, pi).
+    """Wrap an angle (rad) into [-pi, pi).
 
     Args:
         angle: Angle (rad).
-
-    Returns:
-        The wrapped angle (rad).
     """
     return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
 
@@ -172,9 +157,6 @@ def smoothstep(x: Scalar) -> Scalar:
 
     Args:
         x: Argument.
-
-    Returns:
-        The step, 0 to 1.
     """
     t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
     return t * t * (3.0 - 2.0 * t)

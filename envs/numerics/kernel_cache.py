@@ -54,16 +54,13 @@ def report_once(subject: str, text: str, level: int = logging.WARNING) -> None:
 
 
 def hash_sources(layer: str = LAYERS[-1]) -> str:
-    """Hash all source files that a layer's kernels may call.
+    """Hash all source files that a layer's kernels may call, to 16 hexadecimal digits.
 
     numba watches only the file of the function itself; an edit in a callee's module would go
     unnoticed. Calls point one way, so an edit in `benchmarks` leaves the kernels of `envs` alone.
 
     Args:
         layer: Name in `LAYERS`.
-
-    Returns:
-        16 hexadecimal digits.
     """
     digest = hashlib.sha256()
     for folder in LAYERS[: LAYERS.index(layer) + 1]:
@@ -88,13 +85,10 @@ def hash_experiment() -> str:
 
 @functools.cache
 def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
-    """Find or make the folder of a layer's kernels, and prune older versions.
+    """Find or make a layer's kernel folder (it may be read-only), else None; prune older versions.
 
     Args:
         layer: Name in `LAYERS`.
-
-    Returns:
-        The folder, which may be read-only; None where there can be none.
     """
     try:
         folder = _find_cache_folder() / hash_sources(layer)
@@ -145,13 +139,10 @@ def _make_folder(folder: Path, sticky: bool = False) -> None:
 
 
 def read_trusted(path: Path) -> bytes | None:
-    """Read a cached file.
+    """Read a cached file's bytes; None where there is none, or one that others could have written.
 
     Args:
         path: Path of the file.
-
-    Returns:
-        Its bytes; None where there is none, or one that others could have written.
     """
     try:
         folder = _open_if_trusted(path.parent, stat.S_ISDIR)

@@ -23,16 +23,13 @@ T = TypeVar("T")
 
 
 def make_offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
-    """Make the offsets of a NamedTuple's numbers in a packed vector.
+    """Make (offsets, end) of a NamedTuple in a packed `vector`, as in `vector[offsets.part.field]`.
 
     Args:
         kind: The NamedTuple. A field is a number, another NamedTuple, `count` equal parts as
             `Annotated[tuple[part, ...], count]`, or `count` numbers as `Annotated[Vector, count]`,
             of which only the first one's offset is stored.
         start: Offset of the first number.
-
-    Returns:
-        (offsets, end): `vector[offsets.part.field]` is a number by name.
     """
     if hasattr(kind, "_fields"):
         parts = list(get_type_hints(kind, include_extras=True).values())
@@ -52,15 +49,12 @@ def make_offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
 
 
 def read(array: Vector, where: T, *index: int) -> T:
-    """Read neighbours along the first axis of a packed array.
+    """Read neighbours along the first axis of a packed array, in a tuple like `where`.
 
     Args:
         array: Packed array.
         where: Their offsets, a NamedTuple or tuple.
         index: Their place on the other axes.
-
-    Returns:
-        The numbers, in a tuple like `where`.
     """
     first, numbers = where[0], len(where)  # type: ignore[index,arg-type]
     values = array[(slice(first, first + numbers), *index)].tolist()
@@ -103,27 +97,21 @@ def store_element(array: Vector, value: Scalar, *index: int) -> None:
 
 
 def lane_width(array: Matrix) -> int:
-    """Count the columns of a matrix that `load_lanes` reads at once.
+    """Count the columns of a matrix that `load_lanes` reads at once; 1 where they are lanes.
 
     Args:
         array: The matrix, or one of lanes.
-
-    Returns:
-        The number of columns, 1 where they are lanes.
     """
     return 1
 
 
 def load_lanes(array: Matrix, where: T, first: int) -> T:
-    """Read neighbouring columns of a matrix into lanes.
+    """Read neighbouring columns of a matrix into lanes, in a tuple like `where`.
 
     Args:
         array: The matrix, or one of lanes.
         where: Rows to read, a NamedTuple of offsets.
         first: First of the `lane_width(array)` columns.
-
-    Returns:
-        Lanes, in a tuple like `where`.
     """
     return read(array, where, first)
 
@@ -134,13 +122,10 @@ def count_lanes() -> int:
 
 
 def iota(first: int) -> Scalar:
-    """Make lanes of consecutive whole numbers.
+    """Make lanes of `count_lanes()` consecutive whole numbers.
 
     Args:
         first: The first of them.
-
-    Returns:
-        `count_lanes()` whole numbers.
     """
     return first
 
@@ -149,7 +134,7 @@ def locate_element(
     context: BaseContext, builder: ir.IRBuilder, kind: types.Array, array: ir.Value,
     index: Sequence[ir.Value],
 ) -> ir.Value:  # fmt: skip
-    """Compute the pointer to the number, or the lanes, at an index of an array.
+    """Compute the pointer to an array's number, or lanes where the index leaves out the last axis.
 
     Args:
         context: Target of the compiler.
@@ -157,9 +142,6 @@ def locate_element(
         kind: Type of the array.
         array: Machine value of the array.
         index: Machine values of the index.
-
-    Returns:
-        The pointer, to lanes where the index leaves out the last axis.
     """
     made = make_array(kind)(context, builder, array)
     shape = cgutils.unpack_tuple(builder, made.shape)

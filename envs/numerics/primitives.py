@@ -48,25 +48,19 @@ def absolute(a: Scalar) -> Scalar:
 
 
 def floor(a: Scalar) -> Scalar:
-    """Round down to a whole number.
+    """Round down to the largest whole number at or below, as a float.
 
     Args:
         a: A float.
-
-    Returns:
-        The largest whole number at or below it, as a float.
     """
     return math.floor(a) * 1.0
 
 
 def sqrt(a: Scalar) -> Scalar:
-    """Compute the square root.
+    """Compute the square root, correctly rounded.
 
     Args:
         a: A float.
-
-    Returns:
-        Its square root, correctly rounded.
     """
     return math.sqrt(a)
 
@@ -92,13 +86,10 @@ def to_float(a: Scalar) -> Scalar:
 
 
 def frexp(a: Scalar) -> Scalar:
-    """Split a float into m 2^e with 0.5 <= m < 1.
+    """Split a float into m 2^e with 0.5 <= m < 1: (m, e), both floats.
 
     Args:
         a: Positive float.
-
-    Returns:
-        (m, e), both floats.
     """
     m, e = math.frexp(a)
     return m, e * 1.0
@@ -114,13 +105,10 @@ def to_int(a: Scalar) -> Scalar:
 
 
 def to_word(a: Scalar) -> Scalar:
-    """Convert a float to a 32-bit word.
+    """Convert a float to a 32-bit word: its value, or its bits where floats have 32 bits.
 
     Args:
         a: The float that stands for the word.
-
-    Returns:
-        Its value, or its bits where floats have 32 bits.
     """
     return int(a)
 

@@ -2,8 +2,6 @@
 # mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
 """SIMD lanes: numba types whose machine value is LLVM's vector of doubles, integers or bools.
 
-Each operator and primitive is registered for single numbers and for lanes.
-
 The equations compile for them unchanged, in the order written and without fused operations: a lane
 has the bits that its number alone would have. Single numbers mix with lanes as with arrays. There
 are sixteen with AVX-512 (two registers, a third faster than one) and eight elsewhere. `FLOATS8`,

@@ -104,27 +104,21 @@ def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> Matrix
 
 
 def vector_width(array: Matrix) -> int:
-    """Count the columns of a matrix that `load8` reads at once.
+    """Count the columns of a matrix that `load8` reads at once; 1 where they are lanes.
 
     Args:
         array: The matrix, or one of lanes.
-
-    Returns:
-        The number of columns, 1 where they are lanes.
     """
     return 8
 
 
 def allocate_scratch(template: Matrix, rows: int, columns: int) -> Matrix:
-    """Allocate a matrix of constant shape, uninitialised, on the stack where compiled.
+    """Allocate an uninitialised matrix; where compiled, on the stack until the function ends.
 
     Args:
         template: Matrix of the same kind, of numbers or of lanes.
         rows: Rows, a constant.
         columns: Columns, a constant.
-
-    Returns:
-        The matrix, which lasts until the function ends.
     """
     return np.empty((rows, columns))
 

@@ -68,14 +68,11 @@ def _make_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
 
 
 def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> SimpleNamespace:
-    """Rebuild functions for tensors.
+    """Rebuild functions for tensors, each under its name.
 
     Args:
         dtype: Type of the tensors' floats.
         functions: Functions compiled by `jit`.
-
-    Returns:
-        The rebuilt functions, by name.
     """
     table = _make_primitives(dtype)
     return SimpleNamespace(**{f.__name__: as_python(f, table) for f in functions})

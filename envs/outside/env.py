@@ -1,7 +1,4 @@
-"""Environments around a plant that is not ours: our sensors, scenarios, references and cost.
-
-`PlantEnv` takes any `_Plant`, `OutsideEnv` one of CommonRoad's models.
-"""
+"""Environments around a plant that is not ours: our sensors, scenarios, references and cost."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -47,16 +47,11 @@ def find_unit(text: str) -> str:
 def read_text(
     data: bytes, is_wanted: Callable[[str], bool]
 ) -> tuple["pd.DataFrame", list[str], list[str]]:
-    """Read a text table in any dialect.
-
-    Raises ValueError for a binary file, and where header and rows differ in length.
+    """Read a text table (its names may repeat), its units ("" if unknown), remarks on its dialect.
 
     Args:
-        data: Content of the file.
+        data: Content of the file; ValueError if it is binary, or header and rows differ in length.
         is_wanted: Whether a column's name is looked for; such names identify the header.
-
-    Returns:
-        The table, whose names may repeat, its units ("" for unknown ones), remarks on its dialect.
     """
     import pandas as pd
 

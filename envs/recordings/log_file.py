@@ -186,7 +186,7 @@ def read_parts(
     start: float = 0.0,
     end: float | None = None,
 ) -> tuple[list[Log], list[str]]:
-    """Read a recorded drive from a table (needs the extra `report`).
+    """Read whole drives of a table, and sentences on what was done (needs the extra `report`).
 
     Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
     between their samples. One is captured in its row, and arrives there or by its gps_latency or
@@ -206,9 +206,6 @@ def read_parts(
         mapping: Our column names to the log's, as `tables.parse_mapping` makes it.
         start: Time after the first row from which it is read (s).
         end: Time after the first row up to which it is read (s); None: to its end.
-
-    Returns:
-        Whole drives, and sentences on what was done.
     """
     label = title = name_log(source)
     if isinstance(source, str | Path):  # the file's with its folder's

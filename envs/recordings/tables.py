@@ -148,7 +148,7 @@ def read_quantities(
     needed: Sequence[str],
     gaps: Collection[str] | None,
 ) -> tuple[dict[str, Array], list[str]]:
-    """Read a log's known quantities in SI units, and describe how they were read.
+    """Read a log's quantities in SI units by name, shape (n,), and sentences on how they were read.
 
     Rows in messages count from 1 below the header. Raises the errors of `read_columns`, and
     ValueError for NaN in a quantity without gaps.
@@ -158,9 +158,6 @@ def read_quantities(
         mapping: Our column names, unit included, to the log's; other columns are ignored.
         needed: Quantities that must be present.
         gaps: Quantities that may hold NaN; None: all but the time, and shuffled rows are sorted.
-
-    Returns:
-        Quantities by name, shape (n,) each, and sentences on how they were read.
     """
     values, kinds, remarks = read_columns(source, mapping, needed)
     remarks += find_samples(values, needed, kinds, gaps is not None)

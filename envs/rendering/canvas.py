@@ -134,7 +134,7 @@ class Canvas:
         align: float = 0.0,
         bold: bool = False,
     ) -> float:
-        """Draw words whose middle line passes a place.
+        """Draw words whose middle line passes a place; returns their width (px).
 
         Args:
             place: The place (px), shape (2,).
@@ -143,9 +143,6 @@ class Canvas:
             size: Size of the font (px).
             align: 0 begins at the place, 1 ends there.
             bold: Whether they are bold.
-
-        Returns:
-            Their width (px).
         """
         surface = _render_words(words, colour, size, bold)
         width, height = surface.get_size()

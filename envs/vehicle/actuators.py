@@ -21,14 +21,11 @@ class Lag(NamedTuple):
 
 
 def make_lag(time_constant: float, tick: float) -> Lag:
-    """Compute the exact decay of a first-order lag within a tick.
+    """Compute a first-order lag's exact decay at start, middle and end of a tick, and its mean.
 
     Args:
         time_constant: Time constant of the lag (s); 0 for none.
         tick: Length of the tick (s).
-
-    Returns:
-        Fractions at the start, middle and end of the tick, and their mean.
     """
     if time_constant == 0.0:
         return Lag(0.0, 0.0, 0.0, 0.0)
@@ -44,23 +41,17 @@ def apply_lag(command: Scalar, value: Scalar, rest: Scalar) -> Scalar:
         command: Commanded value.
         value: Value at the start of the tick, in the command's unit.
         rest: Fraction of the deviation that remains.
-
-    Returns:
-        The value, in the command's unit.
     """
     return command + (value - command) * rest
 
 
 @jit
 def compute_torque_limit(v_x: Scalar, car: "CarParams") -> Scalar:
-    """Compute the torque limit of one motor at a speed, driving or braking.
+    """Compute a motor's torque limit (N m), driving or braking: T_max, or P / |omega| if less.
 
     Args:
-        v_x: Longitudinal speed (m/s).
+        v_x: Longitudinal speed (m/s), at which the wheel rolls.
         car: `CarParams`.
-
-    Returns:
-        T_max, or P / |omega| of a wheel that rolls at v_x where that is less (N m).
     """
     max_torque = car.T_max
     if any_lane(car.P > 0.0):
@@ -73,7 +64,7 @@ def compute_torque_limit(v_x: Scalar, car: "CarParams") -> Scalar:
 def allocate_torques(
     N_z: Scalar, a_x: Scalar, car: "CarParams", yaw_first: Scalar, max_torque: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Distribute a yaw moment and an acceleration over two motors: tie-vision (3) in ISO axes.
+    """Compute torques (T_l, T_r) (N m) of yaw moment and acceleration: tie-vision (3) in ISO axes.
 
     A positive yaw moment drives the right wheel.
 
@@ -83,9 +74,6 @@ def allocate_torques(
         car: `CarParams`.
         yaw_first: Where both pass the limit, 1 keeps the yaw moment and 0 the acceleration.
         max_torque: Torque limit of one motor (N m).
-
-    Returns:
-        (T_l, T_r), torques of the left and the right motor (N m).
     """
     turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - max_torque), max_torque)
     drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - max_torque), max_torque)
@@ -111,7 +99,7 @@ def limit_rate(value: Scalar, command: Scalar, max_change: Scalar) -> Scalar:
 
 @jit
 def limit_angle(added: Scalar, driver: Scalar, stop: Scalar) -> Scalar:
-    """Limit an added steering angle so that the sum with the driver's stays within the stop.
+    """Limit an added steering angle (rad) so that the sum with the driver's stays within the stop.
 
     Where the driver's angle alone is beyond the stop, nothing is added to that side.
 
@@ -119,23 +107,17 @@ def limit_angle(added: Scalar, driver: Scalar, stop: Scalar) -> Scalar:
         added: Added steering angle (rad).
         driver: The driver's angle (rad).
         stop: Largest angle of the sum (rad).
-
-    Returns:
-        The limited added angle (rad).
     """
     return minimum(maximum(added, minimum(0.0 - stop - driver, 0.0)), maximum(stop - driver, 0.0))
 
 
 @jit
 def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: "CarParams") -> Scalar:
-    """Compute the yaw moment of two motor torques.
+    """Compute the yaw moment N_z (N m) of two motor torques.
 
     Args:
         T_l: Torque of the left motor (N m).
         T_r: Torque of the right motor (N m).
         car: `CarParams`.
-
-    Returns:
-        N_z (N m).
     """
     return 0.5 * car.d_r / car.r * (car.k_r * T_r - car.k_l * T_l)

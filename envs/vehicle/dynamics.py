@@ -92,28 +92,22 @@ def _compute_ramp(road: RoadParams, s: Scalar) -> Scalar:
 
 @jit
 def compute_curvature(road: RoadParams, s: Scalar) -> Scalar:
-    """Compute the curvature of the road at a distance along it.
+    """Compute the curvature of the road at a distance along it (1/m), positive to the left.
 
     Args:
         road: `RoadParams`.
         s: Distance along the road (m).
-
-    Returns:
-        Curvature (1/m), positive to the left.
     """
     return road.curvature * _compute_ramp(road, s)
 
 
 @jit
 def compute_car_curvature(motion: Motion, road: RoadParams) -> Scalar:
-    """Compute the curvature of the road at the car, a turning road's direction included.
+    """Compute the road's curvature at the car (1/m, left positive), a turning road's part included.
 
     Args:
         motion: `Motion` of the car.
         road: `RoadParams`.
-
-    Returns:
-        Curvature (1/m), positive to the left.
     """
     kappa = compute_curvature(road, motion.s)
     if any_lane(road.turn != 0.0):
@@ -137,16 +131,13 @@ def _rotate_gravity(
 def compute_gravity(
     motion: Motion, road: RoadParams, small_angle: int, ahead: Scalar = 0.0
 ) -> tuple[Scalar, Scalar]:
-    """Compute the gravity that accelerometers measure in a car without roll.
+    """Compute the gravity (x, y) in car axes (m/s2) that accelerometers measure without roll.
 
     Args:
         motion: `Motion` of the car.
         road: `RoadParams`.
         small_angle: 1 for the small-angle plant, else 0.
         ahead: Time (s) by which place and heading are extrapolated.
-
-    Returns:
-        (x, y) in the car's axes (m/s2).
     """
     s = motion.s + ahead * motion.v_x
     if small_angle:
@@ -254,15 +245,12 @@ def derivative(
 
 @inline
 def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar:
-    """Compute the sideslip angle: atan2(v_y, v_x) above 0.5 m/s, else 0.
+    """Compute the sideslip angle (rad): atan2(v_y, v_x) above 0.5 m/s, else 0.
 
     Args:
         v_x: Longitudinal velocity (m/s).
         v_y: Lateral velocity (m/s).
         small_angle: 1 for the small-angle plant, whose angle is the ratio; else 0.
-
-    Returns:
-        beta (rad).
     """
     if small_angle:
         return select(v_x > MIN_SPEED, v_y / maximum(v_x, MIN_SPEED), 0.0)

@@ -32,14 +32,13 @@ class Bicycle(NamedTuple):
 
 @jit
 def compute_bicycle_coefficients(car: Vector, V: Scalar) -> tuple[Scalar, ...]:
-    """Compute the coefficients of the linear bicycle, tie-vision (8).
+    """Compute (a11, a12, a21, a22, b11, b21, b22) of the linear bicycle, tie-vision (8).
+
+    States are beta and gamma, inputs delta_f and N_z.
 
     Args:
         car: `Bicycle`, or its six numbers.
         V: Speed (m/s).
-
-    Returns:
-        (a11, a12, a21, a22, b11, b21, b22) of the states beta, gamma and inputs delta_f, N_z.
     """
     m, I, l_f, l_r, C_f, C_r = car[0], car[1], car[2], car[3], car[4], car[5]  # noqa: E741
     a11 = -2.0 * (C_f + C_r) / (m * V)
@@ -55,15 +54,13 @@ def write_lateral(
 ) -> None:
     """Write the linear lateral model into A and B; entries that are zero are left alone.
 
-    States are beta, gamma, psi and y_l; inputs are delta_f, N_z and the road's curvature.
-
     Args:
         A: State matrix, at least (states, states).
         B: Input matrix, at least (states, inputs).
         car: `Bicycle`, or its six numbers.
         V: Speed (m/s).
-        states: Number of states, 2 to 4.
-        inputs: Number of inputs, 2 or 3.
+        states: Number of states, 2 to 4, of beta, gamma, psi and y_l.
+        inputs: Number of inputs, 2 or 3, of delta_f, N_z and the road's curvature.
         preview: Preview distance l_pre of the camera (m).
     """
     a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(car, V)
@@ -112,13 +109,10 @@ class LinearModel:
     outputs: tuple[str, ...]
 
     def discretise(self, dt: float) -> tuple[Array, Array]:
-        """Discretise by exact zero-order hold, tie-vision (9).
+        """Discretise by exact zero-order hold, tie-vision (9): (G, H), shapes (n, n) and (n, m).
 
         Args:
             dt: Length of a step (s).
-
-        Returns:
-            (G, H), shapes (n, n) and (n, m).
         """
         from scipy.linalg import expm  # environments read this module too
 
@@ -147,9 +141,7 @@ def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[A
 
 
 def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """Make the linear bicycle of beta and gamma, tie-vision (1)-(2).
-
-    Inputs are delta_f and N_z, the output is gamma.
+    """Make the linear bicycle of beta and gamma, from delta_f and N_z to gamma: tie-vision (1)-(2).
 
     Args:
         vehicle: Vehicle of the model.

@@ -130,11 +130,7 @@ class Vehicle:
         return self.sprung_mass * self.roll_arm
 
     def check_roll(self) -> None:
-        """Check that the suspension holds the body upright and the roll inertia suffices.
-
-        Raises:
-            ValueError: If the body would roll over, or its inertia is too small for its mass.
-        """
+        """Check that the body stays upright and its inertia suits its mass; else ValueError."""
         low = self.roll_moment_arm * GRAVITY
         if self.roll_stiffness <= low:
             got = f"{self.roll_stiffness!r} N m/rad does not hold the body upright"
@@ -158,13 +154,10 @@ class Vehicle:
 
 
 def critical_speed(vehicle: Vehicle) -> float:
-    """Compute the speed above which the linear vehicle is unstable.
+    """Compute the speed (m/s) above which the linear vehicle is unstable; inf if it understeers.
 
     Args:
         vehicle: Vehicle with stiffnesses and arms.
-
-    Returns:
-        The critical speed (m/s); inf if the vehicle understeers.
     """
     excess = vehicle.front_stiffness * vehicle.front_arm - vehicle.rear_stiffness * vehicle.rear_arm
     if excess <= 0.0:
@@ -196,17 +189,14 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     tyre in a mapping that has every parameter, as `Vehicle.to_dict` makes one, and else refused.
     What is left out is that of the vehicle under `base` (a name or another file); without one it is
     the passenger car's, except for mass, inertia, arms and stiffnesses, which must be present. A
-    file without a `name` has that of the file. An unreadable file raises FileNotFoundError or
-    ValueError, a value out of place ValueError; messages name the file.
+    file without a `name` has that of the file. Messages name the file. An unreadable one raises
+    FileNotFoundError or ValueError; an unknown name, a missing parameter, a value out of place, and
+    a stiffness of no convention or of two ValueError; an unknown parameter, one that is no number,
+    and another kind of source TypeError.
 
     Args:
         source: Name in `VEHICLES`, path, mapping of parameters, or a `Vehicle`, returned as it is.
         strict: Whether implausible numbers of a file or a mapping are refused.
-
-    Raises:
-        TypeError: For an unknown parameter, one that is no number, or another kind of source;
-            ValueError for an unknown name, a missing parameter, or a stiffness of no convention or
-            of two.
     """
     if isinstance(source, Vehicle):
         return source

@@ -88,7 +88,7 @@ def _has_load_shift(variant: Variant) -> bool:
 
 @inline
 def compute_tyre_load(inputs: Any, car: Car, variant: Variant) -> TyreLoad:
-    """Compute the tyres' load under the inputs of one instant.
+    """Compute the tyres' load, forces and capacities, under the inputs of one instant.
 
     The front tyres have the mean friction of both sides. Each rear tyre's friction limits its
     motor's force, and drive force moves load between the axles, but not on the small-angle plant.
@@ -99,9 +99,6 @@ def compute_tyre_load(inputs: Any, car: Car, variant: Variant) -> TyreLoad:
         inputs: Steering and torques: `TyreInputs`, or the actuators' state.
         car: Parameters, `CarParams`.
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        Forces and capacities, `TyreLoad`.
     """
     small_angle = variant.small_angle
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
@@ -191,7 +188,7 @@ def _apply_magic_formula(tyre: Tyre) -> Scalar:
 
 @inline
 def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_angle: int) -> Any:
-    """Compute the lateral forces of the four tyres; the law is chosen once for all of them.
+    """Compute the four tyres' lateral forces (N), a to d; the law is chosen once for all of them.
 
     Args:
         a: `Tyre` front left.
@@ -200,9 +197,6 @@ def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_a
         d: `Tyre` rear right.
         law: Code of the tyre law, its place in `TYRE_LAWS`.
         small_angle: 1 for the small-angle plant, else 0.
-
-    Returns:
-        Four forces (N) in that order.
     """
     if law == LINEAR:
         s = small_angle
@@ -252,9 +246,6 @@ def compute_slip_rates(
         load: `TyreLoad` of the inputs.
         car: `CarParams`.
         small_angle: 1 for the small-angle plant, else 0.
-
-    Returns:
-        Rates of the front and the rear tangent.
     """
     across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
     is_relaxing = car.relaxation > 0.0
@@ -295,7 +286,7 @@ def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar
 def compute_tyre_forces(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Compute the forces of the axles and the moment of the motors.
+    """Compute (F_yf, F_yr, F_x, N_z): the axles' lateral and the drive force (N), yaw moment (N m).
 
     Args:
         motion: `Motion` or `Velocity` of the car.
@@ -303,9 +294,6 @@ def compute_tyre_forces(
         car: `CarParams`.
         g_y: Lateral gravity that the car feels on a banked road (m/s2).
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), yaw moment (N m).
     """
     a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, variant)
     F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, variant.law, variant.small_angle)
@@ -316,7 +304,7 @@ def compute_tyre_forces(
 def compute_tyres(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
-    """Compute the state of the four tyres, and the motors' drive force and yaw moment.
+    """Compute four `Tyre` (front, then rear; left first), drive force (N) and yaw moment (N m).
 
     Args:
         motion: `Motion` or `Velocity` of the car.
@@ -324,9 +312,6 @@ def compute_tyres(
         car: `CarParams`.
         g_y: Lateral gravity that the car feels on a banked road (m/s2).
         variant: `PlantVariant` or `StepVariant` of the plant.
-
-    Returns:
-        Four `Tyre` (front left and right, rear left and right), F_x (N) and N_z (N m).
     """
     if variant.law == MAGIC_FORMULA and not variant.small_angle:
         return _compute_magic_tyres(motion, load, car, g_y, variant)

@@ -50,10 +50,7 @@ class OutputTable(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """What an observation is made of, and where it is written.
-
-    Of N cars, all but `table` have them as the first axis.
-    """
+    """Inputs and targets of an observation; for N cars all but `table` have them as first axis."""
 
     obs: Vector  # observation of the env, float32, shape (at least inner,)
     table: OutputTable

@@ -50,10 +50,7 @@ class SkipCounters(NamedTuple):
 
 
 class CarIndex(NamedTuple):
-    """Places in the field `car`, in the order of `compute_bicycle_coefficients`.
-
-    Names are those of `Vehicle`.
-    """
+    """Places in `car`: the order of `compute_bicycle_coefficients`, the names of `Vehicle`."""
 
     mass: int = 0  # kg
     yaw_inertia: int = 1  # kg m2

@@ -42,13 +42,10 @@ FILE = Path(__file__).with_name("tunings.toml")
 
 
 def read_tunings(path: str | Path = FILE) -> list[dict[str, Any]]:
-    """Read the entries of a tunings file; ValueError with its path if it is none.
+    """Read a tunings file's `estimator`, `sensors` and `q`, process noise by state, (unit)^2 / s.
 
     Args:
-        path: TOML file.
-
-    Returns:
-        Entries with `estimator`, `sensors` and `q`, process noise by state, (unit)^2 / s.
+        path: TOML file; ValueError with its path if it is no tunings file.
     """
     try:
         entries = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("tuning", [])

@@ -278,16 +278,13 @@ def _design_cached(key: bytes) -> tuple[Array, Array]:
 def design_and_map(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, Array]:
-    """Design the table of gains and the map of the error at a speed; both are read-only.
+    """Design the gains (rows, columns) at a speed and the error's map over a cycle, both read-only.
 
     Args:
         f: Memory of the filter, left as it is.
         schedule: Schedule of its slow sensor.
         speed: Speed (m/s).
         config: Parsed options of the filter.
-
-    Returns:
-        Table, shape (rows, columns), and map from the error before a cycle to that after it.
     """
     return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
 

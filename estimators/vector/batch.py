@@ -191,11 +191,9 @@ class BatchEstimator:
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
         """Fit the filters of some rows to their specs; a reset has to follow.
 
-        A filter whose spec differs in more than the phases of its clocks is built anew.
-
         Args:
             rows: Indices of the filters.
-            specs: Spec of each of these filters.
+            specs: Spec of each; where more than its clocks' phases differ, a filter is built anew.
         """
         has_changed = False
         for i, spec in zip(rows, specs, strict=True):

@@ -63,10 +63,8 @@ class VectorObservation(VectorWrapper[Observations, Any, Observations, Any, Any]
 
         Args:
             seed: Seed of row 0, or a list (N,).
-            options: Options of the env.
-
-        Raises:
-            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
+            options: Options of the env. ResetNeeded if a mask leaves out rows and no step succeeded
+                since the last whole reset.
         """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
@@ -84,13 +82,10 @@ class VectorObservation(VectorWrapper[Observations, Any, Observations, Any, Any]
         return self._append(obs, infos, rows), infos
 
     def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, Infos]:
-        """Step all rows as `gymnasium.vector.VectorEnv` does.
+        """Step all rows as Gymnasium does; ResetNeeded before `reset` and after a step that failed.
 
         Args:
             actions: Actions of all rows.
-
-        Raises:
-            ResetNeeded: It is called before `reset`, or after a step that failed.
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:

@@ -99,11 +99,8 @@ class Arguments:
 
         Args:
             slow_sensors: Slow sensors of the env by name.
-            *values: Arguments of the wrapper.
+            *values: Arguments of the wrapper; ValueError if vehicle or options reach no object.
             **misplaced: Unknown arguments; TypeError for them has the nearest name.
-
-        Returns:
-            The arguments; ValueError where a vehicle or options would not reach an object.
         """
         names = [field.name for field in dataclasses.fields(cls) if field.init]
         self = cls(*values)
@@ -207,9 +204,7 @@ def compile_observe() -> Any:
 
 
 def write_outputs(estimator: EstimatorLike, observed: Observed) -> None:
-    """Write a user's estimates as `observe` writes those of a compiled filter.
-
-    Raises what `ForeignEstimator.x` raises.
+    """Write a user's estimates as `observe` writes a compiled filter's; raises as `estimator.x`.
 
     Args:
         estimator: The user's estimator.
@@ -371,10 +366,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         """Restore a snapshot of this env or of one built with the same arguments.
 
         Args:
-            snapshot: Result of `get_state`.
-
-        Raises:
-            ValueError: The snapshot is of an env with other step limits.
+            snapshot: Result of `get_state`; ValueError for one of an env with other step limits.
         """
         limits, steps = self._find_step_limits(), snapshot.get("steps", [])
         if len(limits) != len(steps):

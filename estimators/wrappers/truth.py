@@ -51,9 +51,7 @@ class TruthEntries:
     Args:
         parameters: Parameters of a `Vehicle` or motors of `CarTruth`, each as `true_<parameter>`.
         states: States of a `TrueState`, each as `<state>_hat`.
-        inner: Entries of the observation.
-
-    ValueError says that a parameter or state is unknown, or that a name would stand twice.
+        inner: Entries of the observation; ValueError for a name that is unknown or twice there.
 
     Attributes:
         layout: All entries.
@@ -125,7 +123,7 @@ class TruthEntries:
 def choose_vehicle(
     estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle
 ) -> Vehicle:
-    """Choose the car to build an estimator for, so that the one at hand serves wherever it can.
+    """Choose a filter's car: `vehicle` with stiffness and friction of `built` where these may stay.
 
     Where gains follow P no gain is designed from the stiffnesses, and `set_stiffness` suffices.
 
@@ -133,9 +131,6 @@ def choose_vehicle(
         estimator: The estimator at hand.
         built: Vehicle for which it was built.
         vehicle: True vehicle.
-
-    Returns:
-        `vehicle`, with the stiffnesses and the friction of `built` where these may stay.
     """
     if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
         return vehicle

@@ -24,10 +24,8 @@ PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 def read_picture(path: "str | os.PathLike[str]") -> Image:
     """Read a picture from a file, (height, width, 3) bytes of blue, green, red.
 
-    FileNotFoundError without the file, ValueError for a broken one.
-
     Args:
-        path: Path of the file.
+        path: Path of the file; FileNotFoundError without it, ValueError for a broken one.
     """
     _check_file(path)
     data = np.fromfile(path, np.uint8)
@@ -210,16 +208,14 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
 def calibrate_camera(
     paths: Sequence[Path], corners: tuple[int, int] = (9, 6)
 ) -> tuple[Pinhole, float]:
-    """Compute a camera's intrinsics from photographs of a chessboard; tilt and height are defaults.
+    """Compute a camera's intrinsics and corners' RMS error (px) from photographs of a chessboard.
 
-    Raises ValueError if fewer than three show a board, or photographs have different sizes.
+    Tilt and height are defaults. Raises ValueError if fewer than three show a board, or the
+    photographs have different sizes.
 
     Args:
         paths: Files of the photographs; those without a board are skipped.
         corners: Inner corners of the board along its two sides.
-
-    Returns:
-        The camera, and the root mean square error of the corners (px).
     """
     board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
