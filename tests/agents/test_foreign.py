@@ -84,8 +84,7 @@ def test_a_matrix_cell_of_foreign_parts() -> None:
         env, agent = Entry(controller, estimator).make(ControlTask(scenario="step-steer"), 2)
         obs, _ = env.reset(seed=1)
         actions, _ = agent.predict(obs)
-        damper = getattr(agent, "agent", agent)  # a file's or an entry point's is checked
-        assert type(damper).__name__ == "YawDamper" and actions.shape == (2, 1)
+        assert actions.shape == (2, 1) and actions.any()  # `none` gives zeros
         again = env.step(actions)[0]
         assert bits(again[:, -2:]) == bits(np.array([[0.1, 0.2]] * 2, np.float32))
 

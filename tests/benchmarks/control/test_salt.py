@@ -100,7 +100,7 @@ def test_a_suite_drives_the_salt_it_is_given(name: str, monkeypatch: pytest.Monk
     for salt in (ONE, OTHER, ""):
         with pytest.raises(StopIteration):
             if module is readme:
-                readme._measure_entries(salt=salt)
+                readme._measure_entries(salt or make_salt())
             run_suites([name], Request(quick=True, episodes=4, salt=salt))
     salts = (ONE, OTHER, make_salt())
     assert found == [make_salted_seeds(salt, 4, GUST.seed_text) for salt in salts]
