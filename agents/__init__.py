@@ -40,16 +40,13 @@ class Agent(Protocol):
         self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:  # fmt: skip
-        """Compute the action for an observation.
+        """Compute the action, shape (width,) or (N, width), for an observation, and the next state.
 
         Args:
             observation: Observation, shape (k,) or (N, k).
             state: Memory from the last call; None at first.
             episode_start: Rows whose episode has just begun, bool, shape (N,).
             deterministic: Whether to take the mean action instead of a sample.
-
-        Returns:
-            Action of shape (width,) or (N, width), and the next state.
         """
 
 
@@ -113,13 +110,11 @@ def make_agent(
 def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
     """Give a user's agent a name that works wherever an agent's name does.
 
+    Raises TypeError for a wrong type, ValueError for an invalid name or factory or a taken name.
+
     Args:
         name: New name, in this process alone; workers and the command line take the entry point.
         factory: Called with env and options; or "package.module:Name", imported at its first use.
-
-    Raises:
-        TypeError: The name or the factory has a wrong type.
-        ValueError: The name or the factory is invalid, or the name is taken.
     """
     if isinstance(name, str) and (is_policy(name) or name.endswith(ZIP)):
         raise ValueError(f"{name!r} is the name of a policy")

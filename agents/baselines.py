@@ -132,7 +132,7 @@ def make_oracle(
     vector_kwargs: Mapping[str, Any] | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None, **env_kwargs: Any,
 ) -> tuple[Any, Controller]:  # fmt: skip
-    """Make an oracle and the env whose observation it needs.
+    """Make an oracle and the env whose observation it needs; ValueError for an unknown name.
 
     In a world, those that know more than nominal get the drawn car, with gains of its own, and
     calibrated readings of steering, wheels and motors. References are made from the env's readings,
@@ -144,13 +144,9 @@ def make_oracle(
         env_id: Id of the env.
         num_envs: Rows of a vector env; None: a single env.
         vector_kwargs: Arguments of the vector env.
-        options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
-            sensors of the id, `make_noise_options` of the scenario, a grip limit.
+        options: {"filter": of `exact-kf`, "controller": of the agent}, else TypeError, over the
+            defaults: slow sensors of the id, the scenario's `make_noise_options`, a grip limit.
         env_kwargs: Arguments of the env (scenario, vehicle, ...).
-
-    Raises:
-        ValueError: The name is unknown.
-        TypeError: The options have another key.
     """
     check_choice("oracle", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
@@ -207,14 +203,10 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
 
 @cache
 def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
-    """Read the options of a file, by class, entry and part.
+    """Read the options of a file, by class, entry and part; ValueError for another file or world.
 
     Args:
-        path: TOML file.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file holds something else, or is of another world.
+        path: TOML file; FileNotFoundError without one.
     """
     classes = read_document(path, "tuning")
     if (version := classes.pop("world_version", 0)) != WORLD_VERSION:

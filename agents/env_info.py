@@ -140,13 +140,10 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
     Every wrapper must be known to keep observations and actions, or have `transparent = True` on
     itself or its class. A subclass that overrides how it steps, observes or acts sets it anew.
+    Raises ValueError for another wrapper, or rows with different nominal cars or limits.
 
     Args:
-        env: Env of this package, wrapped or bare.
-
-    Raises:
-        TypeError: `env` is no env of this package.
-        ValueError: Another wrapper, or rows with different nominal cars or limits.
+        env: Env of this package, wrapped or bare; TypeError for another.
     """
     try:
         return env.facts if isinstance(env, EnvView) else _collect_facts(env)

@@ -52,16 +52,13 @@ def iterate_steps(
 
     Args:
         env: Env, single or vector.
-        agent: Object with stable-baselines3's `predict`; None leaves the cars uncontrolled.
+        agent: Object with stable-baselines3's `predict`, else TypeError; ValueError for one of
+            another full scale. None leaves the cars uncontrolled.
         seeds: Seed or seeds of the env's reset.
         options: Options of the env's reset.
 
     Yields:
         The reset, then every step.
-
-    Raises:
-        TypeError: The agent has no `predict`.
-        ValueError: The agent is made for a car of another full scale.
     """
     if not (agent is None or hasattr(agent, "predict")):
         text = f"an agent has stable-baselines3's predict, got {type(agent).__name__}"
@@ -239,14 +236,10 @@ def rollout(
     """Run one episode.
 
     Args:
-        env: Env of this package, or its id.
-        agent: Agent, as for `iterate_steps`.
+        env: Single env of this package, or its id; TypeError for another env.
+        agent: Agent, as for `iterate_steps`, with its errors.
         seed: Seed of the reset.
         options: Options of the reset.
-
-    Raises:
-        TypeError: A vector env, an env of another package, or an agent without `predict`.
-        ValueError: The agent is made for a car of another full scale.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as new_env:

@@ -212,8 +212,7 @@ def make_vec_env(
         env_kwargs: Arguments of the environment.
         monitor_file: CSV file of episodes.
         info_keywords: Keys of the last step's info that go into that file.
-        wrapper_class: Wrapper for the vector env, applied outside the estimator's wrapper; its
-            result becomes the `VecEnv`.
+        wrapper_class: Wrapper outside the estimator's; its result becomes the `VecEnv`.
         scaled: Whether observations and rewards are scaled; no controller reads such observations.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
@@ -237,13 +236,10 @@ def make_native_env(
     """Make the vector env that `make_vec_env` bridges, with its estimator around it.
 
     Args:
-        env_id: Id of an env with a native vector env.
+        env_id: Id of an env with a native vector env; ValueError without one.
         num_envs: Number of rows.
         estimator: Name of an estimator, or arguments of `EstimateObservation`.
         env_kwargs: Arguments of the environment.
-
-    Raises:
-        ValueError: The id has no native vector env.
     """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry

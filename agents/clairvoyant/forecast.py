@@ -124,11 +124,8 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
     """Make the forecast of an episode, whose lead-in just ended if it has one, to its end.
 
     Args:
-        base: Unwrapped env at the manoeuvre's start.
+        base: Unwrapped env at the manoeuvre's start; ValueError elsewhere in its episode.
         actions: Actions of a run, shape (K, width), to which driver and place react; None: zeros.
-
-    Raises:
-        ValueError: The env is elsewhere in its episode.
     """
     n = base.control_period
     snapshot = base.get_state()

@@ -305,15 +305,12 @@ def compute_clairvoyant(
 
 
 def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Actions:
-    """Record an agent's actions in an episode.
+    """Record actions after the lead-in (of full scale), shape (K, width), zeros after a failure.
 
     Args:
         env: Single env.
         agent: Agent, as for `iterate_steps`.
         seed: Seed of the episode.
-
-    Returns:
-        Fractions of full scale after the lead-in, shape (K, width), zeros after a failure.
     """
     base, (_, *steps) = _get_base(env), iterate_steps(env, agent, seed)
     actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)

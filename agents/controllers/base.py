@@ -31,15 +31,13 @@ class Controller(ABC):
 
     Where an entry is not finite the action is NaN and the memory stays as it was, which makes a
     failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
+    Raises ValueError for a missing entry.
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
         grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
-            force. None: no such limit. Friction is `true_friction`, else the nominal car's.
-
-    Raises:
-        TypeError: The grip is no number.
-        ValueError: An entry of `needs` is missing, or the grip is not positive.
+            force. None: no limit. Friction: `true_friction`, else the nominal car's. TypeError for
+            no number, ValueError unless positive.
     """
 
     needs: tuple[str, ...] = ()  # entries of the observation that the controller reads
@@ -121,19 +119,13 @@ class Controller(ABC):
         self, observation: npt.NDArray[np.float32], state: Array | None = None,
         episode_start: npt.NDArray[np.bool_] | None = None, deterministic: bool = True,
     ) -> tuple[npt.NDArray[np.float32], Array]:  # fmt: skip
-        """Compute the action for an observation or a batch.
+        """Compute the action in [-1, 1], shape (width,) or (N, width), and the next state.
 
         Args:
-            observation: Observation, shape (k,) or (N, k).
+            observation: Observation, shape (k,) or (N, k); ValueError for another width.
             state: Memory, shape (N, memory); None at the start.
             episode_start: Rows whose memory is cleared, shape (N,).
             deterministic: Without effect.
-
-        Returns:
-            Action in [-1, 1], shape (width,) or (N, width), and the next state.
-
-        Raises:
-            ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
         if obs.shape[-1] != self._n_entries or obs.ndim > 2:

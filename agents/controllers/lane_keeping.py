@@ -119,15 +119,13 @@ class LaneKeeping(Controller):
     It reads a vision filter's beta_hat, gamma_hat, psi_hat and y_l_hat. The curvature follows from
     psi' = gamma - V kappa, filtered; the integral makes up its error. y is the offset of the centre
     of gravity: on a curve, that of the preview point is not zero for a car in its lane.
+    Raises ValueError where no action steers, an entry is missing, or an option is out of range.
 
     Args:
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s), of a control period at least.
         haste: Weight of the steering command less the applied angle, as for `HASTE`.
-
-    Raises:
-        ValueError: The action does not steer, an entry is missing, or an option is out of range.
     """
 
     needs = Inputs._fields

@@ -97,7 +97,8 @@ class Lqr(Controller):
     d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is LQG.
     Where the env steers, both inputs are optimal within their limits and the steering's rate, if
     none were met later. The memory is the steering last added and, where the yaw moment's rate
-    costs, its fraction at the last decision and its command.
+    costs, its fraction at the last decision and its command. Raises ValueError for an
+    entry that is missing, or an option out of range.
 
     Args:
         env: Env of the controller.
@@ -108,11 +109,7 @@ class Lqr(Controller):
         knots: Knots of each stiffness axis; the table is designed once.
         steer_weight: Factor on the cost of added steering, whose rate limit the design lacks.
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
-        knows_car: Whether the observation has each row's `TRUE_PARAMETERS`: gains are designed for
-            that car, and commands corrected for its motors.
-
-    Raises:
-        ValueError: An entry is missing, or an option is out of range.
+        knows_car: Whether gains and motor commands follow each row's observed `TRUE_PARAMETERS`.
     """
 
     min_period = 1  # ticks, of the period that the gains are designed for

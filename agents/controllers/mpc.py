@@ -40,10 +40,7 @@ _SETTINGS = {  # tolerances of full scale; rho adapts after so many iterations, 
 
 @dataclass(frozen=True)
 class _QuadraticProgram:
-    """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
-
-    Inputs are fractions of their limits, step by step. The mean of P's diagonal is 1.
-    """
+    """Minimise a'P a / 2 + (F x)'a from x (n,) over a (h m,), fractions of limits step by step."""
 
     P: Array  # Hessian, (h m, h m)
     F: Array  # effect of the state on the gradient, (h m, n)
@@ -82,7 +79,8 @@ class Mpc(Lqr):
 
     Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`. Each
-    solution starts from the last one, which the memory holds.
+    solution starts from the last one, which the memory holds. Raises ModuleNotFoundError without
+    the extras `mpc` and `design`, ValueError for a missing entry or an option out of range.
 
     Args:
         env: Env of the controller.
@@ -94,10 +92,6 @@ class Mpc(Lqr):
     Attributes:
         status: Status of each row in the last call: "solved", "solved inaccurate" (ten times the
             tolerance of 1e-4 of full scale), or why there is no solution and the action is NaN.
-
-    Raises:
-        ModuleNotFoundError: The extras `mpc` and `design` are not installed.
-        ValueError: An entry is missing, or an option is out of range.
     """
 
     def __init__(
@@ -342,6 +336,7 @@ class Nmpc(Lqr):
     added to `lqr`'s action, within the limits of moment, `grip`, steering and its rate. Where no
     limit is met and the car is linear the action is `lqr`'s. It also reads phi_hat and phi_rate_hat
     where they are there. Where no prediction is finite the action is NaN.
+    Raises ValueError for a missing entry, an option out of range, or rows of different plants.
 
     Args:
         env: Env of the controller.
@@ -349,9 +344,6 @@ class Nmpc(Lqr):
         iterations: Iterations of a decision; an episode's first one has more.
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         options: Other arguments of `Lqr`.
-
-    Raises:
-        ValueError: An entry is missing, an option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP

@@ -52,13 +52,10 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     Args:
         vehicle: Vehicle of the design.
         speed: Speed (m/s).
-        pole: Radius or place of the closed-loop poles (rad/s).
+        pole: Radius or place of the closed-loop poles (rad/s); ValueError unless it is positive.
         placement: "radius": k k_p = pole^2 puts both poles on that circle, a smaller one where
             their damping would be below a half. "real": k k_p = pole (p_2 - pole) puts one of two
-            real poles there, or both at p_2 / 2 where pole is beyond p_2.
-
-    Raises:
-        ValueError: The placement is unknown, or the pole is not positive.
+            real poles there, or both at p_2 / 2 where pole is beyond p_2. Another: ValueError.
     """
     check_choice("placement", placement, PLACEMENTS)
     check_positive("pole", pole)
@@ -168,17 +165,16 @@ class Feedforward(Controller):
 class TwoDof(Controller):
     """Feedforward plus a PI on beta_ref - beta_hat, tie-vision section V.
 
+    Raises ValueError for an unknown rate, placement or feedforward.
+
     Args:
-        env: Env of the controller, with beta_hat in its observation.
+        env: Env of the controller, with beta_hat in its observation; ValueError without it.
         rate: "control" updates at every decision, "camera" at the first decision after 33 ms.
         gain: Factor on the PI's gains.
         pole: Pole of the closed loop (rad/s), as for `design_pi`.
         placement: Rule of the pole, as for `design_pi`.
         grip: Grip limit, as for `Controller`.
         feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
-
-    Raises:
-        ValueError: A rate, placement or feedforward is unknown, or beta_hat is missing.
     """
 
     needs = Inputs._fields

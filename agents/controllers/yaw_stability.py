@@ -119,7 +119,8 @@ class Esc(Controller):
     The yaw rate follows that of the nominal car within what friction holds, |gamma| <= 0.85 mu g /
     v, under every reference of the env. The PI acts outside of the dead band, within which its
     integral decays. Beyond the bound of the sideslip angle a moment drives beta back, where the
-    observation has beta_hat. Source: Rajamani, Vehicle Dynamics and Control, 8.2.
+    observation has beta_hat. An option out of range is a ValueError. Source: Rajamani, Vehicle
+    Dynamics and Control, 8.2.
 
     Args:
         env: Env of the controller.
@@ -128,9 +129,6 @@ class Esc(Controller):
         slip: Bound of the sideslip angle (rad).
         stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: An option is out of range.
     """
 
     memory = 1
@@ -311,13 +309,10 @@ class ModelFollowing(Controller):
     authority around the driver's) and the error would push it further out.
 
     Args:
-        env: Env of the controller, whose action steers.
-        bandwidth: K_beta and K_gamma (rad/s).
+        env: Env of the controller; ValueError where no action steers or an entry is missing.
+        bandwidth: K_beta and K_gamma (rad/s); ValueError for no pair.
         rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
     """
 
     memory = len(ModelMemory._fields)

@@ -85,13 +85,11 @@ class DesignModel:
         return [*range(d), *range(last, n), *range(d, last)]
 
     def solve(self) -> tuple[Array, Array]:
-        """Solve for the regulator u = -K x of least cost, and its cost to go x'Vx.
+        """Solve for the best regulator u = -K x, K (m, n), and V (n, n) of its cost to go x'Vx.
 
         The states that inputs move have the gains of `control.dlqr`. The others need not decay;
         their optimal gains follow from a linear equation for their part of the cost to go.
-
-        Returns:
-            K (m, n) and V (n, n), but for a part that no input changes.
+        V lacks the part that no input changes.
         """
         from scipy.linalg import solve, solve_discrete_are
 
@@ -161,18 +159,15 @@ def _compute_rate_cost(vehicle: Vehicle, design_spec: DesignSpec, shares: Array)
 def make_tick_model(
     vehicle: Vehicle, speed: float, design_spec: DesignSpec
 ) -> tuple[Array, Array, Array, Array]:
-    """Make the model of one tick, and its outputs that the cost judges.
+    """Make G (n, n), H (n, m) of a tick, and C (4, n), D (4, m) from its start to the outputs.
 
-    The outputs at the tick's end are e_beta, e_gamma, and the means over the tick of the delivered
-    fraction of the yaw moment and of the added steering (the applied less the driver's).
+    The cost judges the outputs: e_beta and e_gamma at the tick's end, and the tick's means of the
+    delivered fraction of the yaw moment and of the added steering (the applied less the driver's).
 
     Args:
         vehicle: Vehicle of the design.
         speed: Speed (m/s).
         design_spec: Parameters of the design.
-
-    Returns:
-        G (n, n) and H (n, m) of a tick; C (4, n) and D (4, m), from its start to the outputs.
     """
     lags = [make_lag(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _discretise_plane(vehicle, speed, design_spec)
@@ -224,14 +219,11 @@ SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())  # m/s, of the designs
 
 @jit
 def find_cell(axis: Vector, value: Scalar) -> tuple[int, Scalar]:
-    """Find the cell of a value in an axis, held at its ends.
+    """Find a cell's first knot and the value's fraction of the cell; (0, 0) for a single knot.
 
     Args:
         axis: Rising knots.
-        value: Value in the axis's unit.
-
-    Returns:
-        Index of the cell's first knot, and the fraction of the cell; (0, 0) for a single knot.
+        value: Value in the axis's unit, held at the axis's ends.
     """
     if len(axis) < 2:
         return 0, 0.0

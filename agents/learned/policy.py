@@ -37,11 +37,7 @@ JsonMap = dict[str, Any]
 
 @dataclass(frozen=True)
 class Card:
-    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
-
-    Raises:
-        ValueError: A value has another type, or one that JSON does not have.
-    """
+    """The card of a policy: training and evaluation in JSON types; ValueError for a wrong type."""
 
     env_id: str  # id of the env
     observation: tuple[tuple[str, str], ...]  # (name, unit) of each entry that the network takes
@@ -210,14 +206,10 @@ def _check_width(card: Card, network: Network) -> None:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy from its file, or a shipped one by its name.
+    """Load a policy's file or a shipped one; ValueError for an unknown format or unfit tensors.
 
     Args:
-        path: Path or shipped name.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is no policy of a known format, or card and tensors do not fit.
+        path: Path or shipped name; FileNotFoundError without its file.
     """
     file = _make_path(path)
     if file.is_dir():

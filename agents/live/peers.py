@@ -151,11 +151,8 @@ def simulate(
         port: Port that sends.
         to: Address of the receiver.
         seed: Seed of the reset.
-        step: Whether to run in lock-step.
+        step: Whether to run in lock-step; ValueError for a control period too long for it.
         speed: Speed of the clock, 1 for real time.
-
-    Raises:
-        ValueError: The control period is too long for lock-step.
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
@@ -380,16 +377,12 @@ def _run_viewer(pipe: "Connection", *arguments: Any) -> None:
 
 
 class Viewer(_Peer):
-    """The process that shows a loop's estimates.
+    """The process that shows a loop's estimates; ModuleNotFoundError without aiohttp.
 
     Args:
         title: Title above the estimates.
-        page: Host and port of the page, port 0 for any; None: no page.
+        page: Host and port of the page, port 0 for any, OSError for one in use; None: no page.
         screen: Whether the terminal has a table.
-
-    Raises:
-        OSError: The port is in use.
-        ModuleNotFoundError: aiohttp is not installed.
     """
 
     def __init__(self, title: str, page: Address | None, screen: bool) -> None:

@@ -66,11 +66,7 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of a run, which may change when a training resumes.
-
-    Raises:
-        ValueError: `eval_freq` is below 1, or the device is none of torch's.
-    """
+    """The options of a run, free to change later; ValueError: `eval_freq` < 1 or unknown device."""
 
     eval_freq: int = 250_000  # steps between two evaluations
     device: str = "cpu"  # torch's name of the device

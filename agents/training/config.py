@@ -138,11 +138,7 @@ def _make_schedule(name: str, value: object) -> LinearSchedule | float:
 
 @dataclass(frozen=True)
 class TrainingTask:
-    """The task of a training, which stays the same when the training resumes.
-
-    Raises:
-        ValueError: A name is unknown, a number out of range, or fields contradict each other.
-    """
+    """The task of a training, the same when it resumes; ValueError for unknown or unfit fields."""
 
     env_id: str = "sideslip/YawVision-v1"  # of a native vector env
     algo: str = "ppo"  # name in `ALGORITHMS`

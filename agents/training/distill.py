@@ -120,13 +120,10 @@ def distill(
 
     Args:
         card: Card of the student's cars, to which the training's numbers are added.
-        tasks: Cars and teachers.
-        config: Configuration of the student and its training.
+        tasks: Cars and teachers; ValueError without one.
+        config: Configuration; ValueError for `auxiliary_weight` where the student sees everything.
         path: Path that ends in `.safetensors`.
         report: Function that is called after each round.
-
-    Raises:
-        ValueError: There is no task, or `auxiliary_weight` where the student sees everything.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")

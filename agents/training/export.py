@@ -175,16 +175,11 @@ def policy_from_zip(
     A policy trained on a VecFrameStack around the env has that many frames of history.
 
     Args:
-        path: Path of the zip.
-        env: Env, single or vector, whose observation names the zip's numbered entries.
-        trust: Whether code in the zip may run.
+        path: Path of the zip; FileNotFoundError without one, ValueError for another file.
+        env: Single or vector env whose observation names the numbered entries; ValueError if unfit.
+        trust: Whether code in the zip may run; PermissionError if not.
         normalise: Pickle of VecNormalize; None: NAME.pkl or vecnormalize.pkl beside the zip.
         about: Fields of the policy's `Card`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        PermissionError: `trust` is False.
-        ValueError: The file is no such zip, or its policy has another observation.
     """
     file = Path(path)
     check_trusted(file, trust)
@@ -325,13 +320,8 @@ def load_normaliser(
 
     Args:
         path: Path of the zip.
-        trust: Whether the pickle may be read.
-        normalise: Path of the pickle, as for `find_normaliser`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        PermissionError: There is a pickle and no trust.
-        ValueError: The file holds no VecNormalize.
+        trust: Whether the pickle may be read; PermissionError if not.
+        normalise: As for `find_normaliser`; FileNotFoundError without it, ValueError if unfit.
     """
     from stable_baselines3.common.vec_env import VecNormalize
 

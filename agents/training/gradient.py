@@ -142,7 +142,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int = 1,
         tb_log_name: str = "gradient", reset_num_timesteps: bool = True, progress_bar: bool = False,
     ) -> "AnalyticPolicyGradient":  # fmt: skip
-        """Train until a number of steps, window by window.
+        """Train until a number of steps, window by window; ValueError without a source.
+
+        Raises FloatingPointError, with the step, where the gradient is not finite.
 
         Args:
             total_timesteps: Steps of all cars.
@@ -151,10 +153,6 @@ class AnalyticPolicyGradient(BaseAlgorithm):
             tb_log_name: Name of the run in TensorBoard.
             reset_num_timesteps: Whether the steps count from 0.
             progress_bar: Whether to show a bar.
-
-        Raises:
-            ValueError: There is no source.
-            FloatingPointError: The gradient is not finite; the message has the step.
         """
         if self.source is None:
             raise ValueError("AnalyticPolicyGradient drives cars on tensors: it needs their source")

@@ -81,18 +81,12 @@ class Standardised(FlattenExtractor):
 def read_normalisation(
     normaliser: VecNormalize | None, n_inputs: int, history: int
 ) -> tuple[Array, Array, float | None]:
-    """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
+    """Read mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
 
     Args:
-        normaliser: VecNormalize or None.
+        normaliser: VecNormalize around the frames or inside, or None; ValueError for another size.
         n_inputs: Entries that the network reads, of all frames together.
         history: Number of frames.
-
-    Returns:
-        Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
-
-    Raises:
-        ValueError: The normaliser is of observations of another size.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None

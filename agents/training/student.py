@@ -119,9 +119,7 @@ class DistillConfig:
 
     The auxiliary loss is that of the teacher's inputs that a student with memory does not see:
     squared errors in standard deviations, where the loss of zero actions counts 1.
-
-    Raises:
-        ValueError: A number is out of range, there are cells and traces, or `told` without memory.
+    Raises ValueError for a number out of range, cells beside traces, or `told` without memory.
     """
 
     rounds: int = 7  # of driving and learning; in the first one the teacher drives

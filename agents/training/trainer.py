@@ -84,15 +84,11 @@ class SavedTraining(NamedTuple):
 
 
 def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
-    """Read a folder's training from its checkpoint.
+    """Read a folder's training from its checkpoint; ValueError for another version.
 
     Args:
-        folder: Folder of the training.
-        **arguments: Fields of the task that must agree with it.
-
-    Raises:
-        FileNotFoundError: There is no checkpoint.
-        ValueError: A field differs, or the checkpoint is of another version.
+        folder: Folder of the training; FileNotFoundError without a checkpoint.
+        **arguments: Fields of the task that must agree with it, else ValueError.
     """
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
@@ -198,11 +194,8 @@ class Trainer:
 
     A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
     and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
-    actions before weights change.
-
-    Raises:
-        ValueError: The folder holds another training, or arguments contradict each other.
-        ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
+    actions before weights change. Raises ValueError for another training's folder or arguments that
+    contradict each other, ModuleNotFoundError without TensorBoard or Weights & Biases.
     """
 
     task: TrainingTask

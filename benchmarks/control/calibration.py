@@ -112,18 +112,15 @@ def calibrate(
     """Solve the episodes of tasks, one task after the other, and write them to a file.
 
     Finished tasks of a stopped run lie in a file beside it, whose name follows the sources.
+    Raises ModuleNotFoundError without CasADi or OSQP.
 
     Args:
         path: File, whose entries of other tasks stay.
         tasks: Tasks.
-        count: Seeds of a task, two or more.
+        count: Seeds of a task, two or more for an interval, else ValueError.
         command: Command line, for the records.
         jobs: Processes, None for all processors.
         console: Where progress is shown.
-
-    Raises:
-        ModuleNotFoundError: CasADi or OSQP is not installed.
-        ValueError: There are fewer than two seeds, so that there is no interval.
     """
     if count < 2:
         raise ValueError(f"an interval needs two seeds or more, got {count}")
@@ -206,14 +203,11 @@ def read_current(
 def measure_foresight(
     records: Mapping[ControlTask, CalibrationRecord], **options: Any
 ) -> dict[ControlTask, Array]:
-    """Drive oracle-state on the clairvoyant's seeds.
+    """Measure log(J / J_clairvoyant) of oracle-state by task, shape (n,), on seeds it survives.
 
     Args:
-        records: Records by task.
+        records: Records of the clairvoyant by task.
         options: Options of `measure`.
-
-    Returns:
-        log(J / J_clairvoyant) on the seeds that it survives, shape (n,), by task.
     """
     cases = [(task, Entry(STATE)) for task in records]
     title, foresight = "control, the clairvoyant's seeds", dict[ControlTask, Array]()

@@ -202,8 +202,7 @@ def score(
     the result's `error`.
 
     Args:
-        agent: Name, file's class ("my.py:MyController") or path, as for `make_agent`; or an agent,
-            its class or another factory.
+        agent: Name, file's class ("my.py:MyController"), path, agent or factory, as `make_agent`.
         env_id: Id whose tasks are driven; "": both ids of the matrix.
         scenarios: Names, files or mappings, or one of them; empty: a task or two of every tier.
         vehicle: Name, file or mapping instead of the tasks' cars.

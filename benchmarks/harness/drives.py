@@ -31,26 +31,20 @@ class LoggedEpisode:
 
 
 def make_filter_arguments(base: Any) -> dict[str, Any]:
-    """Make the arguments of `make_estimator` from an env's episode.
+    """Make the arguments of `make_estimator` by name, dt (s) too, from an env's episode.
 
     Args:
         base: Unwrapped env.
-
-    Returns:
-        Arguments by name, dt (s) too.
     """
     return make_spec(base)._asdict() | {"dt": base.dt}
 
 
 def record_drive(env: gym.Env[Any, Any], seed: int) -> Log:
-    """Record a drive without control, and without the columns of `rollout`, which take longer.
+    """Record an uncontrolled drive with its true sideslip, without `rollout`'s columns, for speed.
 
     Args:
         env: Env of one car.
         seed: Seed of the reset.
-
-    Returns:
-        Log with the true sideslip angle.
     """
     base: Any = env.unwrapped
     records, times, slips = [], [], []
@@ -81,15 +75,12 @@ def make_unchecked_filter(
 
 
 def draw_steering(rng: np.random.Generator, amplitude: float, duration: float) -> Array:
-    """Draw a steering angle every 10 ms: sines, and plateaus that begin within 0.25 s.
+    """Draw steering angles (rad), shape (n,), every 10 ms: sines, and plateaus begun within 0.25 s.
 
     Args:
         rng: Generator.
         amplitude: Size of the angle (rad).
         duration: Duration (s).
-
-    Returns:
-        Steering angles (rad), shape (n,).
     """
     time = np.arange(round(duration / 0.01)) * 0.01
     angle = np.zeros(len(time))
@@ -127,9 +118,6 @@ def make_env(
         estimator: Name of the estimator, "" for none.
         estimate: Other arguments of `EstimateObservation`.
         options: Arguments of the env.
-
-    Returns:
-        Env, wrapped if there is an estimator.
     """
     env: gym.Env[Any, Any] = gym.make(env_id, **{"on_bad_action": "fail", **options})
     if estimator:

@@ -137,15 +137,12 @@ METRICS = {metric.name: metric.unit for metric in EPISODE} | {
 
 
 def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
-    """Compute the power that N cars' tyres dissipate: -F_y times the sliding speed, both axles.
+    """Compute the power (W), shape (N,), of both axles' lateral sliding: -F_y times sliding speed.
 
     Args:
         params: Packed parameters of the engine, one row for each car.
         states: Packed states of the engine, likewise.
         switches: Packed switches of the engine, likewise.
-
-    Returns:
-        Power of each car (W), shape (N,), without that of drive slip.
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

@@ -1,7 +1,4 @@
-"""Independent cases side by side, in processes or on a Ray cluster, with a progress bar.
-
-Every engine and every number of workers give the same results.
-"""
+"""Independent cases in processes or on Ray, with a bar; engine and workers change no result."""
 
 import io
 import math
@@ -39,15 +36,11 @@ def count_cores() -> int:
 
 @contextmanager
 def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
-    """Use an engine for the cases within.
+    """Use an engine for the cases within; ValueError for an unknown engine or cluster.
 
     Args:
-        name: Name, `PROCESSES` or "ray".
+        name: Name, `PROCESSES` or "ray"; ModuleNotFoundError where Ray is not installed.
         address: Existing Ray cluster, "host:port", "" for this machine's; it must run this version.
-
-    Raises:
-        ModuleNotFoundError: Ray is not installed.
-        ValueError: There is no such engine or cluster.
     """
     check_choice("engine", name, _ENGINES)
     if name == PROCESSES:
@@ -195,9 +188,6 @@ def run_cases(
         title: Title of the progress bar.
         jobs: Number of processes, None for one a processor, 1 for this process.
         console: Console of the progress bar outside of `use_shared_bar`; None: nothing is shown.
-
-    Returns:
-        Results, one for each case.
     """
     shared, results = _SHARED.get(), dict[int, Result]()
     with Bar(console) if shared is None else nullcontext(shared) as bar:

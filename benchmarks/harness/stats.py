@@ -65,10 +65,7 @@ def margin_of_error(*strata: Array) -> float:
     kurtosis is large (O'Neill 2014, Some useful moment results in sampling problems).
 
     Args:
-        strata: Numbers of each mean, shape (n_i,).
-
-    Returns:
-        Half of the interval's width; NaN where a mean is of fewer than two numbers.
+        strata: Numbers of each mean, shape (n_i,); NaN for fewer than two.
     """
     variance = uncertainty = 0.0
     for values in strata:
@@ -95,14 +92,12 @@ def interval(
     """Compute a statistic over seeds with its 95 % interval, by the jackknife.
 
     Where no number is negative, the interval is that of the statistic's logarithm.
+    Fewer than four seeds or an infinite statistic have none.
 
     Args:
         values: Numbers of the seeds, shape (n,).
         statistic: Smooth function, no median, of `values`, and of `paired` unless that is None.
         paired: Numbers of the same seeds, shape (n,), left out together with `values`.
-
-    Returns:
-        Statistic and interval, without bounds for fewer than four seeds or an infinite statistic.
     """
     data = (values,) if paired is None else (values, paired)
     estimate, n = float(statistic(*data, axis=-1)), len(values)
@@ -154,13 +149,10 @@ ratio_of_roots = _make_ratio(root_mean)  # RMSE over that of a reference, from s
 
 
 def average(*strata: Array) -> Estimate:
-    """Average the means of strata.
+    """Average the means of strata, with interval; NaN without strata, and where a number is NaN.
 
     Args:
         strata: Numbers of each stratum, shape (n_i,).
-
-    Returns:
-        Average and interval; NaN without strata, and where a number is NaN.
     """
     filled = [stratum for stratum in strata if len(stratum)]
     if not filled:
@@ -180,13 +172,10 @@ def geometric_mean(*strata: Array) -> Estimate:
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """Compute the mean of hits with Wilson's interval.
+    """Compute the mean of hits with Wilson's interval; NaN without hits.
 
     Args:
         hits: Numbers that are 0 or 1, a tie 0.5, shape (n,).
-
-    Returns:
-        Mean and interval; NaN without hits.
     """
     from scipy.special import ndtri
 
@@ -233,10 +222,7 @@ def compute_tail_mean(costs: Array) -> Estimate:
     Its interval is the logarithm's, by influences on the tail's mean; none for a tail below 25.
 
     Args:
-        costs: Costs, shape (n,).
-
-    Returns:
-        Mean, NaN without costs, and interval.
+        costs: Costs, shape (n,); NaN without any.
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
@@ -251,14 +237,11 @@ def compute_tail_mean(costs: Array) -> Estimate:
 
 
 def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
-    """Check whether a share is surely larger than another of the same drives: McNemar's exact test.
+    """Check that a share exceeds another of the same drives: McNemar's exact one-sided test, 2.5 %.
 
     Args:
         hits: Whether each drive is a hit, shape (n,).
         others: The same of the other share, shape (n,).
-
-    Returns:
-        Whether the one-sided p value is at most 2.5 %.
     """
     from scipy.special import bdtrc
 

@@ -74,13 +74,10 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
 
 
 def describe_innovations(nis: Mapping[str, float]) -> str:
-    """Describe whether slow samples surprise each filter as much as it expects.
+    """Describe whether slow samples surprise each filter as it expects; "" without innovations.
 
     Args:
         nis: Mean squared innovation over its variance, of a value of a packet, by filter.
-
-    Returns:
-        A sentence; "" where no filter has innovations.
     """
     lost = [f"{name} ({mean:.1f})" for name, mean in nis.items() if mean > MAX_NIS]
     if not nis:

@@ -107,9 +107,6 @@ def compute_coms_ranks(seed: int) -> Numbers:
 
     Args:
         seed: Without effect: nothing is random.
-
-    Returns:
-        Rank by paper.
     """
     A = linear.make_vision_model(COMS, 25.0 * KMH).A
     vision: Matrix = np.array([[Fraction(entry) for entry in row] for row in A])

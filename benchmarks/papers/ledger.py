@@ -212,13 +212,10 @@ class Simulation:
     share: float = 1.0  # of the seeds; 0: once; above 1 where a ratio is close to its threshold
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Measure the numbers of a case, and keep the signals of seed 0.
+        """Measure numbers by subject and quantity, shape (seeds,) each, and the signals of seed 0.
 
         Args:
             seeds: Seeds of the case.
-
-        Returns:
-            Numbers by subject and quantity, shape (seeds,) each, and the example.
         """
         measure_seed, lines, example = self._prepare(), list[Numbers](), None
         for seed in seeds:

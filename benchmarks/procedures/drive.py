@@ -94,13 +94,10 @@ class ProcedureEntry:
     policies: Mapping[str, str] = field(default_factory=dict)  # learned, with its estimator, by car
 
     def get_configuration(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
-        """Get what drives a car.
+        """Get the agent, the estimator and the options of its wrapper that drive a car.
 
         Args:
             car: One of `CARS`, or an outside model, which is taken for the passenger car.
-
-        Returns:
-            Agent, estimator and the options of its wrapper.
         """
         if not self.policies:
             return self.agent, self.estimator, self.estimate

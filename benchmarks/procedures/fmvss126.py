@@ -127,17 +127,11 @@ class SineDwellResult:
 
 
 def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
-    """Measure A, the mean of turns to the left and to the right.
+    """Measure A (rad at the steering wheel), the mean of turns to the left and to the right.
 
     Args:
         drive: Function that drives the car through a scenario.
-        car: Car under test, with speed and steering ratio.
-
-    Returns:
-        Angle (rad at the steering wheel).
-
-    Raises:
-        ValueError: The car never passes 0.375 g.
+        car: Car under test, with speed and steering ratio; ValueError if it never passes 0.375 g.
     """
     turns = [drive(_make_slow_steer(car, side)) for side in (1.0, -1.0)]
     return float(np.mean([_fit_reference_angle(turn, car.ratio) for turn in turns]))
@@ -146,16 +140,13 @@ def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
 def run(
     drive: DriveFunction, car: TestCar, A: float, multiples: Sequence[float] | None = None
 ) -> SineDwellResult:
-    """Run the procedure.
+    """Run the procedure, to both sides with each amplitude.
 
     Args:
         drive: Function that drives the car through a scenario.
         car: Car under test, with speed and steering ratio.
         A: Reference angle (rad at the steering wheel).
         multiples: Amplitudes (of A); None: the standard's series.
-
-    Returns:
-        The runs, both sides of each amplitude.
     """
     angles = _list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]

@@ -124,16 +124,13 @@ def _evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> Tra
 
 
 def run_track(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
-    """Try a speed with each driver until one is clean.
+    """Drive at a speed with each driver until a run is clean, and return that or the closest run.
 
     Args:
         drive: Function that drives the car through a scenario.
         car: Car under test, with speed and steering ratio.
         track: One of `TRACKS`.
         speed: Speed (m/s).
-
-    Returns:
-        The clean run, or the one that came closest to it.
     """
     runs, fields = list[TrackRun](), _make_lane_change(car, track, speed)
     for driver in DRIVERS:
@@ -172,15 +169,12 @@ def _compute_handling(series: Series, car: TestCar) -> Handling:
 
 
 def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
-    """Drive a circle on which the linear car would reach 0.5 g at its full speed.
+    """Measure the handling diagram on a circle where the linear car reaches 0.5 g at full speed.
 
     Args:
         drive: Function that drives the car through a scenario.
         car: Car under test, with speed and steering ratio.
         seconds: Time in which the speed rises (s).
-
-    Returns:
-        The handling diagram.
     """
     v = car.speed
     steer = (car.vehicle.wheelbase / v**2 + car.understeer_gradient) * (0.5 * GRAVITY)

@@ -91,15 +91,12 @@ def run_check() -> list[fmvss126.SineDwellResult]:
 
 
 def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> Array:
-    """Run the episodes of a controller on an outside plant.
+    """Run episodes: cost, 1 if failed, largest sideslip angle (rad) of each seed, shape (seeds, 3).
 
     Args:
         model: Name of the plant, of `OUTSIDE_PLANTS`.
         entry: Controller with its estimator.
         seeds: Seeds of the episodes.
-
-    Returns:
-        Cost, 1 where it failed, and largest sideslip angle (rad) of each seed, shape (seeds, 3).
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     options |= {"steering": True, "sensors": "fusion"}

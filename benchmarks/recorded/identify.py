@@ -62,15 +62,12 @@ def identify(
     """Fit the car to the parts of a log, and the noise of its sensors.
 
     Args:
-        logs: Parts of the log.
+        logs: Parts of the log; ValueError for swapped columns.
         car: Stated car, where the search starts.
         wires: Stated calibration, where the search starts.
         tyres: "linear", as stiff as the log's accelerations have them, without roll, or "fiala", as
             stiff as at small slips, with the stated friction and roll; None: what errs less on
-            held-out stretches.
-
-    Raises:
-        ValueError: Swapped columns, or an unknown law of tyres.
+            held-out stretches; another: ValueError.
     """
     if tyres not in (None, *TYRES):
         raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")

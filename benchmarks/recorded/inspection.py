@@ -67,14 +67,11 @@ def inspect_file(
     """Read a drive and judge whether it is worth estimating from.
 
     Args:
-        source: Table, or its file.
+        source: Table, or its file; ValueError for a receiver's log (NMEA).
         vehicle: Vehicle that is assumed, as for `make_vehicle`.
-        mapping: Texts such as "steer_rad=Delta".
+        mapping: Texts such as "steer_rad=Delta"; ValueError for an unknown column or calibration.
         wires: Calibration of the signals.
         figures: Whether to draw.
-
-    Raises:
-        ValueError: A column's name or calibration is none, or it is a receiver's log (NMEA).
     """
     if isinstance(source, str | Path) and is_nmea(source):
         text = "a receiver's log (NMEA) has no gyro and no steering; `sideslip replay` filters it"

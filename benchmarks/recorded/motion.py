@@ -1,7 +1,4 @@
-"""The motion in a recorded drive, and the noise and latency of its sensors.
-
-Intervals are jackknives over blocks of the log.
-"""
+"""Motion, and noise and latency of sensors, in a drive; intervals are jackknives over blocks."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -175,10 +172,7 @@ class Finding(NamedTuple):
 
 
 def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
-    """Estimate standard deviation and half interval of a channel's white noise.
-
-    From third differences of new samples: a slower sensor repeats its last one.
-    """
+    """Estimate white noise and half interval by third differences of samples that do not repeat."""
     blocks = []
     for values in parts:
         new = np.concatenate([[True], np.diff(values) != 0.0])
@@ -191,14 +185,11 @@ def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
 def make_sensor_findings(
     logs: Sequence[Log], slips: Sequence[Array]
 ) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
-    """Make findings of the sensors.
+    """Make findings of the sensors, noise by the estimators' options, and latency by sensor (s).
 
     Args:
         logs: Parts of the log.
         slips: Sideslip angle (rad) of each, shape (rows,), by which the course is predicted.
-
-    Returns:
-        Findings, noise by the estimators' options, latency by sensor (s).
     """
     findings: list[Finding] = []
     noise: dict[str, float] = {}

@@ -1,7 +1,4 @@
-"""Quality of a recorded drive: columns that contradict one another, noise, and a late GPS.
-
-Intervals are jackknives over blocks of the log.
-"""
+"""Contradictory columns, noise and a late GPS in a drive; intervals are jackknives over blocks."""
 
 import math
 from collections.abc import Sequence
@@ -106,8 +103,7 @@ def smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
 
     Args:
         logs: Parts of the log.
-        names: Columns; also "turning", speed x yaw rate, and "slipping", the change of speed x
-            truth (m/s2).
+        names: Columns; "turning": speed x yaw rate; "slipping": change of speed x truth (m/s2).
     """
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:

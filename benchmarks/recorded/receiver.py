@@ -208,10 +208,7 @@ def replay_nmea(log: str | Path) -> ReceiverReplay:
     """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
 
     Args:
-        log: Path of the log.
-
-    Raises:
-        ValueError: For a log too short to compare, and for all that `read_nmea` refuses.
+        log: Path of the log; ValueError for one too short, or that `read_nmea` refuses.
     """
     path = Path(log)
     epochs, counts = read_nmea(path)

@@ -267,17 +267,14 @@ def replay_file(
     """Read a drive and replay it, each part of a log with holes by itself.
 
     Args:
-        log: File of the drive.
+        log: File of the drive; ValueError where its reader or `replay` refuses it.
         vehicle: Vehicle as for `make_vehicle`. "identify": the log identifies the car, or its
             first `until` s do and the rest is replayed.
         mapping: Texts such as "steer_rad=Delta".
         wires: Calibration of the signals; its latency and noise overrule identified ones.
         nominal: Vehicle whose mass and arms an identified car with linear tyres has.
-        until: End of the part that identifies the car (s).
+        until: End of the identifying part (s); like `nominal` a ValueError without "identify".
         settings: Fields of `Settings`.
-
-    Raises:
-        ValueError: `until` or `nominal` without "identify", or the readers or `replay` refuse it.
     """
     if is_nmea(log):
         raise ValueError(f"{log}: a receiver's log (NMEA); replay_nmea reads it")

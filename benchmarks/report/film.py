@@ -35,15 +35,10 @@ class FilmDriver(NamedTuple):
 
 
 def check_film(path: Path | None) -> None:
-    """Check before the work that a film can be written: its ending, folder and needed modules.
+    """Check a film's ending (ValueError), folder (OSError) and modules (ModuleNotFoundError) first.
 
     Args:
-        path: File, None for none.
-
-    Raises:
-        ValueError: The file has another ending.
-        OSError: The file cannot be written.
-        ModuleNotFoundError: The extra `render` is not installed.
+        path: File, None for none; it needs the extra `render`.
     """
     if path is None:
         return

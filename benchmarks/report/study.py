@@ -98,13 +98,10 @@ class Study(Generic[Results]):
     needs: tuple[str, str] = ("", "")  # optional module, and the verdict where it is not installed
 
     def run(self, request: Request) -> Suite:
-        """Run the study.
+        """Make the study's suite: rows, tables, verdict, and figures if plotly is installed.
 
         Args:
             request: Options of the run.
-
-        Returns:
-            Suite with rows, tables, verdict, and figures only where plotly is installed.
         """
         suite = Suite(self.name, self.title, self.text)
         module, absence = self.needs

@@ -63,14 +63,11 @@ class Taken(list[float]):
 
 
 def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
-    """Measure the CPU time a unit of workloads, round by round, after a first round.
+    """Measure CPU time a unit (us) of each round by name, workloads in turn, after a first round.
 
     Args:
         workloads: Workloads by name.
         effort: Rounds and time of each.
-
-    Returns:
-        CPU time a unit (us) in each round, by name.
     """
     with limit_threads():
         calls = {name: _count_calls(x, effort.seconds) for name, x in workloads.items()}
@@ -142,14 +139,11 @@ class WorkloadSet:
             self.absent[name] = f"{package} is not installed"
 
     def measure(self, suite: Suite, effort: Effort) -> dict[str, Taken]:
-        """Measure all, and add rows and a table to a suite.
+        """Measure CPU time a unit (us) of each round by name, and add rows and a table to a suite.
 
         Args:
             suite: Suite that gets the results.
             effort: Rounds and time of each.
-
-        Returns:
-            CPU time a unit (us) in each round, by name.
         """
         if self.is_slow:
             effort = replace(effort, rounds=max(1, min(effort.rounds // 2, _MAX_SLOW_ROUNDS)))
@@ -166,13 +160,10 @@ class WorkloadSet:
 
 
 def format_absences(absent: Mapping[str, str]) -> str:
-    """Format a sentence on the absent workloads.
+    """Format a sentence on the absent workloads, "" without any.
 
     Args:
         absent: Reasons by name.
-
-    Returns:
-        Sentence, "" without any.
     """
     if not absent:
         return ""

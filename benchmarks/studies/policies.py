@@ -123,14 +123,11 @@ def evaluate_policy(
     """Drive a policy, the uncontrolled car, and the classical line.
 
     Args:
-        policy: Shipped name or path.
+        policy: Shipped name or path; ValueError where it cannot drive the env.
         episodes: Episodes of each entry.
         env_id: Another env than the policy's own, with that id's options.
         scenario: Name instead of the env's own.
         seed: Seed of the first episode, the next ones count up; None: made from the weights.
-
-    Raises:
-        ValueError: The policy cannot drive the env.
     """
     loaded = load_policy(policy)
     card, home = loaded.card, env_id or loaded.card.env_id
@@ -225,11 +222,7 @@ def _vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> JsonMap:
 
 @dataclass(frozen=True)
 class Lessons:
-    """The lessons of a class of tasks: what a student drives and reads, and who teaches it.
-
-    Raises:
-        ValueError: An unknown name.
-    """
+    """Lessons of a class: a student's drives and inputs, its teacher; ValueError if unknown."""
 
     kind: str  # class of tasks
     estimator: str = ""  # that the student reads, one of `FILTERS`
@@ -287,20 +280,14 @@ class Lessons:
 def prepare_start(
     agent: Path | None, varied: int = 0
 ) -> "tuple[Path | Policy | None, Callable[..., TrainingTask]]":
-    """Prepare what `sideslip train -i` begins with, and the function that makes its task.
+    """Prepare the path or policy of `sideslip train -i`, and the maker of its `TrainingTask`.
 
     A zip's path stays what it is; a distilled policy goes on in all tasks of its class, but for
     those with a driver where cars are driven on tensors: rows are of one kind there.
 
     Args:
         agent: File of a policy or a zip, None for none.
-        varied: How often each task varies by `VARIED`, drawn by the training's seed.
-
-    Returns:
-        Path or policy, and the function of the fields of `TrainingTask`.
-
-    Raises:
-        ValueError: Tasks vary, but the policy is of no class.
+        varied: How often tasks vary by `VARIED` and the training's seed; ValueError for no class.
     """
     from ...agents.training.config import TrainingTask, get_algorithm, make_finetune_task
 

@@ -1,7 +1,4 @@
-"""Tuning of an estimator: its options and ranges, its drives and their errors, its entry in files.
-
-It is searched on training seeds and judged on test seeds.
-"""
+"""Tuning of an estimator: ranges, training and test drives with their errors, entry in files."""
 
 import functools
 import math

@@ -75,7 +75,7 @@ def run_study(
     """Run batches of trials until a study has so many, those it holds included.
 
     Args:
-        name: Name of the study.
+        name: Name of the study; ValueError where the storage fails or holds something else.
         ranges: Range of each number by name.
         search: Options of the search; machines that share a storage take different seeds.
         evaluate: Function of the numbers of a batch: value, and drives it is the mean of, of each.
@@ -84,9 +84,6 @@ def run_study(
 
     Returns:
         The finished trials, with "objective" and "seeds" (drives) among their `user_attrs`.
-
-    Raises:
-        ValueError: The storage fails or holds something else.
     """
     study = load_study(name, ranges, search)
     space: dict[str, optuna.distributions.BaseDistribution] = {
