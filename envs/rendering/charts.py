@@ -1,7 +1,7 @@
 """The picture of a car: the road, a close-up and strip charts over time.
 
-The close-up has its nose to the right: velocity, tyre forces in their friction circles and wind.
-The charts show truth, references and estimates with their standard deviation.
+The close-up has its nose to the right: velocity, tyre forces in their friction circles,
+motor torques and wind. The charts show truth, references and estimates with their deviation.
 """
 
 import math
@@ -147,6 +147,9 @@ def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAn
     per_newton = _CIRCLE / (0.3 * scene.vehicle.mass * GRAVITY)
     for wheel in scene.wheels:
         _draw_wheel(canvas, wheel, scene.vehicle.wheel_radius, to_pixels, per_newton)
+    for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
+        place = box[0] + 44.0, to_pixels(np.array([[wheel.x, wheel.y]]))[0, 1]
+        _draw_motor(canvas, place, torque, torque / scene.max_torque)
     _draw_directions(canvas, (x_0, y_0), slips)
     if scene.wind:
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
@@ -176,6 +179,16 @@ def _draw_wheel(
         canvas.draw_text(place, f"{100.0 * utilisation:.0f} %", colour, 12, 0.5)
     canvas.draw_polygon(to_pixels(wheel.outline(r)), "#A9B0B7")
     canvas.draw_arrow(centre, centre + per_newton * np.array([forward, -left]), colour, 3.0)
+
+
+def _draw_motor(canvas: Canvas, place: tuple[float, float], torque: float, share: float) -> None:
+    """Draw a rear motor's torque as a bar, to the right where it drives."""
+    x, y = place
+    length = 30.0 * min(max(share, -1.0), 1.0)
+    canvas.draw_box((x - 30.0, y + 4.0, 60.0, 7.0), "#E4E7EA", 3.5)
+    canvas.draw_box((x + min(length, 0.0), y + 4.0, abs(length), 7.0), PALETTE[0])
+    canvas.draw_line([(x, y + 2.0), (x, y + 13.0)], road.SOFT, 1.0)
+    canvas.draw_text((x, y - 6.0), f"{torque:+.0f} N m", INK, 12, 0.5)
 
 
 def _draw_directions(canvas: Canvas, centre: tuple[float, float], slips: _SlipAngles) -> None:

@@ -19,6 +19,7 @@ from ..record import Array
 from ..scenarios import road as tracks
 from ..scenarios.driver import compute_wind
 from ..sensors.slow import compute_lane_quality
+from ..vehicle.actuators import compute_torque_limit
 from ..vehicle.dynamics import Motion, compute_curvature, compute_gravity
 from ..vehicle.parameters import Vehicle
 from ..vehicle.tyres import LINEAR, compute_lateral_forces, compute_tyre_load, compute_tyres
@@ -30,7 +31,8 @@ _make_step_params, _make_step_variant = as_python(make_step_params), as_python(m
 _compute_tyre_load, _compute_tyres = as_python(compute_tyre_load), as_python(compute_tyres)
 _compute_lateral_forces = as_python(compute_lateral_forces)
 _apply_tyre_change, _compute_gravity = as_python(apply_tyre_change), as_python(compute_gravity)
-_compute_lane_quality, _compute_wind = as_python(compute_lane_quality), as_python(compute_wind)
+_compute_torque_limit, _compute_wind = as_python(compute_torque_limit), as_python(compute_wind)
+_compute_lane_quality = as_python(compute_lane_quality)
 _step_nominal_car = as_python(tracks.step_nominal_car)
 _compute_curvature = as_python(compute_curvature, ARRAYS)
 _compute_path_offset = as_python(tracks.compute_path_offset, ARRAYS)
@@ -92,6 +94,8 @@ class CarScene(NamedTuple):
 
     motion: Motion
     vehicle: Vehicle
+    torques: tuple[float, float]  # N m, left and right motor
+    max_torque: float  # N m, of one motor
     wheels: tuple[Wheel, ...]  # front left and right, rear left and right
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
@@ -137,6 +141,8 @@ def make_car_scene(shot: RenderState) -> CarScene:
     return CarScene(
         motion,
         config.vehicle,
+        (float(drive.T_l), float(drive.T_r)),
+        float(_compute_torque_limit(motion.v_x, car)),
         tuple(wheels),
         0.5 * float(car.mu + car.mu_r),
         float(_compute_wind(tick, params.wind)[0]),
@@ -338,11 +344,15 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
 
 def _draw_car(canvas: Canvas, project: Projection, scene: CarScene, colour: str) -> None:
     """Draw a car by the projection of its axes."""
-    body = compute_body(scene.vehicle)
+    body = front, rear, half = compute_body(scene.vehicle)
     for wheel in scene.wheels:  # further out than they are, to be seen
-        shown = wheel._replace(y=np.sign(wheel.y) * body.half)
+        shown = wheel._replace(y=np.sign(wheel.y) * half)
         canvas.draw_polygon(project(shown.outline(scene.vehicle.wheel_radius)), _TYRE)
     canvas.draw_polygon(project(body.outline), colour)
+    shares = ((0.62, 0.86), (0.74, 0.72)), ((0.14, 0.74), (0.21, 0.86))  # of length and width
+    for corners in np.array(shares) * (front - rear, half) + (rear, 0.0):
+        window = np.concatenate([corners, corners[::-1] * (1.0, -1.0)])
+        canvas.draw_polygon(project(window), mix_colours(INK, colour, 0.55))
 
 
 def compute_body(vehicle: Vehicle) -> _Body:

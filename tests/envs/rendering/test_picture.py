@@ -17,6 +17,7 @@ from sideslip.envs.engine.step import make_step_variant
 from sideslip.envs.rendering import canvas
 from sideslip.envs.rendering.canvas import Canvas, read_pixels
 from sideslip.envs.rendering.charts import (
+    _CLOSEUP,
     _ROAD,
     _STRIPS,
     MAGNIFIED,
@@ -73,8 +74,14 @@ def test_a_positive_yaw_moment_drives_the_right_wheel(action: float) -> None:
     env = started()
     for _ in range(5):
         env.step([action])
-    *front, left, right = (wheel.F_x for wheel in scene(env).wheels)
-    assert front == [0.0, 0.0] and right * action > 100.0 > -100.0 > left * action
+    now = scene(env)
+    left, right = now.torques
+    assert right * action > 50.0 > -50.0 > left * action
+    pushed = [wheel.F_x * now.vehicle.wheel_radius for wheel in now.wheels]
+    assert pushed == pytest.approx([0.0, 0.0, left, right], abs=1e-6)
+    rows = painted(seen(env), BLUE, (44.0, _CLOSEUP[1], 31.0, _CLOSEUP[3]))[:, 1]
+    below = rows.mean() > 0.5 * _CLOSEUP[3]  # bars to the right drive; the right motor is below
+    assert below == (action > 0.0)
 
 
 def test_forces_are_the_plants_and_stay_in_their_circles() -> None:
@@ -240,7 +247,7 @@ def still() -> CarScene:
     env.render()
     now = make_car_scene(env.make_render_state())
     wheels = tuple(each._replace(angle=0.0, F_x=0.0, F_y=0.0) for each in now.wheels)
-    return now._replace(wheels=wheels, wind=0.0)
+    return now._replace(wheels=wheels, wind=0.0, torques=(0.0, 0.0))
 
 
 def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
