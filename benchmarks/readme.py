@@ -319,7 +319,9 @@ SYSTEMS = (
 )
 
 
-def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[ResultRow]:
+def _measure_systems(
+    salt: str, jobs: int | None, console: Console, keep: Path | None
+) -> list[ResultRow]:
     """Drive every system on its own ground and, beside nominal, in the small car's tasks."""
     suite, seeds = Suite("own-ground", "", ""), make_salted_seeds(salt, SYSTEM_EPISODES)
     for system in SYSTEMS:
@@ -334,7 +336,7 @@ def _measure_systems(salt: str, jobs: int | None, console: Console) -> list[Resu
     drivers = dict.fromkeys((Entry(NOMINAL), *systems))
     pairs = [(task, entry) for task in scored for entry in drivers]
     seeds_by_task = make_task_seeds(salt, SYSTEM_EPISODES)
-    common = measure(pairs, seeds_by_task, jobs=jobs, console=console)
+    common = measure(pairs, seeds_by_task, jobs=jobs, console=console, keep=keep)
     _check_driven(common)
     for standing in rank_entries(common, _TIER):
         standing.add_rows(suite, salt)
@@ -374,7 +376,7 @@ def _main(
     if not papers:
         _write_tables(read_json(ROWS) if driven else _measure_entries(salt, jobs, console, keep))
         return
-    rows = read_json(SYSTEM_ROWS) if driven else _measure_systems(salt, jobs, console)
+    rows = read_json(SYSTEM_ROWS) if driven else _measure_systems(salt, jobs, console, keep)
     text = _replace_table(PAPERS.read_text(encoding="utf-8"), _make_system_table(rows))
     write_json(SYSTEM_ROWS, rows)
     write_text(PAPERS, text)

@@ -197,7 +197,7 @@ class Estimator:
         Args:
             fast_row: Fast row of this tick, shape (FAST_WIDTH,).
         """
-        self.step(np.reshape(fast_row, (1, -1)), np.zeros((0, PACKET_WIDTH)))
+        self.step(np.asarray(fast_row)[None], np.zeros((0, PACKET_WIDTH)))
 
     def update(self, packet: npt.ArrayLike) -> None:
         """Process one packet that has arrived, after the fast row of this tick.
@@ -205,7 +205,7 @@ class Estimator:
         Args:
             packet: Packet, shape (PACKET_WIDTH,).
         """
-        self.step(np.zeros((0, FAST_WIDTH)), np.reshape(packet, (1, -1)))
+        self.step(np.zeros((0, FAST_WIDTH)), np.asarray(packet)[None])
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record; errors as in `prepare_record`.

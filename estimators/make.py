@@ -8,7 +8,6 @@ import importlib.util
 import inspect
 import math
 import operator
-import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -63,11 +62,22 @@ def find_class(text: str) -> tuple[Path, str]:
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     classes = [word for word in names if not word.startswith("_")]
     definitions = f"it defines {', '.join(classes) or 'no class'}"
-    if name and not re.search(rf"\b{re.escape(name)}\b".encode(), source):
+    if name and name not in set(_iterate_bindings(tree)):
         raise ValueError(f"{path} has no {name!r}; {definitions}")
     if not name and len(classes) != 1:
         raise ValueError(f"say what of {path} is meant, as {path}:NAME; {definitions}")
     return path, name or classes[0]
+
+
+def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
+    """Iterate over the names that a file binds somewhere."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.alias):
+            yield node.asname or node.name
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
 
 
 def _load_user_class(text: str) -> _Factory:

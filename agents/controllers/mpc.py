@@ -19,7 +19,7 @@ from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference
 from ...envs.validation import check_int
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
-from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource
 from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
 from ..design.prediction import PredictionModel, PredictionStart, PredictionTask, make_prediction
@@ -342,19 +342,28 @@ class Nmpc(Lqr):
         env: Env of the controller.
         horizon: Length of the prediction (s).
         iterations: Iterations of a decision; an episode's first one has more.
+        disturbance_time: Time in which F_d and N_d decay (s).
+        vehicle: Vehicle of the design, as for `Lqr`.
+        stiffness: Entries of front and rear cornering stiffness, as for `Lqr`.
+        span: Range of the stiffness schedule, as for `Lqr`.
+        knots: Knots of each stiffness axis, as for `Lqr`.
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
-        options: Other arguments of `Lqr`.
+        grip: Grip limit, as for `Controller`.
+        knows_car: Whether each row's car is in the observation, as for `Lqr`.
     """
 
     min_period = MIN_STEP
     knows_friction = True
 
     def __init__(
-        self, env: AnyEnv, horizon: float = 0.5, iterations: int = 2, steer_weight: float = 10.0,
-        **options: Any,
+        self, env: AnyEnv, horizon: float = 0.5, iterations: int = 2, disturbance_time: float = 0.3,
+        vehicle: VehicleSource | None = None, stiffness: Sequence[str] = (),
+        span: tuple[float, float] = (0.5, 1.6), knots: int = 7, steer_weight: float = 10.0,
+        grip: float | None = None, knows_car: bool = False,
     ) -> None:  # fmt: skip
-        super().__init__(env, steer_weight=steer_weight, **options)
-        check_int("iterations", iterations, "iterations")
+        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, knows_car
+        super().__init__(env, *options)
+        check_int("iterations", iterations, "passes")
         spec = self.design_spec
         steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
         blocks = _make_blocks(steps, MAX_VARIABLES // self.width)

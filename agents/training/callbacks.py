@@ -5,6 +5,7 @@ weighted by 1 over the uncontrolled car's cost, but at least 5 % of its mean ove
 Where a training starts from a policy, each drive is weighted by 1 over that policy's cost in it.
 """
 
+import glob
 import json
 import time
 from collections.abc import Callable
@@ -343,7 +344,7 @@ def find_zoo_folder(logs: Path, task: TrainingTask) -> Path:
         task: Task of the next one.
     """
     folder, name = logs / task.algorithm.zoo, _make_zoo_name(task.env_id)
-    return folder / f"{name}_{get_latest_run_id(str(folder), name) + 1}"
+    return folder / f"{name}_{get_latest_run_id(glob.escape(str(folder)), name) + 1}"
 
 
 def describe_for_zoo(task: TrainingTask, folder: Path, steps: int, eval_freq: int) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...envs.numerics import require_extra
 from ...envs.scenarios.manoeuvres import make_scenario
-from ...envs.validation import check_choice, check_mapping, is_finite
+from ...envs.validation import check_choice, is_finite
 from ..env_info import CarVectorEnv
 from ..learned.policy import Policy
 from ..vec_env import make_native_env
@@ -82,10 +82,12 @@ def _read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Se
         import yaml
     path = HYPERPARAMS / f"{get_algorithm(algo).zoo}.yml" if file is None else Path(file)
     try:
-        entries = check_mapping("the file", yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError) as error:
+        entries = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path} is no YAML of settings: {text}") from None
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} is no YAML of settings: {{id: {{name: value}}}} is expected")
     key = env_id if env_id in entries else "default"
     if key not in entries:
         raise ValueError(f"{path} has no settings of {env_id}, and no 'default'")
@@ -270,7 +272,9 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
     if fields.get("estimator", card.estimator) == card.estimator:
         task_fields["estimator"] = card.estimator
         task_fields["estimator_options"] = dict(card.estimator_options)
-    task_fields["settings"] = resolve_settings(None, fields.get("algo", "ppo"), card.env_id, policy)
+    algo = fields.get("algo", "ppo")
+    settings = fields.pop("settings", None) or resolve_settings(None, algo, card.env_id, policy)
+    task_fields["settings"] = _add_policy_form(settings, policy, algo)
     return TrainingTask(**task_fields | fields)
 
 
@@ -285,8 +289,13 @@ def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: obj
     """
     if not isinstance(start, Policy):
         return _read_settings(algo, env_id, file)
-    settings, form = _read_settings(algo, WARM_START_ENTRY, file), get_policy_form(start, algo)
-    return settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
+    return _add_policy_form(_read_settings(algo, WARM_START_ENTRY, file), start, algo)
+
+
+def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
+    """Add the form of a policy's network to settings."""
+    kwargs = settings.get("policy_kwargs", {}) | get_policy_form(policy, algo)
+    return settings | {"policy_kwargs": kwargs}
 
 
 def get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ..env_info import CarVectorEnv, get_layout
 from ..learned.network import CELL_WEIGHTS
-from ..learned.policy import Policy, check_names_no_code, load_policy, save_policy
+from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
 from ..rollout import COST_FLOOR
 from ..vec_env import get_scales, make_vec_env, scale_layout
 from .callbacks import (
@@ -203,9 +203,9 @@ class Trainer:
     folder: str | Path
     resume: bool = False  # whether to resume from the folder's checkpoint
     run_options: RunOptions = field(default_factory=RunOptions)
-    # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy`,
-    # whose costs weigh the drives
-    trained_agent: Path | Policy | None = None
+    # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy`
+    # or its name, whose costs weigh the drives
+    trained_agent: str | Path | Policy | None = None
     trust: bool = False  # whether a pickle of VecNormalize beside the zip may be read
 
     def __post_init__(self) -> None:
@@ -216,12 +216,15 @@ class Trainer:
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if agent is not None and self.task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if isinstance(agent, Path):
-            check_zip(agent)
+        if isinstance(agent, str | Path):
+            if is_policy(str(agent)):
+                self.trained_agent = load_policy(agent)
+            else:
+                check_zip(Path(agent))
         logs = {"tensorboard": self.run_options.tensorboard_log, "wandb": self.run_options.track}
         for package, is_wanted in logs.items():
             if is_wanted and find_spec(package) is None:
-                raise ModuleNotFoundError(f"a log there needs {package}: pip install {package}")
+                raise ModuleNotFoundError(f"a log for {package} needs it: pip install {package}")
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
         self._state: Checkpoint | None = None
         if self.resume:
@@ -266,7 +269,7 @@ class Trainer:
         if isinstance(agent, Policy):
             policy, start = agent, _WarmStart.from_policy(agent, task)
         elif agent is not None:
-            start = _WarmStart.from_zip(agent, task, self.trust)
+            start = _WarmStart.from_zip(Path(agent), task, self.trust)
         callback = EvalCallback(task, self._folder, self.run_options, self.steps, policy, state)
         steps = state.steps if state else 0
         if state:

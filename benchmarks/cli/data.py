@@ -5,6 +5,7 @@ cv2 is imported when a command needs it, after the limit on a picture's pixels i
 
 import math
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -123,9 +124,14 @@ class _Replay:
                 delay=self.course_delay,
                 bias_deg=self.course_bias,
                 gyro_bias_degps=self.gyro_bias,
-                figures=self.html is not None,
+                figures=_has_figures(self.html),
             )
         write_output(console, [suite], vars(self))
+
+
+def _has_figures(html: Path | None) -> bool:
+    """Return whether a report is written and can have figures."""
+    return html is not None and find_spec("plotly") is not None
 
 
 @register("identify", "Find the car of a recorded drive.")
@@ -194,7 +200,7 @@ class _Inspect:
         console, wires = Console(), _read_wires(self, self.latency)
         with use_shared_bar(console, f"inspect {self.log}"):
             known = self.log, self.vehicle, self.mapping or ()
-            suite = inspect_file(*known, wires, figures=self.html is not None)
+            suite = inspect_file(*known, wires, figures=_has_figures(self.html))
         write_output(console, [suite], {"html": self.html, "json": None, "parquet": None})
         if suite.verdict.startswith("Do not"):
             raise Exit(1)

@@ -1,8 +1,10 @@
 """Commands of learned policies: train, distill, enjoy, export."""
 
 import json
+import shlex
 import shutil
-from dataclasses import asdict, fields
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -93,6 +95,9 @@ class _Enjoy:
     trust: bool
 
     def run(self) -> None:
+        from ..report.film import check_film
+
+        check_film(self.video)
         if self.card:
             refuse_unused_options(self, "policy env trust card", "--card")
         if not self.policy.endswith(".zip"):
@@ -109,11 +114,10 @@ class _Enjoy:
         """Drive the policy of a name or a path."""
         from ...agents.learned.policy import load_policy
         from ...agents.rollout import rollout
-        from ..report.film import FilmDriver, check_film, write_film
+        from ..report.film import FilmDriver, write_film
         from ..studies.policies import evaluate_policy
 
         console, options = Console(), {"env_id": self.env, "scenario": self.scenario}
-        check_film(self.video)
         if self.card:
             _show_card(console, load_policy(path))
             return
@@ -308,9 +312,15 @@ class _Train:
             record = RunRecord(int(task.settings["n_timesteps"]), RunOptions.eval_freq)
         steps = record.steps if self.steps is None else self.steps
         eval_freq = record.eval_freq if self.eval_freq is None else self.eval_freq
-        command = get_command_line()
         if resume:
-            command = f"{record.command}; {command}"
+            words = ["sideslip", "train", "--resume", "--out", folder.name, "--steps", str(steps)]
+            command = f"{record.command}; {shlex.join(words)}"
+        else:
+            names = ("conf_file", "trained_agent", "varied")
+            more = {"eval_freq": eval_freq} | {name: getattr(self, name) for name in names}
+            more |= {"out": out.name if out else None}
+            named = replace(task, scenarios=[]) if varied else task
+            command = shlex.join(_make_command(named, steps, more))
         console = Console()
         with use_shared_bar(console if self.progress else None, "train", "steps", steps) as bar:
             project, show = self.wandb_project_name if self.track else "", partial(_show, bar)
@@ -357,6 +367,24 @@ def _show(bar: Bar, now: "EvalCallback") -> None:
     else:
         text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
     bar.update(bar.task_ids[0], completed=now.model.num_timesteps, description=text)
+
+
+def _make_command(
+    task: "TrainingTask", steps: int, more: Mapping[str, object] | None = None
+) -> list[str]:
+    """Make the words of the command that trains a task from the start."""
+    words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
+    words += ["--estimator", task.estimator] if task.estimator else []
+    option_groups = {"--estimator-option": task.estimator_options, "--option": task.env_options}
+    for option, values in option_groups.items():
+        for name, value in values.items():
+            words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    words += [word for item in task.scenarios for word in ("--scenarios", str(item))]
+    words += [word for item in task.reads for word in ("--reads", item)]
+    numbers = {name: getattr(task, name) for name in ("seed", "num_envs", "n_eval_envs")}
+    rest = {"steps": steps} | numbers | {name: x for name, x in (more or {}).items() if x}
+    options = {f"--{name.replace('_', '-')}": str(value) for name, value in rest.items()}
+    return words + [word for pair in options.items() for word in pair]
 
 
 def _choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Path | None) -> Path:

@@ -1,5 +1,6 @@
 """`sideslip tune`, of estimators and controllers, and `calibrate`, of the clairvoyant's costs."""
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,9 @@ from .common import get_command_line, handle_interrupt, print_written
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 tune_app = Typer(no_args_is_help=True)
+
+_RECORDED = ("scenario", "env", "target", "option", "search", "noise", "sampler")
+_ALWAYS_RECORDED = ("trials", "seeds")
 
 
 @tune_app.callback()
@@ -74,7 +78,13 @@ class _TuneEstimator:
         console, where = Console(), (self.storage or STORAGE, self.sampler, self.seed, self.jobs)
         suite, result = run(task, SearchOptions(self.trials, *where, console), self.test_seeds)
         print_suite(console, suite)
-        made = make_entry(task, result, get_command_line(), self.note)
+        words = ["sideslip", "tune", "estimator", self.name]
+        for name in (*_RECORDED, *_ALWAYS_RECORDED, "seed"):
+            value = getattr(self, name)
+            if name in _ALWAYS_RECORDED or value != getattr(type(self), name, None):
+                values = value if isinstance(value, list) else [value]
+                words += [str(word) for item in values for word in (f"--{name}", item)]
+        made = make_entry(task, result, shlex.join(words), self.note)
         for path in files:
             update(path, made)
             print_written(console, path)

@@ -1,1 +1,1 @@
-"""The matrix of estimators and controllers: tasks, entries, runs, scores, report, calibration."""
+"""The matrix of estimators and controllers: tasks, entries, runs, scores, tables, calibration."""

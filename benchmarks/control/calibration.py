@@ -127,7 +127,8 @@ def calibrate(
     with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
         import casadi  # noqa: F401
         import osqp  # noqa: F401
-    part = path.with_name(f".{path.name}.{hash_sources()[:12]}")
+    question = hash_sources().encode() + TASKS_FILE.read_bytes() + Path(__file__).read_bytes()
+    part = path.with_name(f".{path.name}.{hashlib.sha256(question).hexdigest()[:12]}")
     finished = _read_calibration(part) if part.exists() else {}
     for i, task in enumerate(tasks, 1):
         seeds = _derive_seeds(task, count)
@@ -137,10 +138,9 @@ def calibrate(
             made: dict[str, Any] = task.record | {"world_version": WORLD_VERSION}
             finished[task] = CalibrationRecord(**made, command=command, episodes=episodes)
             _update(part, [finished[task]])
-    records = [finished[task] for task in tasks]
-    _update(path, records)
+    _update(path, list(finished.values()))  # those of a stopped run too
     part.unlink(missing_ok=True)
-    return records
+    return [finished[task] for task in tasks]
 
 
 def _read_calibration(

@@ -220,7 +220,8 @@ def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
         path: File.
         rows: Rows of a run's suites.
     """
-    from pandas import DataFrame
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    with atomic_file(path) as file:
-        DataFrame(list(rows)).to_parquet(file, index=False)
+    with atomic_file(path) as file:  # pandas would write NaN as null
+        pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), file)

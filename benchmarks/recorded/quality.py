@@ -1,4 +1,4 @@
-"""Contradictory columns, noise and a late GPS in a drive; intervals are jackknives over blocks."""
+"""Columns of a drive that contradict each other."""
 
 import math
 from collections.abc import Sequence

@@ -1,1 +1,1 @@
-"""One HTML file and its figures, heat maps, colours and tracks."""
+"""One HTML file and its figures, colours and films."""

@@ -85,26 +85,19 @@ def draw_time_series(
     return _finish(_sort_facts(figure), "time / s", unit_label, 380, hovermode="x unified")
 
 
-def draw_curves(
-    x: Array, series: Mapping[str, Array | tuple[Array, Array, Array]], x_label: str, y_label: str
-) -> go.Figure:
+def draw_curves(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> go.Figure:
     """Draw lines with dots.
 
     Args:
         x: Places of the dots, shape (n,).
-        series: Values by name, shape (n,), or (value, low, high) for whiskers.
+        series: Values by name, shape (n,).
         x_label: Quantity and unit of `x`.
         y_label: Quantity and unit of the values.
     """
     figure = go.Figure()
     for name, pen in _choose_line_styles(series).items():
-        line = series[name]
-        value, *bounds = line if isinstance(line, tuple) else (line,)
-        trace = _make_line(name, np.asarray(x, float), np.asarray(value, float), *pen)
+        trace = _make_line(name, np.asarray(x, float), np.asarray(series[name], float), *pen)
         trace.mode = "lines+markers"
-        if bounds:
-            ends = {"array": bounds[1] - value, "arrayminus": value - bounds[0], "symmetric": False}
-            trace.error_y = {"type": "data", "color": pen[0], "thickness": 1, "width": 3, **ends}
         figure.add_trace(trace)
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 

@@ -204,8 +204,7 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
     if suite.headlines:
         lines = "\n".join(f"<li>{_mark_code(line)}</li>" for line in suite.headlines)
         blocks.append(f'<ul class="verdict">\n{lines}\n</ul>')
-    answers = sorted(suite.answers[opened:], key=lambda item: bool(item[1].layout.meta))
-    pictures = [_format_figure(*item) for item in answers]  # the wide ones below
+    pictures = [_format_figure(*item) for item in suite.answers[opened:]]
     pictures += [_format_explorer(item) for item in suite.explorers]
     if pictures:
         blocks.append('<div class="pictures">\n' + "\n".join(pictures) + "\n</div>")
@@ -220,10 +219,9 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
 
 
 def _format_figure(title: str, figure: "Figure", caption: str) -> str:
-    """Format a figure; its layout's meta is "wide", or "scroll" to keep its width on phones."""
-    kind = figure.layout.meta or ""
+    """Format a figure with its title and caption."""
     return (
-        f'<figure class="{kind}">\n<h3>{escape(title)}</h3>\n<div class="frame">'
+        f'<figure>\n<h3>{escape(title)}</h3>\n<div class="frame">'
         f'<div class="plot" role="img" aria-label="{escape(title)}"></div></div>\n'
         f"{_format_data('figure', _encode_figure(figure))}\n"
         f"<figcaption>{_mark_code(caption)}</figcaption>\n</figure>"

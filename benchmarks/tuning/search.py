@@ -107,7 +107,10 @@ def run_study(
                 else:
                     study.tell(trial, value)
             done = _list_finished(study, ranges)
-            best = min((x.value for x in done if x.value is not None), default=math.inf)
+            values = (
+                x.value for x in done if x.state is TrialState.COMPLETE and x.value is not None
+            )
+            best = min(values, default=math.inf)
             bar.update(shown, completed=len(done), description=f"best {best:.4g}")
     return done
 

@@ -68,12 +68,19 @@ def get_ptx(
     key = json.dumps([constants, real.__name__, capability, versions])
     path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()}.ptx" if folder else None
     if path and (data := kernel_cache.read_trusted(path)):
-        return data.decode()
+        digest, _, text = data.partition(b"\n")
+        if digest == _hash_text(text):  # else the file is not whole
+            return text.decode()
     ptx = _compile_ptx(constants, real, capability)
     if path:
         with contextlib.suppress(OSError), replace_file(path) as file:
-            file.write(ptx.encode())
+            file.write(_hash_text(ptx.encode()) + b"\n" + ptx.encode())
     return ptx
+
+
+def _hash_text(text: bytes) -> bytes:
+    """Make the first line of a file: a comment of PTX with its text's hash."""
+    return f"// {hashlib.sha256(text).hexdigest()}".encode()
 
 
 def _compile_ptx(

@@ -323,12 +323,13 @@ class DeviceVectorEnv(TensorVectorEnv):
     ) -> _Capacities:
         """Extend the slow sensors' capacities to what these configs need, which are checked."""
         unique = list({id(config): config for config in configs}.values())
+        for scenario in (config.scenario for config in unique):
+            if scenario.steering in ("trace", "wander"):
+                text = f"{scenario.name!r}: no {scenario.steering} is driven on a device"
+                raise ValueError(text)
         self._check_plants(unique)
         extended = dict(capacities)
         for config in unique:
-            if config.scenario.steering in ("trace", "wander"):
-                label = f"{config.scenario.name!r}: no {config.scenario.steering}"
-                raise ValueError(f"{label} is driven on a device")
             for i, capacity in extended.items():
                 link = read(config.start.params, P.slow[i])
                 frames, copies = -int(-self.control_period // link.period), 1 + (link.duplicate > 0)

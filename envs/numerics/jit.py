@@ -43,12 +43,15 @@ def _load_compiler() -> Callable[..., object] | None:
     """The maker of our compiler's kernels; None for plain numba, on request or by its version."""
     if os.environ.get(_STOCK):
         reason = f"{_STOCK} is set"
-    elif numba.__version__.startswith(f"{_SUPPORTED}."):
-        from .compiler import make_kernel
-
-        return make_kernel
-    else:
+    elif not numba.__version__.startswith(f"{_SUPPORTED}."):
         reason = f"our compiler is made for {_SUPPORTED}"
+    else:
+        try:
+            from .compiler import make_kernel
+
+            return make_kernel
+        except (ImportError, AttributeError) as error:  # a private name that moved
+            reason = f"our compiler cannot use it: {error}"
     text = "compiles by itself: longer, in every process, and for the same numbers"
     report_once("stock", f"numba {numba.__version__} {text} ({reason})")
     return None

@@ -224,7 +224,11 @@ def _read_can(path: Path, reader: str, is_wanted: Callable[[str], bool], dbc: st
     absent: dict[str, set[Any]] = {}  # values that say there is none, by label
     for label, (message, signal) in _choose_signals(database, is_wanted).items():
         key = message.frame_id, message.is_extended_frame
-        messages.setdefault(key, (message, {}))[1][signal.name] = label
+        known, wanted = messages.setdefault(key, (message, {}))
+        if known is not message:
+            text = f"{known.name} and {message.name} have one id, 0x{message.frame_id:x}"
+            raise ValueError(f"{dbc}: {text}")
+        wanted[signal.name] = label
         choices, scale = signal.choices or {}, signal.conversion.raw_to_scaled
         raws = [raw for raw, text in choices.items() if _NO_VALUE.search(str(text))]
         absent[label] = {scale(raw, decode_choices=False) for raw in raws}

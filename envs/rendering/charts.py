@@ -5,7 +5,7 @@ motor torques and wind. The charts show truth, references and estimates with the
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,8 +47,9 @@ class _Strip(NamedTuple):
 
 
 def _make_strips(
-    truth: Array, estimates: dict[str, Array], ghosts: list[Array], max_moment: float, turns: bool
-) -> list[_Strip]:
+    truth: Array, estimates: dict[str, Array], shades: dict[str, str], ghosts: list[Array],
+    max_moment: float, turns: bool,
+) -> list[_Strip]:  # fmt: skip
     """Make the charts of sideslip angle, yaw rate (turns: with a reference) and yaw moment."""
     t, point = truth[:, TRACE_POINT.t], TRACE_POINT
 
@@ -61,7 +62,7 @@ def _make_strips(
     slip = make_lines(point.beta, reference=point.beta_ref)
     for name, columns in estimates.items():
         hat, std = _DEGREES * columns.T
-        slip.append(_ChartLine(t, hat, find_colour(name), deviation=std))
+        slip.append(_ChartLine(t, hat, shades[name], deviation=std))
     rate = make_lines(point.gamma, reference=point.gamma_ref if turns else 0)
     return [
         _Strip("sideslip angle / deg", 1.0, 1.6, slip),
@@ -135,6 +136,7 @@ class _SlipAngles(NamedTuple):
     beta: float
     reference: float
     estimates: dict[str, float]  # by label
+    shades: dict[str, str]  # their colours
 
 
 def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAngles) -> None:
@@ -201,7 +203,7 @@ def _draw_directions(canvas: Canvas, centre: tuple[float, float], slips: _SlipAn
     canvas.draw_line(make_ray(0.0, 138.0), "#C3C8CE", 1.0)
     canvas.draw_line(make_ray(slips.reference, 138.0), INK, 1.0, (4.0, 3.0))
     for label, angle in slips.estimates.items():
-        canvas.draw_line(make_ray(angle, 132.0), find_colour(label), 2.0)
+        canvas.draw_line(make_ray(angle, 132.0), slips.shades[label], 2.0)
     canvas.draw_arrow(centre, make_ray(slips.beta, 122.0)[1], INK, 3.0)
     canvas.draw_disc(centre, 4.0, INK)
     canvas.draw_disc(centre, 1.8, "#FFFFFF")
@@ -227,6 +229,7 @@ def draw_picture(
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
     first = max(now[TRACE_POINT.t] - span, 0.0)
     truth, estimates = trace.select_since(first)
+    shades = _choose_shades(estimates)
     scene = road.make_car_scene(shot)
     ghost_cars = [
         road.CarTrack(road.make_car_scene(ghost), ghost.trace.select_since(first)[0], GREY, label)
@@ -238,12 +241,13 @@ def draw_picture(
         driven_car = road.CarTrack(scene, truth, road.BLUE, name if ghosts else "")
         road.draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
     newest = {label: float(x[-1, 0]) for label, x in estimates.items() if np.isfinite(x[-1, 0])}
-    slips = _SlipAngles(now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], newest)
+    slips = _SlipAngles(now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], newest, shades)
     _draw_closeup(canvas, _CLOSEUP, scene, slips)
     turns, scale = int(switches[FLAGS.reference]) != ZERO_SLIP, float(p[P.task.yaw_scale])
-    strips = _make_strips(truth, estimates, [x.truth for x in ghost_cars], scale, turns)
+    others = [x.truth for x in ghost_cars]
+    strips = _make_strips(truth, estimates, shades, others, scale, turns)
     _draw_strips(canvas, _STRIPS, strips, first, span)
-    _draw_legend(canvas, name, [item for item, _ in ghosts], list(estimates))
+    _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
     failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
     _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
     picture = canvas.finish()
@@ -253,10 +257,20 @@ def draw_picture(
     return picture
 
 
-def _draw_legend(canvas: Canvas, name: str, ghosts: list[str], estimates: list[str]) -> None:
+def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
+    """Choose a colour for each estimator: its own unless another has it."""
+    shades: dict[str, str] = {}
+    for label in labels:
+        colour = find_colour(label)
+        free = (choice for choice in (colour, *PALETTE) if choice not in shades.values())
+        shades[label] = next(free, colour)
+    return shades
+
+
+def _draw_legend(canvas: Canvas, name: str, ghosts: list[str], shades: dict[str, str]) -> None:
     entries = [(name, INK, False), ("reference", INK, True)]
     entries += [(ghost, GREY, False) for ghost in ghosts]
-    entries += [(f"{label} ± 1 std", find_colour(label), False) for label in estimates]
+    entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
         ends, width = [(x, 272.0), (x + 20.0, 272.0)], 1.5 if dashed else 2.5

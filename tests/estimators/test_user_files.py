@@ -77,6 +77,7 @@ BAD = {
     "no class": ("GAIN = 3\n", "", "say what of .*my.py is meant, .* it defines no class"),
     "nothing": ("", "", "it defines no class"),
     "two classes": (AGENT + FILTER, "", r"as .*my.py:NAME; it defines Still, Filter"),
+    "in a comment": (AGENT + "# Other\n", ":Other", "my.py has no 'Other'; it defines Still"),
     "another class": (AGENT, ":Stil", "my.py has no 'Stil'; it defines Still"),
     "no Python": ("class Still:\n    def :\n", "", "my.py, line 2: invalid syntax"),
     "null bytes": ("\0", "", "my.py"),

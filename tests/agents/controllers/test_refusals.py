@@ -68,6 +68,7 @@ VALUES: list[Refusal] = [
     ("two-dof", "slip", {"pole": -1.0}, "pole is a positive number"),
     ("lqr", "slip", {"vehicle": "lorry"}, "lorry"),
     ("pid", "slip", {}, "unknown agent 'pid'"),
+    ("nmpc", "slip", {"horizn": 0.4}, "unknown option 'horizn'; did you mean 'horizon'"),
 ]
 
 

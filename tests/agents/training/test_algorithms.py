@@ -182,7 +182,7 @@ MEANT = "default: {policy: MlpPolicy, n_timesteps: 9, n_envs: 1"
         ("default: {n_envs: 1}", "default: no n_timesteps, policy"),
         ("default: 3", "settings are {name: value}, got 3"),
         ("other: {n_envs: 1}", f"has no settings of {VISION}, and no 'default'"),
-        ("[1]", "is no YAML of settings: the file is a mapping, got"),
+        ("[1]", "is no YAML of settings: {id: {name: value}} is expected"),
         ("{", "is no YAML of settings: while parsing"),
     ],
 )

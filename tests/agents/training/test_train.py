@@ -215,7 +215,7 @@ def test_a_tracked_training_hands_over_what_is_logged(
     own.finish.assert_called_once_with()
     assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(ModuleNotFoundError, match="a log there needs wandb: pip install wandb"):
+    with pytest.raises(ModuleNotFoundError, match="a log for wandb needs it: pip install wandb"):
         trainer.Trainer(TINY, 9, tmp_path / "other", run_options=RunOptions(track="cars"))
     assert not (tmp_path / "other").exists()
 

@@ -13,7 +13,10 @@ from sideslip.agents.learned.policy import load_policy
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import CURVE, POLICY
+from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.cli import policies as train_command
+from sideslip.benchmarks.cli.options import parse_options
+from sideslip.benchmarks.cli.policies import _make_command
 from sideslip.benchmarks.studies import policies as enjoy
 from sideslip.benchmarks.studies.policies import _list_tasks
 from tests.benchmarks.conftest import Run
@@ -38,8 +41,11 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert status == 0, err
     assert "best" in out and f"here/{POLICY}" in out and "of none's" in out
     card = load_policy(f"here/{POLICY}").card
-    words = [str(word) for word in (*TINY, "--steps", 256, "--out", "here")]
-    assert shlex.split(card.command) == ["sideslip", "train", *words]
+    assert shlex.split(card.command)[1:] == [
+        "train", "--algo", "ppo", "--env", "sideslip/YawVision-v1",
+        "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
+        "--n-eval-envs", "4", "--eval-freq", "250000", "--out", "here",
+    ]  # fmt: skip
     costs = card.evaluation["cost"]
     assert card.evaluation["salt"] and len(costs) == 3
     assert f"policy {costs['policy']['mean']:.4g}" in out
@@ -98,8 +104,13 @@ def test_without_the_extra_the_command_names_it(
     assert missing != "torch" or err.startswith("sideslip: loading PyTorch")
 
 
-def test_options_without_an_estimator_are_refused(run: Run) -> None:
-    status, _, err = run("--estimator-option", 'outputs=["beta", "F_d"]')
+def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
+    told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
+    task = TrainingTask(estimator="exact-kf", estimator_options=told)
+    words = _make_command(task, 10)
+    found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
+    assert parse_options(found) == told
+    status, _, err = run("--estimator-option", found[0])
     assert status == 2 and "options of an estimator need an estimator" in err
 
 
@@ -144,7 +155,8 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     task = trainer.read_training("on").task
     known = [each.scenario for each in _list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
-    assert load_policy(f"on/{POLICY}").card.command.startswith("sideslip train -i distill-coms-yaw")
+    words = shlex.split(load_policy(f"on/{POLICY}").card.command)[2:]
+    assert words[-4:] == ["--trained-agent", "distill-coms-yaw", "--out", "on"]
     status, _, err = run("-i", "distill-coms-yaw", "--algo", "sac", "--out", "off")
     assert status == 2 and "sac begins with a zip, not with policy distill-coms-yaw" in err
     status, _, err = run("-i", "distill-coms", "--out", "off")

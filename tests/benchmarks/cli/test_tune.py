@@ -34,7 +34,9 @@ def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -
     status, out, _ = run(*arguments, "--note", "a remark")
     assert status == 0 and "2 test seeds" in out and "q_beta" in out
     (entry,) = tomllib.loads((tmp_path / "found.toml").read_text())["tuning"]
-    assert entry["command"].startswith(f"sideslip tune estimator bicycle-kf --scenario {SCENARIO}")
+    assert entry["command"] == (
+        f"sideslip tune estimator bicycle-kf --scenario {SCENARIO} --trials 8 --seeds 1"
+    )
     assert set(entry["q"]) == {"beta", "gamma"} and entry["note"] == "a remark"
     assert (tmp_path / "sideslip-tune.db").exists()
     run(*arguments)

@@ -64,9 +64,12 @@ def test_seeds_are_its_own_and_follow_the_world(monkeypatch: pytest.MonkeyPatch)
     assert not set(many) & set(_derive_seeds(GUST))
 
 
+@pytest.mark.parametrize("again", [(GUST, SINE), (SINE,)])
 def test_a_stopped_run_goes_on(
-    asked: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    again: tuple[ControlTask, ...], asked: list[int], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Another run, of fewer tasks too, keeps what the stopped one finished."""
     path, seek = tmp_path / "made.json", calibration._solve
 
     def stopping(case: tuple[ControlTask, int]) -> ClairvoyantEpisode:
@@ -79,10 +82,11 @@ def test_a_stopped_run_goes_on(
         solve(tmp_path, GUST, SINE)
     assert not path.exists() and asked == _derive_seeds(GUST, 2)
     monkeypatch.setattr(calibration, "_solve", seek)
-    first, second = solve(tmp_path, GUST, SINE)
+    records = solve(tmp_path, *again)
     assert asked == _derive_seeds(GUST, 2) + _derive_seeds(SINE, 2)  # each once
-    assert first.costs.tolist() == [seed % 10 for seed in _derive_seeds(GUST, 2)]
-    assert _read_calibration(path) == {GUST: first, SINE: second}
+    written = _read_calibration(path)
+    assert written[GUST].costs.tolist() == [seed % 10 for seed in _derive_seeds(GUST, 2)]
+    assert written.keys() == {GUST, SINE} and [written[task] for task in again] == records
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(ValueError, match="an interval needs two seeds or more, got 1"):
         calibrate(path, [GUST], 1)

@@ -251,8 +251,9 @@ def still() -> CarScene:
 
 
 def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
-    canvas = Noted()
-    _draw_closeup(canvas, BOX, scene, _SlipAngles(beta, 0.0, {"exact-kf": estimate}))
+    canvas, name = Noted(), "exact-kf"
+    slips = _SlipAngles(beta, 0.0, {name: estimate}, {name: find_colour(name)})
+    _draw_closeup(canvas, BOX, scene, slips)
     return canvas
 
 

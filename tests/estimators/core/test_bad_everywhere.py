@@ -86,6 +86,8 @@ def test_every_filter_refuses_arrays_of_another_shape(name: Any) -> None:
             filter_.step(np.zeros((1, FAST_WIDTH)), packets)
     with pytest.raises(ValueError, match=r"packets have shape \(k, 11\), got \(1, 10\)"):
         filter_.update(np.zeros(PACKET_WIDTH - 1))
+    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 12\), got \(1, 3, 4\)"):
+        filter_.predict(np.zeros((3, 4)))  # twelve numbers, but no row
     with pytest.raises(ValueError):
         filter_.predict(["fast"] * FAST_WIDTH)
     assert filter_.get_state().tobytes() == before.tobytes()
