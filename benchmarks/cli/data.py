@@ -97,7 +97,9 @@ class _Replay:
         if is_nmea(log):
             from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
 
-            used = "log html json parquet plot kml"
+            used = "log html json parquet plot kml vehicle estimator"  # as for a batch of logs
+            if (self.vehicle, self.estimator) != (type(self).vehicle, type(self).estimator):
+                console.print("A receiver's log says nothing of --vehicle and --estimator.")
             refuse_unused_options(self, used, f"a receiver's log ({log})")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log)

@@ -20,7 +20,7 @@ from ...envs.io import atomic_file
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.recordings.dialect import to_metres
-from ...envs.recordings.nmea import Counts, Epoch
+from ...envs.recordings.nmea import HOUR, Counts, Epoch
 from ...envs.recordings.sources import read_nmea
 from ...envs.sensors.slow import COURSE_SPEED, HDOP_LAWS
 from ...envs.validation import Mask
@@ -228,8 +228,12 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     """
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
+    step = np.diff(track.t)
+    set_anew = np.abs(step) >= HOUR  # a clock that was set, or a pause
+    parts = f" in {set_anew.sum() + 1} parts" if set_anew.any() else ""
     text = (
-        f"{len(track.t)} fixes; HDOP {middle:.1f}, from {low:.1f} to {high:.1f} in 90 % of them. "
+        f"{step[~set_anew].sum():.0f} s with {len(track.t)} fixes{parts}; HDOP {middle:.1f}, from "
+        f"{low:.1f} to {high:.1f} in 90 % of them. "
         "A filter with a constant rate, disturbed by white noise, predicts each fix from those "
         "before, where the car moves. Its two noises are those of maximum likelihood on the first "
         "half of the log; all numbers are of the second."

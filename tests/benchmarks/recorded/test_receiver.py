@@ -162,4 +162,7 @@ def test_the_recordings_are_answered(name: str) -> None:
 def test_options_of_a_drive_with_a_gyro_are_refused(tmp_path: Path, run: Run) -> None:
     path = log_of(drive(0.0, 200), tmp_path / "a.nmea")
     status, _, error = run("replay", path, "--until", 3, "--gyro-bias", 4, "--vehicle", "coms")
-    assert status == 2 and "gyro_bias, until, vehicle: of no use to a receiver's log" in error
+    assert status == 2 and "gyro_bias, until: of no use to a receiver's log" in error
+    status, out, error = run("replay", path, "--vehicle", "coms", "--estimator", "joint")
+    assert status == 0 and "says nothing of --vehicle and --estimator" in out, error
+    assert "199 s with 200 fixes" in out
