@@ -122,7 +122,8 @@ class RewardScale:
         """
         for i in np.flatnonzero(rows).tolist():
             self._drive[i] += 1
-            self.now[i] = self._drive_scales[i][: self._drive[i] + 1][-1]
+            scales = self._drive_scales[i]
+            self.now[i] = scales[min(self._drive[i], len(scales) - 1)]
 
 
 class RewardScaleWrapper(VecEnvWrapper):

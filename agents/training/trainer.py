@@ -124,6 +124,7 @@ class _WarmStart(NamedTuple):
     parameters: dict[str, Any]  # as of `get_parameters`; of a policy the actor's alone
     scaling: StandardisedArguments  # of the model's observations
     variables: dict[str, Any] = {}  # noqa: RUF012  a zip's tensors of no module
+    is_whole: bool = False  # whether it is a zip, which has all tensors of a model
 
     @classmethod
     def from_zip(cls, file: Path, task: TrainingTask, trust: bool) -> "_WarmStart":
@@ -144,7 +145,7 @@ class _WarmStart(NamedTuple):
             mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
             scales = get_scales(layout) if _is_scaled(file, layout) else np.ones(len(layout))
             numbers = (mean * scales).tolist(), (scale / scales).tolist(), clip, None
-        return cls(str(file), parameters, StandardisedArguments(*numbers), variables or {})
+        return cls(str(file), parameters, StandardisedArguments(*numbers), variables or {}, True)
 
     @classmethod
     def from_policy(cls, policy: Policy, task: TrainingTask) -> "_WarmStart":
@@ -175,7 +176,7 @@ class _WarmStart(NamedTuple):
         """Load the tensors into a model; ValueError where it has other ones."""
         before = model.get_parameters()
         policy = before["policy"]
-        if len(self.parameters) > 1:  # a zip, which from elsewhere has its extractor outside
+        if self.is_whole:  # a zip, which from elsewhere has its extractor outside
             policy = {name: x for name, x in policy.items() if "features_extractor." in name}
         parameters = before | self.parameters | {"policy": policy | self.parameters["policy"]}
         try:

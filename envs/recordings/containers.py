@@ -346,7 +346,8 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
                 decoders[connection.id] = _make_decoder(connection)
             message = decoders[connection.id](data)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
-            captured = (stamp and stamp.sec * 10**9 + stamp.nanosec) or logged
+            captured = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+            captured = captured or logged  # a stamp of zero was never set
             for name in fields[connection.topic]:
                 channel = channels[f"{connection.topic}:{name}"]
                 channel.values.append(_read_field(message, connection.topic, name))
