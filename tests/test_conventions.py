@@ -133,13 +133,22 @@ def list_options(trees: Trees) -> set[str]:
     return texts | {text for each in arguments if "help=" in (text := ast.unparse(each))}
 
 
+def list_entries(text: str | None) -> set[str]:
+    """The names under `Args` of a docstring."""
+    entries = (text or "").partition("Args:\n")[2]
+    return set(re.findall(r"^ {4,}\*{0,2}(\w+)(?: \(.*?\))?:", entries, re.M))
+
+
 def count_undocumented_arguments(trees: Trees) -> int:
     """Arguments of public functions, methods and constructors without an entry under `Args`.
 
-    An option of a command has its help text instead.
+    An option of a command has its help text instead, and what all functions of a room share stands
+    under `Args` of its face.
     """
     count, options = 0, list_options(trees)
-    for tree in trees.values():
+    for name, tree in trees.items():
+        face = trees.get(f"{name.rpartition('/')[0]}/__init__.py", ast.parse(""))
+        shared = list_entries(ast.get_docstring(face))
         public = [(node, "") for node in tree.body]
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
@@ -149,8 +158,7 @@ def count_undocumented_arguments(trees: Trees) -> int:
                 node.name == "__init__" or not node.name.startswith("_")
             ):
                 text = above if node.name == "__init__" else ast.get_docstring(node) or ""
-                entries = text.partition("Args:\n")[2]
-                documented = set(re.findall(r"^ {4,}\*{0,2}(\w+)(?: \(.*?\))?:", entries, re.M))
+                documented = shared | list_entries(text)
                 documented |= {
                     each.arg
                     for each in ast.walk(node)
@@ -202,7 +210,7 @@ def compute_mean(a, b=0, *rest, **more):
     found = a
 def compute_all(a, b, c, d, e, f, g, h): '''Compute it.'''
 def x_of(a): pass
-def driven(): pass
+def driven(shared): pass
 def lqr(): pass
 def _hidden_at(each): pass
 def make_car(out: Annotated[str, Option(help="The file.")], into: Annotated[str, Option()]): pass
@@ -247,5 +255,7 @@ def test_no_room_outgrows_its_budget(trees: Trees) -> None:
 @pytest.mark.parametrize("name", COUNTS)
 def test_a_count_finds_what_it_is_for(name: str) -> None:
     tree = ast.parse(PLANTED)
-    trees = {f"room/{i}.py": ast.parse("") for i in range(MOST_FILES)} | {"room/planted.py": tree}
+    face = ast.parse("'''A room.\n\nArgs:\n    shared: By all.\n'''")
+    trees = {f"room/{i}.py": ast.parse("") for i in range(MOST_FILES)}
+    trees |= {"room/planted.py": tree, "room/__init__.py": face}
     assert COUNTS[name](trees) == EXPECTED[name]

@@ -15,7 +15,8 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import PACKET, Array, Log
 from ..core.filter import run_tick
-from ..core.innovation import IGNORE, NONE
+from ..core.intersample import NONE
+from ..core.late_samples import IGNORE
 from ..core.model import BETA, LATERAL
 from ..core.packets import process_packet
 from ..core.predict import read_fast_row

@@ -2,5 +2,21 @@
 
 `record` names every number of a filter, `filter` takes rows and packets. `predict` reads a row and
 predicts, with `model` as the transition; `packets` judges what arrives, `update` corrects by it.
-`covariance` and `innovation` have the Kalman filter's equations.
+`late_samples` and `intersample` are the rules for samples that come late and for the time between
+them. `covariance` and `innovation` have the Kalman filter's equations.
+
+Args:
+    f: Memory of a filter, or a block of lanes where a function takes one.
+    gains: Tables of gains, shape (cells, rows, columns).
+    layers: Memory of an estimator: (1,), or (2,), of which the second measures the first's states.
+    s: Index of a slow sensor.
+    i: Index of a row of its measurement, or of a fast measurement.
+    row: Row of C, shape (n,).
+    captured: Captured tick of a sample.
+    target: What a sample measures: its first clone, or DIRECT, DROPPED, PREDICTED, WEIGHED.
+    residual: Measurement minus its prediction.
+    fast_row: Fast row, shape (FAST_WIDTH,).
+    packet: Packet, shape (PACKET_WIDTH,).
+    speed: Speed (m/s).
+    u: Inputs of a step, shape (N_INPUTS,).
 """

@@ -37,13 +37,7 @@ def dot(row: Vector, v: Vector, n: int) -> Scalar:
 
 @jit
 def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
-    """Predict a row of a slow sensor: C x and, over the ground, the road's heading.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-    """
+    """Predict a row of a slow sensor: C x and, over the ground, the road's heading."""
     value = dot(f.C[s, i], f.x, f.n)
     return value + f.road_turn if f.ground[s, i] == 1 else value
 
@@ -97,13 +91,28 @@ def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
 
 
 @jit
+def apply_transition(f: FilterRecord, v: Vector) -> None:
+    """Predict v <- F v with F = diag(own_decay) + G.
+
+    Args:
+        f: Memory of the filter, or a block of lanes.
+        v: Vector of states, shape (n,) or longer.
+    """
+    n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
+    for j in range(0, n, step):
+        total = load8(f.own_decay, j) * load8(v, j)
+        for k in range(n if j < f.dense else 0):  # the states behind decay by themselves
+            total = total + load_element(v, k) * load8(f.GT, k, j)
+        store8(new, total, 0, j)
+    for j in range(0, n, step):
+        store8(v, load8(new, 0, j), j)
+
+
+@jit
 def predict_covariance(f: FilterRecord) -> None:
     """Predict P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones.
 
     The rows of the dense states are computed by fours, what stands above the diagonal counts.
-
-    Args:
-        f: Memory of the filter.
     """
     n, dense, N = f.n, f.dense, f.total
     P, Q, GT, keep, step = f.P, f.Q, f.GT, f.own_decay, vector_width(f.P)
@@ -171,12 +180,7 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
 @jit
 def project(f: FilterRecord, row: Vector) -> Scalar:
-    """Compute f.PC = P C^T of a measurement of the states.
-
-    Args:
-        f: Memory of the filter.
-        row: Row of C, shape (n,).
-    """
+    """Compute f.PC = P C^T of a measurement of the states."""
     n, N, P, PC = f.n, f.total, f.P, f.PC
     for j in range(0, N, vector_width(P)):
         total = 0.0
@@ -194,17 +198,10 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
 
 
 @jit
-def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
-    """Compute f.PC = P C^T of a sensor's row.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        first: Clone of its first row, negative where it measures the states.
-    """
-    if first < 0:
+def project_row(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
+    """Compute f.PC = P C^T of a sensor's row."""
+    if target < 0:
         return project(f, f.C[s, i])
     for j in range(f.total):
-        f.PC[j] = f.P[first + i, j]
-    return f.PC[first + i]
+        f.PC[j] = f.P[target + i, j]
+    return f.PC[target + i]

@@ -14,7 +14,8 @@ from ...envs.numerics.functions import sincos, wrap
 from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, sqrt
 from ...envs.record import PACKET
-from .innovation import BUFFER, interpolate_hdop, store_due_captures
+from .innovation import interpolate_hdop
+from .late_samples import store_due_captures
 from .model import BETA, CURVATURE, LATERAL, build_model, is_finite, linearise
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, read_fast_row
@@ -125,12 +126,7 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
 
 @jit
 def run_tick(f: FilterRecord, gains: GainTables) -> None:
-    """Step from the last tick to this one, whose fast row was read.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-    """
+    """Step from the last tick to this one, whose fast row was read."""
     f.tick += 1
     if f.stride > 1:
         for i in range(f.inputs):
@@ -160,8 +156,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
             f.predicted[f.tick % WINDOW, i] = f.x[i]
     if listens:
         correct_fast(f, gains)
-    if f.delay_rule == BUFFER:
-        store_history(f)
+    store_history(f)
     for i in range(f.inputs):
         f.u_sum[i] = 0.0
     f.u_count = 0

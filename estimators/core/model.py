@@ -234,9 +234,6 @@ def discretise(f: FilterRecord) -> None:
 
     Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
-
-    Args:
-        f: Memory of the filter with A, B and its step.
     """
     n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
     E = allocate_scratch(f.A, N_CORE, N_DRIVERS)

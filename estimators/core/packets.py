@@ -10,7 +10,7 @@ import numpy as np
 from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
-from .innovation import BUFFER, DROPPED, find_clone, get_direct, is_duplicate
+from .late_samples import BUFFER, DROPPED, find_target, get_direct, is_duplicate
 from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
 from .predict import advance_state
 from .record import COUNTERS, N_SNAPSHOTS, SNAPSHOT_INTERVAL, WINDOW, FilterRecord, GainTables
@@ -36,11 +36,9 @@ def _copy_moments(n: int, x: Vector, P: Matrix, to_x: Vector, to_P: Matrix) -> N
 
 @jit
 def store_history(f: FilterRecord) -> None:
-    """Store the inputs, fast measurements and model of the present tick.
-
-    Args:
-        f: Memory of the filter.
-    """
+    """Store the inputs, fast measurements and model of the present tick; "buffer" alone."""
+    if f.delay_rule != BUFFER:
+        return
     slot = f.tick % WINDOW
     copy_into(f.u, f.past_u[slot])
     copy_into(f.y, f.past_y[slot])
@@ -159,9 +157,9 @@ def _apply_sample(f: FilterRecord, gains: GainTables, s: int) -> bool:
     """Correct by f.sample, a sound packet, according to its age; return whether it was used."""
     if f.delay_rule == BUFFER:
         return _rewind_update(f, gains, s)
-    first = find_clone(f, s, int(f.sample[PACKET.captured]))
-    is_usable = first != DROPPED  # True where update_filter's is_gated reads it
-    return is_usable and update_filter(f, gains, s, first, is_usable)
+    target = find_target(f, s, int(f.sample[PACKET.captured]))
+    is_usable = target != DROPPED  # True where update_filter's is_gated reads it
+    return is_usable and update_filter(f, gains, s, target, is_usable)
 
 
 @jit
@@ -250,13 +248,7 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 @noinline
 def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
-    """Use a packet that has arrived or queue it for the next step; False: dropped and counted.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet, shape (PACKET_WIDTH,).
-    """
+    """Use a packet that has arrived or queue it for the next step; False: dropped and counted."""
     copy_into(packet, f.sample)
     f.nis = np.nan
     if not _is_valid(f):
@@ -269,12 +261,7 @@ def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
 
 @jit
 def apply_waiting(f: FilterRecord, gains: GainTables) -> None:
-    """Correct by the packets that came since the last step that listened.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-    """
+    """Correct by the packets that came since the last step that listened."""
     for i in range(f.waits):
         copy_into(f.waiting[i], f.sample)
         _apply_sample(f, gains, int(f.sample[PACKET.sensor]))

@@ -5,10 +5,12 @@ import numpy as np
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
-from ...envs.numerics.simd8 import allocate_scratch, load8, store8, vector_width
+from ...envs.numerics.simd8 import load8, store8, vector_width
 from ...envs.record import FAST
-from .covariance import predict_covariance
-from .innovation import BUFFER, LARSEN, MAX_SURPRISE, PSEUDO, note_surprise
+from .covariance import apply_transition, predict_covariance
+from .innovation import MAX_SURPRISE, note_surprise
+from .intersample import predict_error
+from .late_samples import predict_late
 from .model import (
     BETA,
     KINEMATIC,
@@ -19,23 +21,23 @@ from .model import (
     is_finite,
     linearise,
 )
-from .record import COUNTERS, N_CORE, N_SLOW, FilterRecord
+from .record import COUNTERS, N_SLOW, FilterRecord
 
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
 
 
 @jit
-def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
+def compute_signal(fast_row: Vector, column: Vector, factor: Vector) -> Scalar:
     """Compute a signal of a fast row: the sum of two of its columns times their factors.
 
     Args:
-        row: Fast row, shape (FAST_WIDTH,).
+        fast_row: Fast row, shape (FAST_WIDTH,).
         column: Indices of the columns, shape (2,).
         factor: Their factors, shape (2,).
     """
-    return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
+    return load_element(factor, 0) * load_element(fast_row, load_element(column, 0)) + load_element(
         factor, 1
-    ) * load_element(row, load_element(column, 1))
+    ) * load_element(fast_row, load_element(column, 1))
 
 
 @jit
@@ -50,9 +52,9 @@ def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
 
 
 @jit
-def _filter_speed(f: FilterRecord, row: Vector) -> Scalar:
+def _filter_speed(f: FilterRecord, fast_row: Vector) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds (m/s); a bad sample is skipped."""
-    sample = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+    sample = 0.5 * (fast_row[FAST.wheel_left] + fast_row[FAST.wheel_right])
     if not is_finite(sample):
         return f.speed
     if f.model_speed == 0.0:  # no sample yet
@@ -70,31 +72,21 @@ def _find_cell(f: FilterRecord, speed: float) -> int:
 
 
 @jit
-def find_next_cell(f: FilterRecord, row: Vector) -> Scalar:
-    """Find the index of the table of gains that the next row will use.
-
-    Args:
-        f: Memory of the filter.
-        row: That fast row, shape (FAST_WIDTH,).
-    """
+def find_next_cell(f: FilterRecord, fast_row: Vector) -> Scalar:
+    """Find the index of the table of gains that the next row will use."""
     if f.measured == 1:
-        speed = _filter_speed(f, row)
+        speed = _filter_speed(f, fast_row)
         if is_speed_changed(speed, f.model_speed):
             return _find_cell(f, speed)
     return f.cell
 
 
 @jit
-def read_fast_row(f: FilterRecord, row: Vector) -> None:
-    """Read a fast row: inputs (the last finite ones), measurements, speed, perhaps a new model.
-
-    Args:
-        f: Memory of the filter.
-        row: Fast row, shape (FAST_WIDTH,).
-    """
+def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
+    """Read a fast row: inputs (the last finite ones), measurements, speed, perhaps a new model."""
     is_sound = True
     for i in range(f.inputs):
-        f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
+        f.u_new[i] = compute_signal(fast_row, f.u_column[i], f.u_factor[i])
     if f.steer_jump > 0.0:  # a steering angle (the first input) that jumps waits for the next row
         steer = f.u_new[0]
         if absolute(steer - f.steer_before) > f.steer_jump or absolute(steer) > _MAX_STEER:
@@ -110,13 +102,13 @@ def read_fast_row(f: FilterRecord, row: Vector) -> None:
         if f.r_share > 0.0:
             note_surprise(f, 0, MAX_SURPRISE, f.step)
     for i in range(f.fasts):
-        f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
+        f.y[i] = compute_signal(fast_row, f.y_column[i], f.y_factor[i])
     turning, f.speed_before = f.turning, f.model_speed
-    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
-        turning = row[FAST.gyro]
+    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(fast_row[FAST.gyro]):
+        turning = fast_row[FAST.gyro]
     is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
     if f.measured == 1:
-        f.speed = _filter_speed(f, row)
+        f.speed = _filter_speed(f, fast_row)
         if is_speed_changed(f.speed, f.model_speed):
             is_outdated, speed = True, f.speed
             f.cell = _find_cell(f, f.speed)
@@ -125,28 +117,10 @@ def read_fast_row(f: FilterRecord, row: Vector) -> None:
 
 
 @jit
-def _apply_transition(f: FilterRecord, v: Vector) -> None:
-    """Predict v <- F v, F = diag(own_decay) + G, on the states of a vector (n,) or longer."""
-    n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
-    for j in range(0, n, step):
-        total = load8(f.own_decay, j) * load8(v, j)
-        for k in range(n if j < f.dense else 0):  # the states behind decay by themselves
-            total = total + load_element(v, k) * load8(f.GT, k, j)
-        store8(new, total, 0, j)
-    for j in range(0, n, step):
-        store8(v, load8(new, 0, j), j)
-
-
-@jit
 def propagate(f: FilterRecord, u: Vector) -> None:
-    """Predict x <- F x + H u + drift and, without tables of gains, P.
-
-    Args:
-        f: Memory of the filter, or a block of lanes.
-        u: Inputs, shape (N_INPUTS,).
-    """
+    """Predict x <- F x + H u + drift and, without tables of gains, P."""
     step = vector_width(f.P)
-    _apply_transition(f, f.x)
+    apply_transition(f, f.x)
     for j in range(0, f.dense, step):
         total = load8(f.x, j)
         for k in range(f.inputs):
@@ -176,15 +150,10 @@ def _scale_beta(f: FilterRecord) -> None:
 
 @noinline
 def advance_state(f: FilterRecord, u: Vector) -> None:
-    """Predict by the present model, and what else is carried along.
-
-    Args:
-        f: Memory of the filter.
-        u: Inputs of the step, shape (N_INPUTS,).
-    """
+    """Predict by the present model, and what else is carried along."""
     if f.beta_scale != 1.0:
         _scale_beta(f)
-    if f.tyres > 0 and (f.tick % f.linearise_every == 0 or f.delay_rule == BUFFER):
+    if f.tyres > 0 and f.tick % f.linearise_every == 0:
         linearise(f, u[0])
         build_model(f, f.model_speed, f.turning)
         if f.accel_scale_state > 0:  # its column is what a_y predicts, 0 at standstill
@@ -196,23 +165,13 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
                     specific_force += row[k] * f.x[k]
                 row[f.accel_scale_state] = specific_force
     propagate(f, u)
-    if f.intersample_rule == PSEUDO:
-        _apply_transition(f, f.e)
-    if f.periodic == 0 and f.delay_rule == LARSEN:
-        for s in range(N_SLOW):
-            if f.stamp[s, 0] >= 0:
-                for i in range(f.rows[s]):
-                    _apply_transition(f, f.larsen_gain[s, i])
+    predict_error(f)
+    predict_late(f)
 
 
 @jit
 def compute_residual(f: FilterRecord, i: int) -> Scalar:
-    """Compute the residual of a fast measurement.
-
-    Args:
-        f: Memory of the filter, or a block of lanes.
-        i: Index of the measurement.
-    """
+    """Compute the residual of a fast measurement."""
     residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):
         residual = residual - load_element(f.C_fast, i, k) * load_element(f.x, k)

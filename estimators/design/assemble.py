@@ -10,8 +10,9 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW, SLOW_NAMES
 from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ..core import innovation as rule
+from ..core import late_samples as rule
 from ..core import record as size
+from ..core.intersample import DUAL_RATE, NONE, PSEUDO
 from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from . import models
@@ -32,6 +33,8 @@ def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     delay = config.delay
     f.delay_rule = rule.IGNORE if delay in ("literal", "lag") else rule.RULES.index(delay)
+    if delay == "buffer":  # it filters the past anew while f.tick stands still
+        f.linearise_every = 1
     f.total = f.n
     max_frames = 1 if delay == "larsen" else size.N_FRAMES
     for name, sensor in config.sensors.items() if delay in ("clone", "larsen") else ():
@@ -325,7 +328,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
     shared = config.row.intersample == "dual-rate"
-    f.intersample_rule = rule.PSEUDO if pseudo else rule.DUAL_RATE if shared else rule.NONE
+    f.intersample_rule = PSEUDO if pseudo else DUAL_RATE if shared else NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
     f.store_predictions = f.delay_rule in (rule.STORED, rule.CONSTANT)
@@ -353,13 +356,13 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
-    if f.intersample_rule == rule.DUAL_RATE or config.row.gains == "placed":
+    if f.intersample_rule == DUAL_RATE or config.row.gains == "placed":
         return True
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
     if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
         impossible = "its model changes with the yaw rate"
-    elif f.intersample_rule == rule.PSEUDO:
+    elif f.intersample_rule == PSEUDO:
         early = f"a sample must arrive before the next one is captured, got {config.sensors}"
         refusal = "no gains='covariance': it has one constant gain"
         is_refused = config.gains == "covariance"

@@ -11,7 +11,7 @@ from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import describe_unknown
-from ..core.innovation import RULES
+from ..core.late_samples import RULES
 from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition

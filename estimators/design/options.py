@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ...envs.record import FAST, Array
 from ...envs.sensors.link import SlowSensor
-from ..core.innovation import RULES
+from ..core.late_samples import RULES
 from ..filters import FilterDefinition
 from .gains import INVERSES
 from .models import BIASES, MEASUREMENTS, NONLINEAR, STATES, WANDER, FilterModel

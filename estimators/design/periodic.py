@@ -17,17 +17,8 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximu
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.covariance import correct_scalar, project_row
 from ..core.filter import NO_OUTPUTS, StepRecord, advance, reset_filters, run_tick
-from ..core.innovation import (
-    CLONE,
-    CONSTANT,
-    DROPPED,
-    DUAL_RATE,
-    IGNORE,
-    NONE,
-    PSEUDO,
-    STORED,
-    find_clone,
-)
+from ..core.intersample import DUAL_RATE, NONE, PSEUDO
+from ..core.late_samples import CLONE, CONSTANT, DROPPED, IGNORE, STORED, find_target
 from ..core.record import FILTER, WINDOW, FilterRecord, FilterRecords, GainTables
 from .gains import SampledSystem, compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
@@ -100,7 +91,7 @@ def _iterate_gains(
                 captured = f.tick - lags[frame]
                 if (captured - frame * f.period[s]) % cycle != 0 or captured < 0:
                     continue
-                first = find_clone(f, s, captured)
+                first = find_target(f, s, captured)
                 if first == DROPPED:
                     continue
                 for i in range(N):

@@ -19,7 +19,8 @@ from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
 from ..core.filter import Observed, OutputTable, StepRecord
-from ..core.innovation import BUFFER, LARSEN, NONE
+from ..core.intersample import NONE
+from ..core.late_samples import BUFFER, LARSEN
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
 from ..estimator import Estimator

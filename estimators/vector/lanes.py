@@ -16,7 +16,7 @@ from ...envs.numerics.simd import LANES
 from ...envs.record import FAST, PACKET, Array
 from ..core.covariance import correct_scalar, project
 from ..core.filter import Observed, StepRecord, observe, run_tick
-from ..core.innovation import store_due_captures
+from ..core.late_samples import store_due_captures
 from ..core.model import CURVATURE, LATERAL, is_finite
 from ..core.packets import process_packet
 from ..core.predict import (
