@@ -23,7 +23,7 @@ class FilterDefinition:
     intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
     gains: str = "periodic"  # or "covariance", "placed"
     disturbances: str = "none"  # or "walk", "walk-all", "forces"
-    delay: str = "clone"  # a name of `innovation.RULES`
+    delay: str = "clone"  # a name of `late_samples.RULES`
     poles: tuple[float, ...] = ()  # rad/s, where gains are placed
     second: str = ""  # model of a second layer
     options: tuple[tuple[str, Any], ...] = ()  # (option, its default) unlike the common defaults

@@ -263,7 +263,8 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
         filters: Filters of a simulation.
         base: Env without wrappers, in an episode.
     """
-    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, make_filter_arguments(base)
+    facts = make_filter_arguments(base)
+    cars = {"nominal": facts["vehicle"], "true": base.vehicle}
     by_label = {}
     for spec in filters:
         options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}

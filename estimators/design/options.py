@@ -103,7 +103,7 @@ class FilterOptions:
         None, "slow sensors; several by covariance; None: one, of joint all"
     )
     gains: str = _make("", "periodic or covariance; of dual-rate constant, from-29 or placed")
-    delay: str = _make("clone", f"rule for late samples: {', '.join(RULES)}; see core.innovation")
+    delay: str = _make("clone", f"rule for late samples: {', '.join(RULES)}; see core.late_samples")
     assumed_delay: float = _make(0.033, "delay of all samples, by the rule constant", "s", POSITIVE)
     between: str = _make("hold", "of single-rate-kf: hold or predict between its steps")
     intersample: str = _make(

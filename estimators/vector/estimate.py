@@ -63,7 +63,8 @@ class _BatchedRecords:
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         env = self._env
-        return [EstimatorSpec(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+        facts = env.nominal, env.scenario, env.slow_sensors, env.held_speed
+        return [EstimatorSpec.from_episode(*(fact[i] for fact in facts)) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
         """Pass estimates (rad) of some rows to an env that draws, beside the truth."""

@@ -57,12 +57,30 @@ class Outputs:
     keys: tuple[tuple[str, int], ...]  # keys of `info`, with their places in the summary
 
 
+_RIGID = 0.001  # m, arm of a body that no force rolls
+
+
 class EstimatorSpec(NamedTuple):
     """Vehicle, sensors and speed for which an estimator is built."""
 
     vehicle: Vehicle  # as the estimator believes it to be
     sensors: Mapping[str, SlowSensor]  # slow ones by name
     speed: float | None = None  # m/s where it is held
+
+    @classmethod
+    def from_episode(
+        cls, nominal: Vehicle, scenario: Any, sensors: Mapping[str, SlowSensor], speed: float | None
+    ) -> Self:
+        """Make the spec of an episode; a body that does not roll in it is told to be rigid.
+
+        Args:
+            nominal: The vehicle of designers.
+            scenario: `Scenario`, or None for an env without one.
+            sensors: Slow sensors by name.
+            speed: Speed (m/s) where it is held.
+        """
+        rolls = scenario is None or scenario.roll
+        return cls(nominal if rolls else nominal.replace(roll_arm=_RIGID), sensors, speed)
 
     @property
     def design(self) -> Hashable:
@@ -77,7 +95,8 @@ def make_spec(base: Any) -> EstimatorSpec:
     Args:
         base: Environment without wrappers.
     """
-    return EstimatorSpec(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
+    scenario, speed = getattr(base, "scenario", None), getattr(base, "held_speed", None)
+    return EstimatorSpec.from_episode(base.nominal, scenario, base.slow_sensors, speed)
 
 
 @dataclasses.dataclass

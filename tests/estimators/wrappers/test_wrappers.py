@@ -167,3 +167,19 @@ def test_a_snapshot_has_the_step_limit_inside() -> None:
         env.step(still)
     env.set_state(snapshot)
     assert [env.step(still)[3] for _ in range(8)] == [False] * 7 + [True]
+
+
+def test_a_filter_with_an_accelerometer_knows_whether_the_body_rolls() -> None:
+    options: Any = {"scenario": "dakf-fig6", "control_period": 10}
+    alone = EstimateObservation(gym.make("sideslip/YawGps-v0", **options), "joint")
+    fleet = gym.make_vec("sideslip/YawGps-v0", 2, **options)
+    together = vector.EstimateObservation(fleet, "joint")
+    alone.reset(seed=0)
+    together.reset(seed=[0, 0])
+    errors = []
+    for _ in range(500):  # a rolling body's gravity would be 0.1 rad of slip in the estimate
+        info = alone.step(still(alone))[-1]
+        infos = together.step(still(together))[-1]
+        assert infos["beta_hat"][0] == info["beta_hat"]
+        errors.append(info["beta_hat"] - info["beta"])
+    assert np.sqrt(np.mean(np.square(errors[200:]))) < 0.015
