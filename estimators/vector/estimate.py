@@ -23,6 +23,7 @@ from ..wrappers.estimate import (
     EstimatorSpec,
     find_base_env,
     make_spec,
+    replace_body,
 )
 from ..wrappers.truth import (
     STIFFNESSES,
@@ -63,8 +64,8 @@ class _BatchedRecords:
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         env = self._env
-        facts = env.nominal, env.scenario, env.slow_sensors, env.held_speed
-        return [EstimatorSpec.from_episode(*(fact[i] for fact in facts)) for i in rows]
+        cars = {i: replace_body(env.nominal[i], env.scenario[i]) for i in rows}
+        return [EstimatorSpec(cars[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
         """Pass estimates (rad) of some rows to an env that draws, beside the truth."""

@@ -14,6 +14,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import as_python, compile_call
 from ...envs.numerics.primitives import ARRAYS
+from ...envs.scenarios.scenario import Scenario
 from ...envs.sensors.link import SlowSensor
 from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
@@ -67,26 +68,22 @@ class EstimatorSpec(NamedTuple):
     sensors: Mapping[str, SlowSensor]  # slow ones by name
     speed: float | None = None  # m/s where it is held
 
-    @classmethod
-    def from_episode(
-        cls, nominal: Vehicle, scenario: Any, sensors: Mapping[str, SlowSensor], speed: float | None
-    ) -> Self:
-        """Make the spec of an episode; a body that does not roll in it is told to be rigid.
-
-        Args:
-            nominal: The vehicle of designers.
-            scenario: `Scenario`, or None for an env without one.
-            sensors: Slow sensors by name.
-            speed: Speed (m/s) where it is held.
-        """
-        rolls = scenario is None or scenario.roll
-        return cls(nominal if rolls else nominal.replace(roll_arm=_RIGID), sensors, speed)
-
     @property
     def design(self) -> Hashable:
         """A key that is equal for specs that differ in the phases of their clocks alone."""
         clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
         return self.vehicle, tuple(sorted(clocks)), self.speed
+
+
+def replace_body(nominal: Vehicle, scenario: Scenario | None) -> Vehicle:
+    """Replace a vehicle's body by a rigid one where the scenario's does not roll.
+
+    Args:
+        nominal: The vehicle of designers.
+        scenario: Scenario of the episode, or None for an env without one.
+    """
+    rolls = scenario is None or scenario.roll
+    return nominal if rolls else nominal.replace(roll_arm=_RIGID)
 
 
 def make_spec(base: Any) -> EstimatorSpec:
@@ -95,8 +92,8 @@ def make_spec(base: Any) -> EstimatorSpec:
     Args:
         base: Environment without wrappers.
     """
-    scenario, speed = getattr(base, "scenario", None), getattr(base, "held_speed", None)
-    return EstimatorSpec.from_episode(base.nominal, scenario, base.slow_sensors, speed)
+    vehicle = replace_body(base.nominal, getattr(base, "scenario", None))
+    return EstimatorSpec(vehicle, base.slow_sensors, getattr(base, "held_speed", None))
 
 
 @dataclasses.dataclass
