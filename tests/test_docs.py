@@ -30,6 +30,7 @@ MOST_FILES = {
     "An action": 3,
     "cost term": 2,
     "filter": 1,
+    "delay rule": 1,
     "controller": 2,
     "policy": 0,
     "scenario": 1,
