@@ -8,8 +8,8 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from ...envs.numerics import require_extra
@@ -18,7 +18,7 @@ from ...envs.validation import check_choice, is_finite
 from ..env_info import CarVectorEnv
 from ..learned.policy import Policy
 from ..vec_env import make_native_env
-from .export import list_activations
+from .export import TORCH_ACTIVATIONS
 from .normalise import Standardised, StandardisedArguments
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -51,9 +51,8 @@ class Algorithm:
 
     def load(self) -> Callable[..., BaseAlgorithm]:
         """Import the class; ModuleNotFoundError where its package is not installed."""
-        module, name = self.kind.split(":")
         with require_extra("train", "training needs {}"):
-            algorithm_class: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
+            algorithm_class: Callable[..., BaseAlgorithm] = resolve_name(self.kind)
         return algorithm_class
 
 
@@ -120,7 +119,7 @@ def _check_settings(algo: str, settings: object) -> None:
         raise ValueError(f"{replaced[0]} is the training's own, of scaled observations")
     if "activation_fn" in kwargs and get_algorithm(algo).on_tensors:
         raise ValueError(f"the layers of {algo} are of silu: it has no activation_fn")
-    check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(list_activations()))
+    check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(TORCH_ACTIVATIONS))
     missing = [item for item in ("n_envs", "n_timesteps", "policy") if item not in settings]
     if missing:
         raise ValueError(f"no {', '.join(missing)}")
@@ -249,7 +248,7 @@ class TrainingTask:
         options |= {key: _make_schedule(key, options[key]) for key in _SCHEDULED if key in options}
         kwargs = dict(options.get("policy_kwargs", {}), features_extractor_class=Standardised)
         if "activation_fn" in kwargs:
-            kwargs["activation_fn"] = list_activations()[kwargs["activation_fn"]]
+            kwargs["activation_fn"] = TORCH_ACTIVATIONS[kwargs["activation_fn"]]
         kwargs["features_extractor_kwargs"] = scaling._asdict()
         options |= {"policy_kwargs": kwargs, "stats_window_size": env.num_envs}
         return self.algorithm.load()(self.settings["policy"], env, **options, **rest)
@@ -273,7 +272,7 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
         task_fields["estimator"] = card.estimator
         task_fields["estimator_options"] = dict(card.estimator_options)
     algo = fields.get("algo", "ppo")
-    settings = fields.pop("settings", None) or resolve_settings(None, algo, card.env_id, policy)
+    settings = fields.pop("settings", None) or _read_settings(algo, WARM_START_ENTRY)
     task_fields["settings"] = _add_policy_form(settings, policy, algo)
     return TrainingTask(**task_fields | fields)
 

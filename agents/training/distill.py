@@ -20,7 +20,7 @@ import numpy as np
 from ..controllers.lqr import Lqr
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from .student import Demonstrations, DistillConfig, Scaling, Student, compute_scale
+from .student import Demonstrations, DistillConfig, Scaling, Student, compute_scale, compute_scaling
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
@@ -146,7 +146,9 @@ def distill(
             new_drives.append(_collect_demonstrations(task, policy, numbers, *limits))
         steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
         if scaling is None:
-            scaling = model.fit_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
+            scaling = compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
+            if model.traces is not None:
+                model.traces.fit_whitening(new_drives, scaling)
             max_costs = [float(np.median(demo.costs)) for demo in new_drives]
             privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
             standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))

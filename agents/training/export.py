@@ -10,13 +10,12 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
 import numpy as np
 
-from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.wrappers.estimate import EstimateObservation
@@ -24,20 +23,25 @@ from ..env_info import AnyEnv, CarEnv, get_env_facts
 from ..learned.network import ACTIVATIONS, SUFFIX, Network, RecurrentCell
 from ..learned.policy import Card, Policy, save_policy
 from ..vec_env import get_scales, scale_layout
+from .normalise import Standardised, read_normalisation
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.policies import BasePolicy
-    from stable_baselines3.common.vec_env import VecNormalize
-    from torch import Tensor, nn
+from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy  # isort: skip
+from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
+from stable_baselines3.common.torch_layers import FlattenExtractor  # isort: skip
+from stable_baselines3.common.vec_env import VecNormalize  # isort: skip
+from torch import Tensor, nn  # isort: skip
 
+# torch's activations by their names in a `Network`
+_KINDS = (nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU)
+TORCH_ACTIVATIONS: dict[str, type[nn.Module]] = dict(zip(ACTIVATIONS, _KINDS, strict=True))
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
 _NORMALISER = "vecnormalize.pkl"
 
 
 def convert_sb3_policy(
-    model: "BaseAlgorithm | BasePolicy", normaliser: "VecNormalize | None" = None, history: int = 1
+    model: BaseAlgorithm | BasePolicy, normaliser: VecNormalize | None = None, history: int = 1
 ) -> Network:
     """Convert the deterministic actor of a model to a network; ValueError for an unknown one.
 
@@ -46,10 +50,6 @@ def convert_sb3_policy(
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
     """
-    with require_extra("train", "networks come from stable-baselines3"):
-        from stable_baselines3.common.torch_layers import FlattenExtractor
-
-        from .normalise import Standardised, read_normalisation
     policy = getattr(model, "policy", model)
     actor, space = _find_actor(policy), policy.action_space
     low, high = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
@@ -80,10 +80,10 @@ def convert_sb3_policy(
 class _Actor(NamedTuple):
     """The actor of a policy; `squashed`: whether tanh follows its layers."""
 
-    layers: list["nn.Module"]
+    layers: list[nn.Module]
     squashed: bool
-    extractor: "nn.Module"
-    recurrent: "nn.RNNBase | None" = None
+    extractor: nn.Module
+    recurrent: nn.RNNBase | None = None
 
 
 _POLICIES = (  # classes; a subclass may compute anything and is none of them
@@ -121,7 +121,7 @@ def _find_actor(policy: Any) -> _Actor:
     return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
 
 
-def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
+def _convert_cells(module: nn.RNNBase | None) -> list[RecurrentCell]:
     """Convert the cells of torch's GRU or LSTM; none for a policy without them."""
     if module is None:
         return []
@@ -131,23 +131,13 @@ def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
     return [RecurrentCell(module.mode.lower(), *arrays) for arrays in layers]
 
 
-def _to_array(parameter: "Tensor") -> Array:
-    return parameter.detach().cpu().numpy().copy()
+def _to_array(parameter: Tensor) -> Array:
+    return parameter.detach().cpu().numpy()
 
 
-def list_activations() -> dict[str, type]:
-    """Collect torch's classes of activations, by their names in a `Network`."""
-    from torch import nn
-
-    kinds = nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU
-    return dict(zip(ACTIVATIONS, kinds, strict=True))
-
-
-def _convert_dense(layers: list["nn.Module"]) -> tuple[list[Array], list[Array], list[str], str]:
+def _convert_dense(layers: list[nn.Module]) -> tuple[list[Array], list[Array], list[str], str]:
     """Convert linear layers to weights, biases, activations between them, and the output's."""
-    from torch import nn
-
-    names = {kind: name for name, kind in list_activations().items()}
+    names = {kind: name for name, kind in TORCH_ACTIVATIONS.items()}
     weights, biases, layer_activations = list[Array](), list[Array](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
@@ -272,10 +262,6 @@ def check_zip(file: Path) -> None:
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
     """Read the model's data and the policy's weights; nothing else is unpickled."""
-    from .normalise import Standardised  # noqa: F401  first: it says which extra is missing
-
-    from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
-
     try:
         with ZipFile(file) as archive:
             names = json.loads(archive.read("data"))
@@ -292,10 +278,8 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
     return content or {}, (weights or {})["policy"]
 
 
-def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "BasePolicy":
+def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> BasePolicy:
     """Build the policy with its weights, without the algorithm and its environments."""
-    from stable_baselines3.common.policies import ActorCriticPolicy
-
     kind, options = content["policy_class"], {**content["policy_kwargs"]}
     options.pop("device", None)
     if not isinstance(kind, type):
@@ -315,7 +299,7 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "Base
 
 def load_normaliser(
     path: Path, trust: bool, normalise: str | Path | None = None
-) -> "VecNormalize | None":
+) -> VecNormalize | None:
     """Load a zip's VecNormalize from its pickle, which can run code; None without one.
 
     Args:
@@ -323,8 +307,6 @@ def load_normaliser(
         trust: Whether the pickle may be read; PermissionError if not.
         normalise: As for `find_normaliser`; FileNotFoundError without it, ValueError if unfit.
     """
-    from stable_baselines3.common.vec_env import VecNormalize
-
     file = find_normaliser(path, normalise)
     if file is None:
         return None

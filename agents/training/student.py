@@ -91,10 +91,16 @@ class Scaling(NamedTuple):
         return z if self.mixing is None else z @ self.mixing.astype(np.float32)
 
 
-def _compute_scaling(
+def compute_scaling(
     drives: Sequence[Demonstrations], layout: Sequence[ObservationEntry], needs: Sequence[str]
 ) -> Scaling:
-    """Compute the scaling of a student's inputs from drives."""
+    """Compute the scaling of a student's inputs from drives.
+
+    Args:
+        drives: Demonstrations.
+        layout: Entries of the observation.
+        needs: Entries that the teacher reads.
+    """
     # A student that has all of `needs` reads nothing else, which would only be noise to it. One
     # that has less reads all that varies, but for `_UNREAD` and, behind a filter, what that has
     # read. An age is scaled by its variation while packets come.
@@ -282,22 +288,6 @@ class Student(nn.Module):
             outputs.append(self.auxiliary_head(memory_output if self.cell else z))
         return torch.cat(outputs, dim=-1), state
 
-    def fit_scaling(
-        self, drives: Sequence[Demonstrations], layout: Sequence[ObservationEntry],
-        needs: Sequence[str],
-    ) -> Scaling:  # fmt: skip
-        """Fit the scaling of the inputs, and the whitening of the moving averages, on drives.
-
-        Args:
-            drives: Demonstrations.
-            layout: Entries of the observation.
-            needs: Entries that the teacher reads.
-        """
-        scaling = _compute_scaling(drives, layout, needs)
-        if self.traces is not None:
-            self.traces.fit_whitening(drives, scaling)
-        return scaling
-
     def network(self, scaling: Scaling) -> Network:
         """Convert the student to a network of plain observations without auxiliary outputs.
 
@@ -306,18 +296,14 @@ class Student(nn.Module):
         """
         mean, scale, mixing = scaling
         mixing = np.eye(len(mean)) if mixing is None else mixing
-        numbers = [_to_array(parameter) for parameter in self.dense.parameters()]
+        numbers = [parameter.detach().numpy() for parameter in self.dense.parameters()]
         weights, biases, cells = numbers[::2], numbers[1::2], list[MemoryLayer]()
         if self.traces:
             cells.append(self.traces.cell(mixing))
             weights[0], biases[0] = self.traces.convert_weights(weights[0], biases[0])
         elif self.cell:  # weights of the inputs and of the state, then both biases
-            weight_in, *rest = map(_to_array, self.cell.parameters())
+            weight_in, *rest = (x.detach().numpy() for x in self.cell.parameters())
             cells.append(RecurrentCell("gru", weight_in @ mixing, *rest))
         else:
             weights[0] = weights[0] @ mixing
         return Network(mean, scale, weights, biases, "silu", clip=_CLIP, cells=cells)
-
-
-def _to_array(parameter: torch.Tensor) -> Array:
-    return parameter.detach().numpy().copy()

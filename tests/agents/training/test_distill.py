@@ -28,8 +28,8 @@ from sideslip.agents.training.student import (
     DistillConfig,
     Scaling,
     Student,
-    _compute_scaling,
     _TraceLayer,
+    compute_scaling,
 )
 from sideslip.envs.task import ObservationEntry
 
@@ -112,7 +112,7 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
     course = replace(COURSE, auxiliary_weight=1.0)
     torch.manual_seed(0)
     model = Student(len(names), 1, course, len(told))
-    scaling = _compute_scaling([seen], cars.layout, ("beta_hat",))
+    scaling = compute_scaling([seen], cars.layout, ("beta_hat",))
     _fit_model(model, [seen], scaling, course, 60)
     out = model(torch.from_numpy(scaling.mix_inputs(other.obs)))[0].detach().numpy()
     missed, varies = (
@@ -131,7 +131,7 @@ def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
     weights[:, 1:] = 0.0
     course = replace(COURSE, cells=4, auxiliary_weight=1.0, batch=1)
     model = Student(seen.obs.shape[2], 1, course, seen.privileged.shape[2])
-    scaling = _compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
+    scaling = compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
     assert np.isfinite(_fit_model(model, [seen._replace(weights=weights)], scaling, course, 1))
 
 
@@ -199,7 +199,7 @@ def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None
     seen = [_collect_demonstrations(lesson(), None, range(CARS), 0.1)]
     names = [entry.name for entry in cars.layout]
     for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
-        scaling = _compute_scaling(seen, cars.layout, needs)
+        scaling = compute_scaling(seen, cars.layout, needs)
         reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
         assert reads == there if there else "gyro" in reads and not reads & set(_UNREAD)
 
@@ -213,7 +213,7 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     drives = Demonstrations(
         obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
     )
-    usual = _compute_scaling([drives], layout, ("beta",))
+    usual = compute_scaling([drives], layout, ("beta",))
     deviation = Scaling(obs.mean((0, 1)), 1.0 / obs.std((0, 1)))
     ends = np.percentile(ages, (16, 50))  # the usual age is 0, a soon one a deviation before it
     assert (ends - usual.mean[0]) * usual.scale[0] == pytest.approx([-1.0, 0.0])
@@ -255,7 +255,7 @@ def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:
     seen.obs[..., a] = rng.normal(size=seen.obs.shape[:2])
     apart = 0.1 * rng.normal(size=seen.obs.shape[:2])
     seen.obs[..., b] = seen.obs[..., a] + apart
-    z = _compute_scaling([seen], cars.layout, ("beta_hat",)).mix_inputs(seen.obs)
+    z = compute_scaling([seen], cars.layout, ("beta_hat",)).mix_inputs(seen.obs)
     shown = z[..., b] - z[..., a]
     assert 1.2 < shown.std() < 1.6  # of two that vary by 1, the square root of 2
     assert np.corrcoef(shown.ravel(), apart.ravel())[0, 1] > 0.99

@@ -1,6 +1,7 @@
 """Zips of stable-baselines3: driven as its own `predict` drives them, or refused by name."""
 
 import functools
+import importlib
 import json
 import pickle
 import sys
@@ -351,13 +352,16 @@ def test_what_never_varied_is_not_read() -> None:
     assert network.clip == env.clip_obs
 
 
-def test_another_range_of_actions_and_a_missing_extra_are_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_another_range_of_actions_is_named() -> None:
     wide = made(sb3.PPO, "MlpPolicy", bridged())
     wide.policy.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
     with pytest.raises(ValueError, match=r"within \[-1, 1\]"):
         convert_sb3_policy(wide)
-    monkeypatch.setitem(sys.modules, "stable_baselines3.common.torch_layers", None)
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    for name in ("vec_env", "training.export"):
+        monkeypatch.delitem(sys.modules, f"sideslip.agents.{name}")
     with pytest.raises(ModuleNotFoundError, match=r"sideslip\[train\]"):
-        convert_sb3_policy(wide)
+        importlib.import_module("sideslip.agents.training.export")
