@@ -96,9 +96,9 @@ def _compute_static_gain(car: Bicycle, V: Scalar) -> Scalar:
 @jit
 def _compute_sideslip_gain(car: Bicycle, V: Scalar) -> Scalar:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
-    a11, _, a21, a22, _, _, b22 = compute_bicycle_coefficients(car, V)
-    yaw_rate = a11 * car.m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
-    return -(a21 + a22 * yaw_rate) / b22
+    plant = compute_bicycle_coefficients(car, V)
+    yaw_rate = plant.a11 * car.m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
+    return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
 @jit

@@ -7,16 +7,16 @@ Papers' short names, such as dakf-stability, are those of docs/PAPERS.md.
 import math
 from collections import namedtuple
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ...envs.numerics.functions import TICK
-from ...envs.numerics.jit import as_python, jit
+from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
-from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients
+from ...envs.vehicle.linear import BicyclePlant, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 from ..design.sampled_model import SPEEDS, find_cell
 from ..env_info import AnyEnv, get_env_facts
@@ -26,24 +26,6 @@ BANDWIDTH = 16.0  # rad/s, double pole of the yaw-rate loop
 MODEL_BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
 _MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed
 _RELEASE = 0.5  # s, time constant by which the integral decays within the dead band
-
-
-class BicyclePlant(NamedTuple):
-    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
-
-    a11: Scalar  # effect of beta on beta' (1/s)
-    a12: Scalar  # effect of gamma on beta'
-    a21: Scalar  # effect of beta on gamma' (1/s^2)
-    a22: Scalar  # effect of gamma on gamma' (1/s)
-    b11: Scalar  # effect of the steering angle on beta' (1/s)
-    b21: Scalar  # effect of the steering angle on gamma' (1/s^2)
-    b22: Scalar  # effect of the yaw moment on gamma' (1/(kg m^2))
-
-
-@jit
-def _compute_plant(car: Bicycle, V: Scalar) -> BicyclePlant:
-    """Compute the plant of a nominal car at a speed (m/s)."""
-    return BicyclePlant(*compute_bicycle_coefficients(car, V))
 
 
 @jit
@@ -75,7 +57,7 @@ def _compute_yaw_gains(vehicle: Vehicle, speed: float, bandwidth: float) -> tupl
     # both poles at the bandwidth (rad/s): s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2;
     # where the yaw equation's own damping is more, k_p is zero
     I = vehicle.yaw_inertia  # noqa: E741
-    a22 = as_python(_compute_plant)(Bicycle(*map(float, vehicle.lateral)), speed).a22
+    a22 = float(make_bicycle_model(vehicle, speed).A[1, 1])
     return max(I * (2.0 * bandwidth + a22), 0.0), I * bandwidth * bandwidth
 
 
@@ -189,7 +171,7 @@ def _sliding_mode_law(
     car, target, kind, pole, rate, layer, full_scale, dt = design
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), _MIN_SPEED)
-        plant = _compute_plant(car, v)
+        plant = compute_bicycle_coefficients(car, v)
         beta, gamma = x[n, SLIDING_IN.beta_hat], x[n, SLIDING_IN.gamma_hat]
         delta = x[n, SLIDING_IN.steer]
         xi = _compute_surface_slope(plant, pole)
@@ -262,7 +244,7 @@ def _model_following_law(
         v = maximum(0.5 * (x[n, MODEL_IN.wheel_left] + x[n, MODEL_IN.wheel_right]), _MIN_SPEED)
         driver = x[n, MODEL_IN.steer_command]
         beta_ref, gamma_ref = x[n, MODEL_IN.beta_ref], x[n, MODEL_IN.gamma_ref]
-        plant = _compute_plant(car, v)
+        plant = compute_bicycle_coefficients(car, v)
         last_driver = state[n, MODEL_LAST.driver] if state[n, MODEL_LAST.known] > 0.0 else driver
         old = compute_reference(last_driver, v, target, kind)
         new = compute_reference(driver, v, target, kind)

@@ -30,11 +30,21 @@ class Bicycle(NamedTuple):
     C_r: Scalar  # N/rad, of a rear tyre
 
 
-@jit
-def compute_bicycle_coefficients(car: Vector, V: Scalar) -> tuple[Scalar, ...]:
-    """Compute (a11, a12, a21, a22, b11, b21, b22) of the linear bicycle, tie-vision (8).
+class BicyclePlant(NamedTuple):
+    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
 
-    States are beta and gamma, inputs delta_f and N_z.
+    a11: Scalar  # effect of beta on beta' (1/s)
+    a12: Scalar  # effect of gamma on beta'
+    a21: Scalar  # effect of beta on gamma' (1/s^2)
+    a22: Scalar  # effect of gamma on gamma' (1/s)
+    b11: Scalar  # effect of the steering angle on beta' (1/s)
+    b21: Scalar  # effect of the steering angle on gamma' (1/s^2)
+    b22: Scalar  # effect of the yaw moment on gamma' (1/(kg m^2))
+
+
+@jit
+def compute_bicycle_coefficients(car: Vector, V: Scalar) -> BicyclePlant:
+    """Compute the coefficients of the linear bicycle.
 
     Args:
         car: `Bicycle`, or its six numbers.
@@ -45,7 +55,7 @@ def compute_bicycle_coefficients(car: Vector, V: Scalar) -> tuple[Scalar, ...]:
     a12 = -1.0 - 2.0 * (C_f * l_f - C_r * l_r) / (m * V * V)
     a21 = -2.0 * (C_f * l_f - C_r * l_r) / I
     a22 = -2.0 * (C_f * l_f * l_f + C_r * l_r * l_r) / (I * V)
-    return a11, a12, a21, a22, 2.0 * C_f / (m * V), 2.0 * C_f * l_f / I, 1.0 / I
+    return BicyclePlant(a11, a12, a21, a22, 2.0 * C_f / (m * V), 2.0 * C_f * l_f / I, 1.0 / I)
 
 
 @jit
@@ -117,9 +127,7 @@ class LinearModel:
         from scipy.linalg import expm  # environments read this module too
 
         n, m = self.B.shape
-        block = np.zeros((n + m, n + m))
-        block[:n] = np.hstack([self.A, self.B]) * dt
-        exact = expm(block)
+        exact = expm(np.vstack([np.hstack([self.A, self.B]) * dt, np.zeros((m, n + m))]))
         return exact[:n, :n], exact[:n, n:]
 
     def to_control(self) -> "StateSpace":
@@ -157,7 +165,6 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
     Inputs are delta_f, N_z and kappa, the road's curvature: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
-    Outputs are gamma, psi and y_l.
 
     Args:
         vehicle: Vehicle of the model.

@@ -9,13 +9,12 @@ import pytest
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.yaw_stability import (
     BANDWIDTH,
-    BicyclePlant,
     SlidingMode,
     _compute_surface_slope,
     _compute_yaw_gains,
 )
 from sideslip.envs import COMS, PASSENGER_CAR, critical_speed
-from sideslip.envs.vehicle.linear import make_bicycle_model
+from sideslip.envs.vehicle.linear import BicyclePlant, make_bicycle_model
 from sideslip.estimators import EstimateObservation
 from tests.agents.helpers import observe
 
