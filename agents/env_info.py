@@ -43,9 +43,19 @@ _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observat
             "actions"}  # fmt: skip
 
 
+class PlantKind(NamedTuple):
+    """The variant of a plant, for the prediction of nonlinear MPC."""
+
+    tyres: str  # the tyre law, of `TYRE_LAWS`
+    small_angle: bool
+    roll: bool
+    lags: bool  # whether the actuators lag
+    yaw_first: bool  # whether the yaw moment comes before the drive torque
+
+
 @dataclass(frozen=True)
 class EnvFacts:
-    """The facts that controllers are designed from, the same for all rows of a vector env."""
+    """The facts that controllers are designed from, but for `plants` the same for all rows."""
 
     layout: tuple[ObservationEntry, ...]  # of an observation
     nominal: Vehicle  # as controllers know it
@@ -55,21 +65,12 @@ class EnvFacts:
     reference: str  # name in `envs.task.REFERENCES`
     width: int  # number of entries of an action
     moment_rate: float  # s2, weight of the yaw moment's rate in the cost
+    plants: frozenset[PlantKind]  # among the rows
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of an observation."""
         return tuple(entry.name for entry in self.layout)
-
-
-class PlantKind(NamedTuple):
-    """The variant of a plant, for the prediction of nonlinear MPC."""
-
-    tyres: str  # the tyre law, of `TYRE_LAWS`
-    small_angle: bool
-    roll: bool
-    lags: bool  # whether the actuators lag
-    yaw_first: bool  # whether the yaw moment comes before the drive torque
 
 
 @dataclass(frozen=True)
@@ -82,19 +83,8 @@ class EnvView:
 
     num_envs: int  # rows, one car each
     facts: EnvFacts
-    plants: frozenset[PlantKind]  # among the rows
     single_observation_space: gym.Space[npt.NDArray[np.float32]]
     single_action_space: gym.Space[npt.NDArray[np.float32]]
-
-    @classmethod
-    def from_env(cls, env: CarVectorEnv) -> "EnvView":
-        """Make the view of a vector env.
-
-        Args:
-            env: Vector env with its wrappers.
-        """
-        spaces = env.single_observation_space, env.single_action_space
-        return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
 
     @property
     def unwrapped(self) -> "EnvView":
@@ -165,23 +155,13 @@ def _collect_facts(env: Any) -> EnvFacts:
     designs = [(nominal, car.yaw_moment_limit, car.steering_authority) for nominal, car in cars]
     design = _check_common("nominal vehicle, or other limits", designs)
     period, kind = (_get_common(base, name) for name in ("control_period", "reference"))
-    rates = [config.world.moment_rate for config in list_configs(env)]
-    return EnvFacts(layout, *design, period, kind, width, _check_common("moment_rate", rates))
-
-
-def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
-    """Collect the kinds of plant among the rows of an env.
-
-    Args:
-        env: Env, vector env, `VecEnv` or `EnvView`.
-    """
-    if isinstance(env, EnvView):
-        return env.plants
-    kinds = set()
+    rates, plants = [], set()
     for config in list_configs(env):
         x, tyres = config.scenario, config.world.tyres or config.scenario.tyres
-        kinds.add(PlantKind(tyres, x.small_angle, x.roll, x.lags, config.yaw_first))
-    return frozenset(kinds)
+        rates.append(config.world.moment_rate)
+        plants.add(PlantKind(tyres, x.small_angle, x.roll, x.lags, config.yaw_first))
+    rate = _check_common("moment_rate", rates)
+    return EnvFacts(layout, *design, period, kind, width, rate, frozenset(plants))
 
 
 def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:

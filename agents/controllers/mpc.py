@@ -18,13 +18,13 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference
 from ...envs.validation import check_int
-from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion
+from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource
 from ...envs.vehicle.tyres import MIN_SPEED, fit_fiala
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
-from ..design.prediction import PredictionModel, PredictionStart, PredictionTask, make_prediction
+from ..design.prediction import PredictionModel, PredictionState, PredictionTask, make_prediction
 from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_design_model
-from ..env_info import AnyEnv, list_plant_kinds
+from ..env_info import AnyEnv, get_env_facts
 from .base import check_positive
 from .lqr import IN, AdaptiveLqr, Lqr, make_design_state
 
@@ -267,8 +267,7 @@ def _prepare_prediction(
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
     rear = x[IN.rear_stiffness] if design.scheduled else model.car.C_r
     car = _replace_tyres(model.car, front, rear, friction)
-    gamma, driver, refs = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
-    steady = refs
+    gamma, driver, steady = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
     if model.kind.reference == LAGGED:
         steady = compute_reference(driver, v, design.target, LAGGED)
     per = (car.m * v, car.I) if disturbed == 2 else (1.0, 1.0)
@@ -282,15 +281,17 @@ def _prepare_prediction(
     v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
     motion = Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * phi_rate)
     T_l, T_r, n = x[IN.torque_left], x[IN.torque_right], len(before)
-    start = PredictionStart(
-        car, motion, T_l, T_r, x[IN.steer], added_command, driver, (T_l + T_r) / (car.m * car.r),
-        refs, steady, DisturbanceForces(F_d, N_d, 0.0), max_moment,
+    start = PredictionState(
+        motion, T_l, T_r, x[IN.steer], added_command, x[IN.beta_ref], x[IN.gamma_ref], F_d, N_d,
         before[0] if n > 0 else 0.0, before[1] if n > 0 else 0.0,
     )  # fmt: skip
+    a_x = (T_l + T_r) / (car.m * car.r)
     per_force = 1.0 / per[0], 1.0 / per[1]
     K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force, n)
     terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force, n)
-    return PredictionTask(model, start, K, terminal, design.blocks)
+    return PredictionTask(
+        model, start, car, driver, a_x, steady, max_moment, K, terminal, design.blocks
+    )
 
 
 @jit
@@ -314,8 +315,8 @@ def _nmpc_law(
         if np.isfinite(J):
             state[row, PLAN:end], state[row, LAST.added_command] = plan, added_command
             if state.shape[1] > end:
-                start = task.start
-                torque_per_share = 2.0 * design.model.full_scale * start.car.r / start.car.d_r
+                car, start = task.car, task.start
+                torque_per_share = 2.0 * design.model.full_scale * car.r / car.d_r
                 state[row, end] = (start.T_r - start.T_l) / torque_per_share
                 state[row, end + 1] = share
             state[row, LAST.status] = SOLVED
@@ -368,7 +369,7 @@ class Nmpc(Lqr):
         steps = max(round(check_positive("horizon", horizon) / (spec.period * TICK)), 1)
         blocks = _make_blocks(steps, MAX_VARIABLES // self.width)
         self.memory = PLAN + self.width * len(blocks) + self.remembered
-        self._plant, *others = list_plant_kinds(env)
+        self._plant, *others = get_env_facts(env).plants
         if others:
             raise ValueError("rows of a vector env share one prediction, but their plants differ")
         disturbed = ("none", "forces", "rates").index(spec.disturbances)

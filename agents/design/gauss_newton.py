@@ -20,12 +20,11 @@ _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
 @jit
-def _make_plan_batch(
-    variables: int, blocks: Vector, count: int, n_terminal: int = N_TERMINAL
-) -> PlanBatch:
+def _make_plan_batch(task: PredictionTask, variables: int, count: int) -> PlanBatch:
     """Make a batch of so many plans of zeros, with one column for each."""
+    n_terminal = len(task.terminal)
     n_step = N_RESIDUALS + n_terminal - N_TERMINAL
-    shape, n_residuals = (variables, count), n_step * blocks.sum() + n_terminal
+    shape, n_residuals = (variables, count), n_step * task.blocks.sum() + n_terminal
     plans, perturbations, limits = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     residuals, first = np.zeros((n_residuals, count)), np.zeros((2, count))
     return PlanBatch(plans, perturbations, limits, residuals, first)
@@ -35,7 +34,7 @@ def _make_plan_batch(
 def _simulate_batch(task: PredictionTask, batch: PlanBatch) -> None:
     """Simulate any number of plans, as many at a time as there are lanes."""
     width, (variables, count) = count_lanes(), batch.plans.shape
-    chunk = _make_plan_batch(variables, task.blocks, width, len(task.terminal))
+    chunk = _make_plan_batch(task, variables, width)
     for c in range(0, count, width):
         n = min(width, count - c)
         chunk.plans[:, :n] = batch.plans[:, c : c + n]
@@ -121,7 +120,7 @@ def update_plan(task: PredictionTask, plan: Vector, iterations: int) -> tuple[Sc
         first yaw moment (fraction of full scale) and added steering (rad).
     """
     n = len(plan)
-    batch = _make_plan_batch(n, task.blocks, _N_CANDIDATES, len(task.terminal))
+    batch = _make_plan_batch(task, n, _N_CANDIDATES)
     A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):

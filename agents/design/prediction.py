@@ -78,22 +78,19 @@ class PredictionModel(NamedTuple):
     per_change: float  # of the yaw moment's change since the step before, over that of the moment
 
 
-class PredictionStart(NamedTuple):
-    """The state and the held quantities at the start of a prediction."""
+class PredictionState(NamedTuple):
+    """A prediction's state between steps."""
 
-    car: CarParams
     motion: Motion
     T_l: Scalar  # torque of the left motor (N m)
     T_r: Scalar  # torque of the right motor (N m)
     delta_f: Scalar  # applied steering angle (rad)
     added_command: Scalar  # added steering that was last commanded (rad)
-    driver: Scalar  # driver's steering angle, held (rad)
-    a_x: Scalar  # acceleration, held (m/s^2)
-    refs: tuple[Scalar, Scalar]  # beta_ref (rad) and gamma_ref (rad/s) now
-    steady: tuple[Scalar, Scalar]  # values that a lagged reference approaches
-    push: DisturbanceForces
-    max_moment: Scalar  # largest yaw moment as a fraction of full scale
-    share_before: Scalar  # its fraction a step ago
+    beta_ref: Scalar  # reference of the sideslip angle (rad)
+    gamma_ref: Scalar  # reference of the yaw rate (rad/s)
+    F_d: Scalar  # disturbance force (N)
+    N_d: Scalar  # disturbance moment (N m)
+    share_before: Scalar  # yaw moment a step ago, as a fraction of full scale
     command_before: Scalar  # its command from then on, likewise
 
 
@@ -101,7 +98,12 @@ class PredictionTask(NamedTuple):
     """All that the plans of a decision are simulated from."""
 
     model: PredictionModel
-    start: PredictionStart
+    start: PredictionState
+    car: CarParams
+    driver: Scalar  # driver's steering angle, held (rad)
+    a_x: Scalar  # acceleration, held (m/s^2)
+    steady: tuple[Scalar, Scalar]  # values that a lagged reference approaches
+    max_moment: Scalar  # largest yaw moment as a fraction of full scale
     K: Matrix  # gains of the regulator on its states, (m, 9), or (m, 11) where the rate costs
     terminal: Matrix  # T of the terminal cost |T x|^2, (4, 9) or (6, 11)
     blocks: Vector  # steps of each block
@@ -166,22 +168,6 @@ N_RESIDUALS = 6
 N_TERMINAL = 4  # residuals behind the last step, of what is to come
 
 
-class _PredictionState(NamedTuple):
-    """A prediction's state between steps."""
-
-    motion: Motion
-    T_l: Scalar  # torque of the left motor (N m)
-    T_r: Scalar  # torque of the right motor (N m)
-    delta_f: Scalar  # applied steering angle (rad)
-    added_command: Scalar  # added steering that was last commanded (rad)
-    beta_ref: Scalar  # reference of the sideslip angle (rad)
-    gamma_ref: Scalar  # reference of the yaw rate (rad/s)
-    F_d: Scalar  # disturbance force (N)
-    N_d: Scalar  # disturbance moment (N m)
-    share_before: Scalar  # yaw moment a step ago, as a fraction of full scale
-    command_before: Scalar  # its command from then on, likewise
-
-
 @inline
 def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
     """Clip a value to +-limit."""
@@ -197,13 +183,13 @@ def _detect_limit(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 @inline
 def _multiply_row(
-    M: Matrix, row: int, model: PredictionModel, driver: Scalar, state: _PredictionState,
-    beta: Scalar,
-) -> Scalar:  # fmt: skip
+    M: Matrix, row: int, task: PredictionTask, state: PredictionState, beta: Scalar
+) -> Scalar:
     """Multiply a row of M, K or T of shape (rows, 9 or 11), by the states."""
+    model = task.model
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     first = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
-    middle = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
+    middle = M[row, 3] * state.delta_f + M[row, 4] * task.driver + M[row, 5] * state.beta_ref
     last = M[row, 6] * state.gamma_ref + M[row, 7] * state.F_d + M[row, 8] * state.N_d
     total = first + middle + last
     if M.shape[1] > 9:
@@ -213,18 +199,18 @@ def _multiply_row(
 
 @inline
 def _compute_commands(
-    model: PredictionModel, start: PredictionStart, K: Matrix, state: _PredictionState,
-    beta: Scalar, moment_share: Scalar, steer_share: Scalar,
+    task: PredictionTask, state: PredictionState, beta: Scalar, moment_share: Scalar,
+    steer_share: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
     """Compute the commands within their limits, and 1 or -1 at a limit of either."""
     # The plan adds `moment_share` (of full scale) and `steer_share` (of the authority) to the
     # regulator's action. Commands are the yaw moment (of full scale) and the added steering (rad).
-    max_moment = start.max_moment
-    regulator_share = 0.0 - _multiply_row(K, 0, model, start.driver, state, beta)
+    model, K, max_moment = task.model, task.K, task.max_moment
+    regulator_share = 0.0 - _multiply_row(K, 0, task, state, beta)
     share = _clip_symmetric(regulator_share, max_moment) + moment_share
     added_command, steer_limit = 0.0 * share, 0.0 * share
     if len(K) > 1:
-        added_command = 0.0 - _multiply_row(K, 1, model, start.driver, state, beta)
+        added_command = 0.0 - _multiply_row(K, 1, task, state, beta)
         added_command = _clip_symmetric(added_command, model.authority)
         added_command = added_command + model.authority * steer_share
         added_command = _clip_symmetric(added_command, model.authority)
@@ -238,15 +224,15 @@ def _compute_commands(
 
 @inline
 def _predict_step(
-    model: PredictionModel, start: PredictionStart, state: _PredictionState, share: Scalar,
-    added_command: Scalar, share_beyond: Scalar, steer_beyond: Scalar,
-) -> tuple[_PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:  # fmt: skip
+    task: PredictionTask, state: PredictionState, share: Scalar, added_command: Scalar,
+    share_beyond: Scalar, steer_beyond: Scalar,
+) -> tuple[PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:  # fmt: skip
     """Predict one step with held commands: the state after it, and the effort's four residuals."""
+    model, car, driver = task.model, task.car, task.driver
     kind, motor, steering = model.kind, model.motor, model.steering
-    car, driver = start.car, start.driver
     max_torque = compute_torque_limit(state.motion.v_x, car)
     N_z = share * model.full_scale
-    T_l, T_r = allocate_torques(N_z, start.a_x, car, model.yaw_first, max_torque)
+    T_l, T_r = allocate_torques(N_z, task.a_x, car, model.yaw_first, max_torque)
     torque_beyond = share_beyond * (model.full_scale * car.r / car.d_r)
     T_l, T_r = T_l - torque_beyond, T_r + torque_beyond
     added_target = limit_angle(added_command, driver, model.stop) + steer_beyond
@@ -270,11 +256,11 @@ def _predict_step(
         model.per_steer * apply_lag(added_target, added_before, model.steering_rest[0]),
         model.per_steer * model.steering_rest[1] * (added_before - added_target),
     )
-    next_state = _PredictionState(
+    next_state = PredictionState(
         motion, apply_lag(T_l, state.T_l, motor.end), apply_lag(T_r, state.T_r, motor.end),
         last, added_command,
-        apply_lag(start.steady[0], state.beta_ref, model.ref_decay),
-        apply_lag(start.steady[1], state.gamma_ref, model.ref_decay),
+        apply_lag(task.steady[0], state.beta_ref, model.ref_decay),
+        apply_lag(task.steady[1], state.gamma_ref, model.ref_decay),
         model.decay * state.F_d, model.decay * state.N_d, share_before, target_share,
     )  # fmt: skip
     return next_state, efforts
@@ -282,7 +268,7 @@ def _predict_step(
 
 @inline
 def _compute_changes(
-    model: PredictionModel, ago: _PredictionState, efforts: tuple[Scalar, Scalar, Scalar, Scalar]
+    model: PredictionModel, ago: PredictionState, efforts: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> tuple[Scalar, Scalar]:
     """Compute residuals of the moment's change: mean, and deviation within the step from `ago`."""
     mean = apply_lag(ago.command_before, ago.share_before, model.motor_rest[0])
@@ -301,21 +287,20 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
         task: Model, start, regulator and blocks.
         batch: Plans, of which each is one lane.
     """
-    model, start, K, terminal, blocks = task
+    model, begin, terminal, blocks = task.model, task.start, task.terminal, task.blocks
     plans, perturbations, limits, residuals, first = batch
-    zero, m, start_motion = 0.0 * load_element(plans, 0), len(K), start.motion
+    zero, m = 0.0 * load_element(plans, 0), len(task.K)
     motion = Motion(
-        start_motion.v_x + zero, start_motion.v_y + zero, start_motion.gamma + zero, zero, zero,
+        begin.motion.v_x + zero, begin.motion.v_y + zero, begin.motion.gamma + zero, zero, zero,
         zero, zero, zero, zero,
-        start_motion.phi + zero, start_motion.phi_dot + zero, zero, zero,
+        begin.motion.phi + zero, begin.motion.phi_dot + zero, zero, zero,
     )  # fmt: skip
-    state = _PredictionState(
-        motion, start.T_l + zero, start.T_r + zero, start.delta_f + zero,
-        start.added_command + zero, start.refs[0] + zero, start.refs[1] + zero,
-        start.push.F_d + zero, start.push.N_d + zero,
-        start.share_before + zero, start.command_before + zero,
+    state = PredictionState(
+        motion, begin.T_l + zero, begin.T_r + zero, begin.delta_f + zero,
+        begin.added_command + zero, begin.beta_ref + zero, begin.gamma_ref + zero,
+        begin.F_d + zero, begin.N_d + zero, begin.share_before + zero, begin.command_before + zero,
     )  # fmt: skip
-    beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
+    beta = compute_sideslip_angle(motion.v_x, motion.v_y, model.kind.small_angle)
     n_step = N_RESIDUALS + len(terminal) - N_TERMINAL
     row, last = 0, n_step * (blocks.sum() - 1)
     for b in range(len(blocks)):
@@ -326,7 +311,7 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             steer_beyond = model.authority * load_element(perturbations, m * b + 1)
         for k in range(blocks[b]):
             share, added_command, moment_limit, steer_limit = _compute_commands(
-                model, start, K, state, beta, moment_share, steer_share
+                task, state, beta, moment_share, steer_share
             )
             if k == 0:
                 store_element(limits, moment_limit, m * b)
@@ -337,7 +322,7 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
                 store_element(first, added_command, 1)
             ago = state
             state, efforts = _predict_step(
-                model, start, state, share, added_command, share_beyond, steer_beyond
+                task, state, share, added_command, share_beyond, steer_beyond
             )
             motion = state.motion
             beta = compute_sideslip_angle(motion.v_x, motion.v_y, model.kind.small_angle)
@@ -358,5 +343,4 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
                 store_element(residuals, span * changes[1], row + 7)
             row += n_step
     for j in range(len(terminal)):
-        value = _multiply_row(terminal, j, model, start.driver, state, beta)
-        store_element(residuals, value, row + j)
+        store_element(residuals, _multiply_row(terminal, j, task, state, beta), row + j)

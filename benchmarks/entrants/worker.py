@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.env_info import CarVectorEnv, EnvView
+from ...agents.env_info import CarVectorEnv, EnvView, get_env_facts
 from ...agents.learned.policy import ZIP
 from ...envs.numerics.kernel_cache import LAYERS, find_kernel_folder
 from ...envs.record import Array
@@ -78,9 +78,8 @@ class _ChildProcess:
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # of a message that stops halfway
             with socket.socket(fileno=os.dup(self._pipe.fileno())) as end:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))
-        start = ChildSettings(scratch, drive.allowed)
         self._left, self._limit = _GRACE, _GRACE
-        self.call(start)
+        self.call(ChildSettings(scratch, drive.allowed))
         self._left = self._limit = drive.limit
 
     def call(self, *message: object, length: int | None = None) -> bytes:
@@ -161,7 +160,8 @@ class _RemotePolicy:
     def __init__(
         self, child: _ChildProcess, source: str, trust: bool, env: CarVectorEnv, **options: object
     ) -> None:
-        view = EnvView.from_env(env)
+        spaces = env.single_observation_space, env.single_action_space
+        view = EnvView(env.num_envs, get_env_facts(env), *spaces)
         self._child, self._shape = child, (view.num_envs, view.facts.width)
         child.call("agent", source, view, {"trust": trust, **options})
 

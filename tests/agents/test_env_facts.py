@@ -14,7 +14,7 @@ from gymnasium.wrappers import vector
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.env_info import get_env_facts, get_layout, list_plant_kinds
+from sideslip.agents.env_info import get_env_facts, get_layout
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
 from sideslip.estimators.vector.estimate import TruthObservation as BatchTruth
@@ -250,4 +250,4 @@ def test_what_is_no_env_of_ours_is_refused_in_one_line() -> None:
 def test_rows_of_a_native_env_show_each_plant() -> None:
     rows = [{"base": "slalom", "tyres": tyres} for tyres in ("linear", "fiala")]
     env = gym.make_vec("sideslip/YawFusion-v0", num_envs=2, scenario=rows)
-    assert {kind.tyres for kind in list_plant_kinds(env)} == {"linear", "fiala"}
+    assert {kind.tyres for kind in get_env_facts(env).plants} == {"linear", "fiala"}

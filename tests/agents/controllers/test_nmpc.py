@@ -57,7 +57,7 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
 
 
 def cost_of(agent: Nmpc, found: Any, plan: np.ndarray) -> float:
-    all = _make_plan_batch(len(plan), found.blocks, 1)
+    all = _make_plan_batch(found, len(plan), 1)
     all.plans[:, 0] = plan
     _simulate_batch(found, all)
     return float((all.residuals**2).sum())
@@ -124,10 +124,10 @@ def test_what_it_foresees_is_what_comes() -> None:
     scenario = {"base": "straight", "friction": 0.3, **quiet}
     env, agent = made(YAW, scenario=scenario, reference="model")
     obs, _ = env.reset(seed=0, options={"state": {"v_y": 0.6, "gamma": -0.3}})
-    blocks = agent.design.blocks
     for _ in range(5):
-        all = _make_plan_batch(len(blocks), blocks, 1)
-        _simulate_batch(problem(agent, obs), all)
+        found = problem(agent, obs)
+        all = _make_plan_batch(found, len(found.blocks), 1)
+        _simulate_batch(found, all)
         obs, _, _, _, info = env.step(all.first[:1, 0].astype(np.float32))
         foreseen = all.residuals[:2, 0] / np.sqrt(0.01) * [0.02, 0.1]
         came = [info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]]
@@ -189,8 +189,8 @@ def test_a_damped_step_is_the_solution() -> None:
 def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
     """At a limit beyond which it would be cheaper; where it is cheaper within, it moves."""
     rng = np.random.default_rng(3)
-    blocks = np.array([3, 2])
-    all = _make_plan_batch(4, blocks, 5)
+    env, agent = made(YAW, scenario=SMALL, reference="model")
+    all = _make_plan_batch(problem(agent, observe(env, 7.0, true_friction=0.9)), 4, 5)
     J, r = rng.normal(size=(len(all.residuals), 4)), rng.normal(size=len(all.residuals))
     all.residuals[:] = r[:, None] + _DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
     falls = -np.sign(J.T @ r)  # where the cost falls
