@@ -74,7 +74,7 @@ _ENVIRONMENTS |= {
     _id.replace("-v0", "-v1"): _kwargs | {"world": "v1"} for _id, _kwargs in _ENVIRONMENTS.items()
 }
 filterwarnings("ignore", r".*environment sideslip/\w+-v0 is out of date", DeprecationWarning)
-# Linear, Gaussian, known: the best policy's cost is computed (`agents.optimum`).
+# Linear, Gaussian, known: the best policy's cost is computed (`agents.baselines`).
 # The noise of sensors that the optimal filter does not read leaves them nothing to say.
 _MOTORS = {"motor_lag": 0.0, "steering_lag": 0.0, "motor_torque": 600.0}
 _LINEAR = {

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol, overload
 from ..envs.validation import check_options
 from ..estimators.make import Registry
 from .controllers.base import Controller, NoControl
-from .controllers.lane_keeping import LaneKeeping
-from .controllers.lqr import AdaptiveLqr, Lqr
+from .controllers.lqr import AdaptiveLqr, LaneKeeping, Lqr
 from .controllers.mpc import AdaptiveNmpc, Mpc, Nmpc
 from .controllers.two_dof import Feedforward, TwoDof
 from .controllers.yaw_stability import Esc, ModelFollowing, SlidingMode

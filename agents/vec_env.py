@@ -28,8 +28,7 @@ _ROW_ATTRIBUTES = (  # each is a sequence in the vector env, with an item for ea
     "estimator", "np_random", "np_random_seed", "config",
 )  # fmt: skip
 _SHARED_ATTRIBUTES = (  # each is the same for all rows
-    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode",
-    "metadata",
+    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
 _OTHER_NAMES = {  # of a row, in the vector env, where it has the same name of all rows

@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.baselines import OUTPUTS
-from sideslip.agents.optimum import (
+from sideslip.agents.baselines import (
+    OUTPUTS,
     Lqg,
     Optimum,
     _make_linear_plant,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, _make_lane_model
+from sideslip.agents.controllers.lqr import HASTE, MOVED, LaneKeeping, _make_lane_model
 from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
