@@ -4,6 +4,7 @@ The forecast has driver, wind and disturbances of every step, which the actions 
 """
 
 import functools
+from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -67,29 +68,10 @@ class PreviewStep(NamedTuple):
     effort: Scalar  # 1, and 0 at the episode's end, after which no effort counts
 
 
-class PlanState(NamedTuple):
-    """States of a plan in SI units: motion, actuators, the driver's integral."""
-
-    v_x: Scalar
-    v_y: Scalar
-    gamma: Scalar
-    psi: Scalar
-    X: Scalar
-    Y: Scalar
-    s: Scalar
-    y: Scalar
-    theta: Scalar
-    phi: Scalar
-    phi_dot: Scalar
-    slip_f: Scalar
-    slip_r: Scalar
-    T_l: Scalar  # torque of the left motor (N m)
-    T_r: Scalar
-    integral: Scalar
-    slewing: Scalar  # added steering that is commanded (rad)
-    added: Scalar  # added steering that is applied (rad)
-    command_l: Scalar  # command of the left motor (N m)
-    command_r: Scalar
+# States of a plan: those of `Motion`, the motors' torques (N m), the driver's integral, the added
+# steering as it is commanded and applied (rad), and the motors' commands (N m).
+PlanState = namedtuple("PlanState", "v_x v_y gamma psi X Y s y theta phi phi_dot slip_f slip_r "
+                       "T_l T_r integral slewing added command_l command_r")  # fmt: skip
 
 
 class PlanParams(NamedTuple):

@@ -17,13 +17,7 @@ from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.vehicle.linear import LinearModel, make_vision_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
-from ..design.sampled_model import (
-    SPEEDS,
-    DesignModel,
-    DesignSpec,
-    interpolate_gains,
-    make_gain_table,
-)
+from ..design.sampled_model import SPEEDS, DesignModel, DesignSpec, interpolate_gains, make_gains
 from ..env_info import AnyEnv, get_env_facts
 from .base import Controller, check_positive
 
@@ -166,10 +160,9 @@ class Lqr(Controller):
         self.vehicle, self.scheduled = car, bool(fronts)
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         speeds = SPEEDS[::2] if fronts or self._car_columns else SPEEDS  # many tables: half of it
-        self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
+        self.table, self._terminal = make_gains(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
-        slew = car.steering_rate * self.control_period * TICK
-        limits = self.authority, slew, car.front_arm
+        limits = self.authority, car.steering_rate * self.control_period * TICK, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
     def _list_extra_entries(self, names: Sequence[str]) -> tuple[str, ...]:

@@ -266,7 +266,7 @@ class GainTables(NamedTuple):
 
 
 @lru_cache(maxsize=128)  # a table has at most 0.3 MB; a matrix comes back to a car often
-def make_gain_table(
+def make_gains(
     vehicle: Vehicle, spec: DesignSpec, speeds: Sequence[float], fronts: Sequence[float],
     rears: Sequence[float],
 ) -> GainTables:  # fmt: skip

@@ -214,8 +214,7 @@ class StreamSynchroniser:
         last, patience = self._last, self.patience
         if last is not None and self.silent and patience is not None and self.silent > patience:
             # the first call beyond the patience catches up on the ticks that it waited for
-            missed = patience + 1 if before == patience else 1
-            for _ in range(missed):
+            for _ in range(patience + 1 if before == patience else 1):
                 self.counts["held"] += 1
                 last = last._replace(number=last.number + 1, begins=False)
                 yield self._finish_tick(last)

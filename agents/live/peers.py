@@ -34,16 +34,7 @@ from ...estimators.design.models import FOREIGN_STATE, STATES
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout
 from .loop import LOOPBACK, Port, clock, wait_until
-from .messages import (
-    KINDS,
-    TICK_US,
-    Address,
-    Arrival,
-    DatagramKind,
-    LoopStatus,
-    RejectReason,
-    decode,
-)
+from .messages import KINDS, TICK_US, Address, DatagramKind, LoopStatus, RejectReason, decode
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -91,7 +82,8 @@ class _WireAgent:
         if self.step:
             end = clock() + round(1e9 * CONTROL_TIMEOUT)
         while (is_late := self._newest < tick * TICK_US) and clock() < end:
-            self._read(self.port.wait((end - clock()) * 1e-9))
+            for arrival in self.port.wait((end - clock()) * 1e-9):
+                self._read(arrival.data)
         if is_late and self.step:
             text = f"no control came within {CONTROL_TIMEOUT:g} s for tick {tick}"
             place = f"--step at {self.to[0]}:{self.to[1]}"
@@ -125,16 +117,15 @@ class _WireAgent:
     def _get_due_time(self, tick: int) -> int:
         return self._start_time + round(tick * TICK * 1e9 / self.speed)
 
-    def _read(self, arrivals: list[Arrival]) -> None:
-        for arrival in arrivals:
-            message = decode(arrival.data)
-            if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
-                continue
-            if message.stamp >= self._newest:
-                moment, steering = message.values  # N m, rad
-                shares = moment / self._facts.full_scale, steering / self._facts.authority
-                self._action = np.array(shares[: self._facts.width], np.float32)
-                self._newest = message.stamp
+    def _read(self, data: bytes) -> None:
+        message = decode(data)
+        if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
+            return
+        if message.stamp >= self._newest:
+            moment, steering = message.values  # N m, rad
+            shares = moment / self._facts.full_scale, steering / self._facts.authority
+            self._action = np.array(shares[: self._facts.width], np.float32)
+            self._newest = message.stamp
 
 
 def simulate(

@@ -24,7 +24,7 @@ from ..rollout import compute_cost_ratios, evaluate_episodes
 from ..vec_env import make_native_env
 from .config import TrainingTask
 from .export import convert_sb3_policy
-from .normalise import StandardisedArguments
+from .normalise import Standardisation
 
 with require_extra("train", "training needs {}"):
     import torch
@@ -108,7 +108,7 @@ class Checkpoint:
     task: dict[str, Any]  # fields of `TrainingTask`
     steps: int  # so far
     aim: dict[str, Any]  # fields of `RunRecord`
-    scaling: list[Any]  # of the observations: `StandardisedArguments`
+    scaling: list[Any]  # of the observations: `Standardisation`
     evaluations: list[Any]  # so far
 
 
@@ -124,7 +124,7 @@ class EvalCallback(BaseCallback):
         state: State of a checkpoint, None for a new training.
     """
 
-    scaling: StandardisedArguments  # of the model's observations, which `Trainer.build` sets
+    scaling: Standardisation  # of the model's observations, which `Trainer.build` sets
 
     def __init__(
         self, task: TrainingTask, folder: Path, run_options: RunOptions, steps: int,

@@ -19,7 +19,7 @@ from ..env_info import CarVectorEnv
 from ..learned.policy import Policy
 from ..vec_env import make_native_env
 from .export import TORCH_ACTIVATIONS
-from .normalise import Standardised, StandardisedArguments
+from .normalise import Standardisation, Standardised
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # isort: skip
@@ -234,7 +234,7 @@ class TrainingTask:
         return options
 
     def make_model(
-        self, env: VecEnv, seconds: float, scaling: StandardisedArguments, **rest: Any
+        self, env: VecEnv, seconds: float, scaling: Standardisation, **rest: Any
     ) -> BaseAlgorithm:
         """Make an untrained model.
 

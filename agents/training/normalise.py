@@ -26,8 +26,8 @@ CLIP = 10.0  # limit of a standardised entry (standard deviations)
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
-class StandardisedArguments(NamedTuple):
-    """The arguments of `Standardised`, in JSON types."""
+class Standardisation(NamedTuple):
+    """The standardisation of observations by `Standardised`, in JSON types."""
 
     mean: list[float]
     scale: list[float]  # 0: not read

@@ -38,13 +38,7 @@ from .callbacks import (
 )
 from .config import TrainingTask, get_policy_form
 from .export import check_zip, load_normaliser
-from .normalise import (
-    CLIP,
-    RewardScale,
-    RewardScaleWrapper,
-    StandardisedArguments,
-    read_normalisation,
-)
+from .normalise import CLIP, RewardScale, RewardScaleWrapper, Standardisation, read_normalisation
 from .student import compute_scale, compute_whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
@@ -122,7 +116,7 @@ class _WarmStart(NamedTuple):
 
     name: str  # of the zip or the policy
     parameters: dict[str, Any]  # as of `get_parameters`; of a policy the actor's alone
-    scaling: StandardisedArguments  # of the model's observations
+    scaling: Standardisation  # of the model's observations
     variables: dict[str, Any] = {}  # noqa: RUF012  a zip's tensors of no module
     is_whole: bool = False  # whether it is a zip, which has all tensors of a model
 
@@ -145,7 +139,7 @@ class _WarmStart(NamedTuple):
             mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
             scales = get_scales(layout) if _is_scaled(file, layout) else np.ones(len(layout))
             numbers = (mean * scales).tolist(), (scale / scales).tolist(), clip, None
-        return cls(str(file), parameters, StandardisedArguments(*numbers), variables or {}, True)
+        return cls(str(file), parameters, Standardisation(*numbers), variables or {}, True)
 
     @classmethod
     def from_policy(cls, policy: Policy, task: TrainingTask) -> "_WarmStart":
@@ -170,7 +164,7 @@ class _WarmStart(NamedTuple):
             arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
         tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
         numbers = network.mean.tolist(), network.scale.tolist(), network.clip
-        return cls(policy.name, {"policy": tensors}, StandardisedArguments(*numbers))
+        return cls(policy.name, {"policy": tensors}, Standardisation(*numbers))
 
     def load(self, model: BaseAlgorithm) -> None:
         """Load the tensors into a model; ValueError where it has other ones."""
@@ -274,7 +268,7 @@ class Trainer:
         callback = EvalCallback(task, self._folder, self.run_options, self.steps, policy, state)
         steps = state.steps if state else 0
         if state:
-            callback.scaling = StandardisedArguments(*state.scaling)
+            callback.scaling = Standardisation(*state.scaling)
         else:
             callback.scaling = start.scaling if start else _measure_scaling(task)
         options = dict[str, Any](env_kwargs=task.options(task.num_envs), scaled=False)
@@ -316,7 +310,7 @@ def _make_source(
     return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
 
 
-def _measure_scaling(task: TrainingTask) -> StandardisedArguments:
+def _measure_scaling(task: TrainingTask) -> Standardisation:
     """Measure each entry's scaling under random actions; for gradients it whitens them, too."""
     kwargs, env = task.settings.get("policy_kwargs", {}), task.vector_env(_SCALING_ENVS)
     spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
@@ -336,7 +330,7 @@ def _measure_scaling(task: TrainingTask) -> StandardisedArguments:
         correlated = _collect_observations(env, spread, task.scaling_seed, _CORRELATION_TIME)
         standard = np.clip((correlated - mean) * scale, -CLIP, CLIP)
         mixing = compute_whitening(standard).tolist()
-    return StandardisedArguments(mean.tolist(), scale.tolist(), CLIP, mixing)
+    return Standardisation(mean.tolist(), scale.tolist(), CLIP, mixing)
 
 
 def _collect_observations(
