@@ -29,7 +29,7 @@ TICK_US = 1000  # us a tick
 PATIENCE = 10  # ticks of silence, from which on the last row is held
 MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
 MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
-_WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
+_WINDOW = 1024  # sequence numbers; one further back is of a sender that began anew
 _MAX_WAITING = 64  # packets of slow sensors before a fast row
 Address = tuple[str, int]  # host and port
 
@@ -177,7 +177,7 @@ class StreamSynchroniser:
         self.sender: Address | None = None  # of the newest row
         self.accepted: list[bytes] = []  # of the newest batch
         self.over, self.silent = False, 0  # the drive's end came; calls since the last fast row
-        self._newest: dict[int, int] = {}  # sequence numbers by kind
+        self._newest: dict[int, Message] = {}  # by kind
         self._waiting: list[tuple[int, Message]] = []
         self._last: Tick | None = None
         self._behind = 0
@@ -223,9 +223,10 @@ class StreamSynchroniser:
         """Return whether a message is the newest of its kind; count it otherwise."""
         newest = self._newest.get(message.kind)
         if newest is not None:
-            advance = (message.sequence - newest) & 0xFFFFFFFF
-            behind = 2**32 - advance
-            if advance == 0 or behind < _WINDOW:
+            advance = (message.sequence - newest.sequence) & 0xFFFFFFFF
+            # a lower number on a later datagram is of a sender that began anew
+            is_older = 2**32 - advance < _WINDOW and message.stamp <= newest.stamp
+            if advance == 0 or is_older:
                 self.counts[RejectReason.REORDERED if advance else RejectReason.DUPLICATE] += 1
                 return False
             if advance < 2**31:
@@ -233,7 +234,7 @@ class StreamSynchroniser:
             else:
                 self.counts["restarted"] += 1
                 self._last = None if message.kind == DatagramKind.INERTIAL else self._last
-        self._newest[message.kind] = message.sequence
+        self._newest[message.kind] = message
         return True
 
     def _process_row(self, message: Message) -> Iterator[Tick]:

@@ -236,6 +236,16 @@ def test_a_sender_that_began_anew_is_heard_again() -> None:
     assert assembler.counts["restarted"] == 1
 
 
+def test_a_camera_that_began_anew_is_heard_at_once() -> None:
+    assembler = StreamSynchroniser(None)
+    for tick, number in enumerate((20, 21, 0, 1), start=1):  # its numbers start again, time goes on
+        ticks = ticks_of(assembler, camera(number, stamp=1000 * tick), inertial(tick))
+        assert len(ticks[0].packets) == 1
+    late, *_ = ticks_of(assembler, camera(0, stamp=3000), inertial(5))
+    assert not len(late.packets) and assembler.counts["restarted"] == 1
+    assert assembler.counts[RejectReason.REORDERED] == 1
+
+
 def test_the_longest_gap_that_is_bridged() -> None:
     for missing, begins in ((MAX_HELD, False), (MAX_HELD + 1, True)):
         assembler = StreamSynchroniser(None)
