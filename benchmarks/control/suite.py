@@ -16,10 +16,10 @@ import numpy as np
 
 from ...envs.record import Array
 from ...envs.vehicle.parameters import VEHICLES
-from ..harness.results import Suite
+from ..harness.results import Explorer, Panel, Suite
 from ..harness.stats import Estimate, geometric_mean
-from ..harness.verdict import Explorer, Panel, describe_leader, format_verdict, summarise_names
 from ..report.study import Request, Study
+from ..report.tables import describe_leader, format_verdict, summarise_names
 from .calibration import measure_foresight, read_current
 from .entries import (
     EPISODES,

@@ -1,4 +1,4 @@
-"""Results of suites: rows for machines, tables of numbers, and the files of rows."""
+"""Results of suites: rows for machines, tables and explorers for people, and the files of rows."""
 
 import json
 import math
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from ... import __version__
 from ...envs.io import atomic_file, from_json, write_atomic
+from ...envs.record import Array
 from ...envs.validation import check_choice
 from .metrics import METRICS
 from .stats import Estimate
-from .verdict import Explorer
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -93,6 +93,29 @@ class ResultTable:
             for line in self.cells
         ]
         return [(column, [line[i] for line in lines]) for i, column in enumerate(columns)]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One of the plots above each other."""
+
+    label: str  # quantity with its unit
+    lines: Sequence[tuple[str, str]]  # signals and legend; the first has the entry's colour
+
+
+@dataclass
+class Explorer:
+    """Time series of which two are shown beside each other."""
+
+    title: str
+    menus: Sequence[str]  # labels of the parts of a cell's key but the last one, which is the entry
+    # signals (n,) by key, with time "t" (s); with X, Y (m) and psi (rad) a cell is shown in motion
+    cells: Mapping[tuple[str, ...], Mapping[str, Array]]
+    panels: Sequence[Panel]
+    caption: str = ""  # caption, a sentence
+    pair: tuple[str, str] = ("", "")  # the two entries at the start
+    # length and width of the car (m) by the shared part of the key
+    bodies: Mapping[tuple[str, ...], tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass

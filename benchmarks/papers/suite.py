@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, Column, Line, ResultTable, Suite
-from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
+from ..report.tables import format_verdict, summarise_names
 from . import (
     dakf_stability,
     double_layer,

@@ -21,7 +21,7 @@ from ...estimators.make import make_estimator
 from ...estimators.wires import SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
-from ..harness.verdict import MAX_NIS, describe_innovations, format_verdict
+from ..report.tables import MAX_NIS, describe_innovations, format_verdict
 from .checks import CHECKS, InspectedDrive
 from .motion import LoggedMotion
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.rendering.palette import INK, find_base, find_colour
-from ..harness.results import ResultTable, Suite, write_text
-from ..harness.verdict import Explorer
+from ..harness.results import Explorer, ResultTable, Suite, write_text
 from .tables import TextColumn, format_columns
 
 if TYPE_CHECKING:

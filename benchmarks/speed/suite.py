@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict, summarise_names
 from ..report.study import Request, Study
+from ..report.tables import format_verdict, summarise_names
 from . import env_steps, plant
 from .timing import FULL, QUICK, AbsentError, Taken, format_absences, format_three_digits
 

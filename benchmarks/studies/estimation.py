@@ -18,9 +18,9 @@ from ...estimators.analysis.limits import compute_error_bound
 from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
-from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
 from ..report.study import Request, Study
+from ..report.tables import describe_leader, format_verdict
 
 _CHUNK = 5
 _COLUMNS = (

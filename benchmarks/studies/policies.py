@@ -35,7 +35,7 @@ from ..control.tasks import (
 from ..harness.parallel import run_cases
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
-from ..harness.verdict import format_percent, format_verdict
+from ..report.tables import format_percent, format_verdict
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.recorded import receiver
+from sideslip.benchmarks.report.tables import LETTERS, LINES
 from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
 from tests.benchmarks.conftest import Run

@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import Column, Line, ResultTable, Suite
+from sideslip.benchmarks.harness.results import Column, Explorer, Line, Panel, ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.verdict import Explorer, Panel
 
 HOSTILE = "</script><b>1 & 2</b>"
 COMMAND = "sideslip bench --html report.html --json results.json"

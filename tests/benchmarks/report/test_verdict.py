@@ -7,12 +7,6 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.verdict import (
-    LETTERS,
-    LINES,
-    describe_leader,
-    format_verdict,
-)
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredClaim, MeasuredPart
 from sideslip.benchmarks.procedures import iso
@@ -21,6 +15,7 @@ from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
 from sideslip.benchmarks.recorded import replay as recorded
 from sideslip.benchmarks.recorded.replay import ReplayResult as Replayed
+from sideslip.benchmarks.report.tables import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 from sideslip.benchmarks.speed.timing import Taken
