@@ -37,7 +37,7 @@ def get_command_line() -> str:
 
 def announce_torch() -> None:
     """Say that PyTorch is loaded, which takes seconds; nothing where it is there already."""
-    if sys.modules.get("torch") is None:
+    if "torch" not in sys.modules:
         print("sideslip: loading PyTorch, some seconds ...", file=sys.stderr, flush=True)
 
 
@@ -175,10 +175,8 @@ def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[CarEnv, Agent]"
     Returns:
         Env and agent.
     """
-    if setup["env"] is not None:
-        check_env(setup["env"])
-        return _make_driver(setup, setup["env"], trust)
-    first, *others = _DEFAULT_ENVS
+    first, *others = _DEFAULT_ENVS if setup["env"] is None else (setup["env"],)
+    check_env(first)
     try:
         return _make_driver(setup, first, trust)
     except ValueError:

@@ -16,8 +16,8 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from ...envs.io import write_atomic
 from ...envs.validation import check_choice
+from ..harness.results import write_text
 from ..report.tables import format_verdict
 from .common import make_driver, make_setup, print_written, refuse_unused_options, show_episode
 from .names import check_env
@@ -72,9 +72,8 @@ class _Live:
             refuse_unused_options(self, "replay estimator agent env json trust", "--replay")
             self._replay(self.replay, setup)
         elif self.estimator is not None:
-            refuse_unused_options(
-                self, " ".join({*vars(self)} - {"to"}), "an ESTIMATOR: see --publish"
-            )
+            used = " ".join({*vars(self)} - {"to"})
+            refuse_unused_options(self, used, "an ESTIMATOR: see --publish")
             self._run_loop(setup, [_parse_address(text) for text in self.publish or []])
         elif self.simulate:
             used = "simulate env vehicle scenario option control_period seed to port step speed"
@@ -183,7 +182,7 @@ class _Live:
 
     def _write(self, numbers: Mapping[str, Any]) -> None:
         if self.json is not None:
-            write_atomic(self.json, (json.dumps(numbers, indent=1) + "\n").encode())
+            write_text(self.json, json.dumps(numbers, indent=1) + "\n")
             print_written(console, self.json)
 
 

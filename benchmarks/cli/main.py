@@ -161,9 +161,7 @@ class _Bench:
     address: str
 
     def run(self) -> None:
-        comparison = None
-        if self.agent or self.estimator:
-            comparison = self._make_comparison(self.agent or [], self.estimator or [])
+        comparison = self._make_comparison() if self.agent or self.estimator else None
         of_entries = {
             "--scenario": self.scenario, "--env": self.env_id, "--fresh": self.fresh,
             "--vehicle": self.vehicle, "--trust": self.trust, "--limit": self.limit is not None,
@@ -200,7 +198,7 @@ class _Bench:
             write_page(self.page, done)
         common.print_written(console, self.page)
 
-    def _make_comparison(self, agents: list[str], filters: list[str]) -> "ComparisonRequest":
+    def _make_comparison(self) -> "ComparisonRequest":
         """Make the request of a user's own entries."""
         from ..control.entries import QUICK_EPISODES
         from ..entrants.challenge import EPISODES, ComparisonRequest, make_user_entries
@@ -208,8 +206,8 @@ class _Bench:
 
         if list(self.suites or []) not in ([], ["control"]):
             raise ValueError("--agent and --estimator go with the suite control alone")
-        estimators = ["" if name == "none" else name for name in filters]
-        entries = tuple(make_user_entries(agents, estimators, self.trust))
+        estimators = ["" if name == "none" else name for name in self.estimator or []]
+        entries = tuple(make_user_entries(self.agent or [], estimators, self.trust))
         if not entries:
             raise ValueError("--estimator none goes with --agent")
         episodes = self.episodes or (QUICK_EPISODES if self.quick else EPISODES)

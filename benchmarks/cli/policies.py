@@ -17,14 +17,9 @@ from rich.table import Table
 
 from ..harness.parallel import Bar, use_shared_bar
 from ..harness.results import check_writable
-from .common import (
-    announce_torch,
-    get_command_line,
-    print_written,
-    refuse_unused_options,
-    show_episode,
-    write_output,
-)
+from ..harness.stats import Estimate
+from . import common
+from .common import get_command_line, print_written
 from .names import check_env
 from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
@@ -99,7 +94,7 @@ class _Enjoy:
 
         check_film(self.video)
         if self.card:
-            refuse_unused_options(self, "policy env trust card", "--card")
+            common.refuse_unused_options(self, "policy env trust card", "--card")
         if not self.policy.endswith(".zip"):
             self._drive(self.policy)
             return
@@ -123,10 +118,10 @@ class _Enjoy:
             return
         with use_shared_bar(console, f"enjoy {self.policy}"):
             evaluation = evaluate_policy(path, self.episodes, seed=self.seed, **options)
-        write_output(console, [evaluation.make_suite()], vars(self))
+        common.write_output(console, [evaluation.make_suite()], vars(self))
         name, seed, task = evaluation.policy.name, evaluation.seeds[0], evaluation.task
         first = evaluation.entries[name]
-        show_episode(console, rollout(*first.make(task), seed), name, {"plot": self.plot})
+        common.show_episode(console, rollout(*first.make(task), seed), name, {"plot": self.plot})
         if self.video is not None:
             cars = (name, first), ("no control", evaluation.entries["none"])
             drivers = [FilmDriver(driver, *entry.make(task)) for driver, entry in cars]
@@ -150,27 +145,17 @@ def _show_card(console: Console, policy: "Policy") -> None:
     console.print(table)
 
 
-def evaluate_on_tasks(file: Path, kind: str, episodes: int) -> Table:
-    """Evaluate a policy on the tasks of its class, and write the costs into its card.
-
-    Args:
-        file: File of the policy.
-        kind: Class of tasks.
-        episodes: Number of episodes of each task.
-
-    Returns:
-        Table with a row for each task.
-    """
+def _evaluate_on_tasks(file: Path, kind: str, episodes: int) -> Table:
+    """Evaluate a policy on the tasks of its class, into its card and a table."""
     from ..studies.policies import record_evaluation
 
     table = Table("task", "in % of nominal", "adaptive-nmpc", "better", "fails")
     with use_shared_bar(Console(), f"judge {file}"):
         written = record_evaluation(file, episodes, kind)
     for task, record in written["cost in % of nominal"].items():
-        cost, low, high = record["policy"]
-        better, fails = record["better than adaptive-nmpc"][0], record["fails"]
-        numbers = f"{cost:.0f} [{low:.0f}, {high:.0f}]", f"{record['adaptive-nmpc'][0]:.0f}"
-        table.add_row(task, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
+        cost, rival = Estimate(*record["policy"]).inline(digits=".0f"), record["adaptive-nmpc"][0]
+        shares = record["better than adaptive-nmpc"][0], record["fails"]
+        table.add_row(task, cost, f"{rival:.0f}", *(f"{100.0 * x:.0f} %" for x in shares))
     return table
 
 
@@ -202,7 +187,7 @@ class _Distill:
     out: File = take("The file; default: NAME here.")
 
     def run(self) -> None:
-        announce_torch()
+        common.announce_torch()
         from ...agents.training.distill import RoundResult, distill
         from ...agents.training.student import DistillConfig
         from ..studies.policies import Lessons
@@ -227,7 +212,7 @@ class _Distill:
 
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
             distill(card, lessons.make_tasks(), config, target, show)
-        console.print(evaluate_on_tasks(target, self.kind, self.episodes))
+        console.print(_evaluate_on_tasks(target, self.kind, self.episodes))
         print_written(console, target)
 
 
@@ -273,16 +258,9 @@ class _Train:
     resume: bool = take("Go on with the training in the folder.", False, "--resume")
 
     def run(self) -> None:
-        announce_torch()
+        common.announce_torch()
         from ...agents.learned.policy import load_policy
-        from ...agents.training import trainer
-        from ...agents.training.callbacks import (
-            CURVE,
-            POLICY,
-            RunOptions,
-            RunRecord,
-            describe_for_zoo,
-        )
+        from ...agents.training import callbacks, trainer
         from ...agents.training.config import TrainingTask, resolve_settings
         from ..studies.policies import prepare_start, record_evaluation
 
@@ -301,6 +279,7 @@ class _Train:
         task = trainer.read_training(out).task if resume and out else new(**options)
         start = self.trained_agent.stem if self.trained_agent else ""
         folder = _choose_folder(task, start, out, logs)
+        file = folder / callbacks.POLICY
         if self.conf_file is not None:
             initial = trainer.read_training(folder).load_initial_policy() if resume else agent
             options["settings"] = resolve_settings(self.conf_file, task.algo, task.env_id, initial)
@@ -309,7 +288,8 @@ class _Train:
             task, record = saved.task, saved.record
         else:
             task = new(**options)
-            record = RunRecord(int(task.settings["n_timesteps"]), RunOptions.eval_freq)
+            usual = int(task.settings["n_timesteps"]), callbacks.RunOptions.eval_freq
+            record = callbacks.RunRecord(*usual)
         steps = record.steps if self.steps is None else self.steps
         eval_freq = record.eval_freq if self.eval_freq is None else self.eval_freq
         if resume:
@@ -325,27 +305,27 @@ class _Train:
         with use_shared_bar(console if self.progress else None, "train", "steps", steps) as bar:
             project, show = self.wandb_project_name if self.track else "", partial(_show, bar)
             logged = self.tensorboard_log, show, command, project
-            run_options = RunOptions(eval_freq, self.device, *logged)
+            run_options = callbacks.RunOptions(eval_freq, self.device, *logged)
             if logs is not None:
-                describe_for_zoo(task, folder, steps, eval_freq)
+                callbacks.describe_for_zoo(task, folder, steps, eval_freq)
+            training = task, steps, folder, resume, run_options, agent, self.trust
             try:
-                training = task, steps, folder, resume, run_options, agent, self.trust
                 trained = trainer.Trainer(*training).train()
             except Exception:
-                if logs is not None and not (folder / POLICY).exists():
+                if logs is not None and not file.exists():
                     shutil.rmtree(folder)  # it has nothing but the zoo's description
                 raise
         console.print(_make_table(trained))
-        kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
+        kind = load_policy(file).card.algorithm_options.get("class")
         if kind is not None:
-            console.print(evaluate_on_tasks(folder / POLICY, kind, _TASK_EPISODES))
+            console.print(_evaluate_on_tasks(file, kind, _TASK_EPISODES))
         else:
-            costs = record_evaluation(folder / POLICY, EPISODES)["cost"]
+            costs = record_evaluation(file, EPISODES)["cost"]
             shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
             where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
             text = f"mean cost on test seeds{where}: {shown}"
             console.print(text, highlight=False, soft_wrap=True)
-        print_written(console, folder / POLICY, folder / CURVE)
+        print_written(console, file, folder / callbacks.CURVE)
 
 
 def _make_table(trained: "EvalCallback") -> Table:

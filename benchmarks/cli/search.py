@@ -122,9 +122,8 @@ class _TuneController:
         console, shipped = Console(), (FILE, controllers.LOGS) if self.write else (None, None)
         check_writable(*filter(None, (self.out, shipped[0])))
         where = self.storage or STORAGE, "tpe", self.seed, self.jobs, console
-        search = SearchOptions(self.trials, *where)
+        search, seeds = SearchOptions(self.trials, *where), make_tuning_seeds(self.seeds)
         for kind in self.kind or controllers.KINDS:
-            seeds = make_tuning_seeds(self.seeds)
             task = controllers.make_controller_tuning(self.name, kind, seeds)
             try:
                 with use_engine(self.engine_name, self.address):

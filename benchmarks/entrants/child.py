@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -38,13 +38,6 @@ _INSTALLED = {*site.getsitepackages(), sys.prefix, sys.base_prefix, str(_PACKAGE
 _SYSTEM = ("/proc", "/sys", "/dev", "/etc", "/usr", "/lib", "/lib64")
 _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argument with the path
 _STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.exec", "os.posix_spawn", "os.system")
-
-
-class ChildSettings(NamedTuple):
-    """Settings that the process gets before any code of the entry runs."""
-
-    scratch: str  # the one folder in which it may write
-    allowed: frozenset[str] | None  # files it may open; None: notes them
 
 
 class _EntryServer:
@@ -92,7 +85,7 @@ class _EntryServer:
 def main() -> None:
     """Serve the driver on the connection whose descriptor is the first argument."""
     driver = Connection(int(sys.argv[1]))
-    (start,) = driver.recv()
+    scratch, allowed = driver.recv()  # where it may write; what it may open, None: all, noted
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     opened: set[str] = set()
 
@@ -100,8 +93,8 @@ def main() -> None:
         driver.send_bytes(_FAILED + text.encode())
         os._exit(1)
 
-    _limit_process(Path(start.scratch))
-    sys.addaudithook(_make_audit_hook(opened, start, refuse))
+    _limit_process(Path(scratch))
+    sys.addaudithook(_make_audit_hook(opened, scratch, allowed, refuse))
     driver.send_bytes(DONE)
     server = _EntryServer()
     with suppress(EOFError):
@@ -121,14 +114,14 @@ def main() -> None:
 
 
 def _make_audit_hook(
-    opened: set[str], start: ChildSettings, refuse: Callable[[str], None]
+    opened: set[str], scratch: str, allowed: frozenset[str] | None, refuse: Callable[[str], None]
 ) -> Callable[[str, tuple[object, ...]], None]:
     """Make the audit hook that notes what is opened outside the installation, or ends there."""
-    folders = {*_INSTALLED, *_SYSTEM, start.scratch}
+    folders = {*_INSTALLED, *_SYSTEM, scratch}
     skipped = tuple(f"{os.path.realpath(folder)}/" for folder in folders)
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
-        if event in _STARTS and start.allowed is not None:  # of which nobody knows what it opens
+        if event in _STARTS and allowed is not None:  # of which nobody knows what it opens
             refuse(f"it started a process ({event})")
         place = _OPENS.get(event)
         path = None if place is None else arguments[place]
@@ -140,7 +133,7 @@ def _make_audit_hook(
         if real.startswith(skipped) or real in opened or not os.path.isfile(real):
             return
         opened.add(real)
-        if start.allowed is not None and real not in start.allowed:
+        if allowed is not None and real not in allowed:
             refuse(f"it opened {real}, which it had not opened in the rehearsal")
 
     return hook

@@ -34,7 +34,7 @@ from ...estimators.core.filter import StepRecord
 from ...estimators.make import is_user_file
 from ...estimators.vector.batch import ForeignBatch
 from ..control.run import NUMBERS, Chunk, DriveResult, run_chunk
-from .child import DONE, ChildSettings
+from .child import DONE
 
 LIMIT = 600.0  # s of wall time a cell
 _GRACE = 60.0  # s to start in
@@ -55,15 +55,13 @@ class _ChildProcess:
         self._log = TemporaryFile()  # noqa: SIM115  # closed with the process
         scratch = self._folder.name
         variables = {"OPENBLAS_NUM_THREADS": "1", **os.environ, "SIDESLIP_QUIET": "1"}
-        variables |= {"PYTHONPATH": os.pathsep.join(sys.path)}
         variables |= {"XDG_CACHE_HOME": scratch, "TMPDIR": scratch}
+        variables["PYTHONPATH"] = os.pathsep.join(sys.path)
         variables.pop("NUMBA_CACHE_DIR", None)
-        for layer in LAYERS:  # kernels of its own: it may read ours, and write none of them
-            folder = find_kernel_folder(layer)
-            if folder is not None:
-                copy = Path(scratch, "sideslip", "kernels", folder.name)
-                with suppress(OSError):  # one that is pruned meanwhile is compiled again
-                    shutil.copytree(folder, copy, dirs_exist_ok=True)
+        for folder in filter(None, map(find_kernel_folder, LAYERS)):
+            copy = Path(scratch, "sideslip", "kernels", folder.name)  # it may read ours, not write
+            with suppress(OSError):  # one that is pruned meanwhile is compiled again
+                shutil.copytree(folder, copy, dirs_exist_ok=True)
         self._pipe, child_end = Pipe()
         with child_end:
             self._process = subprocess.Popen(
@@ -78,8 +76,8 @@ class _ChildProcess:
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # of a message that stops halfway
             with socket.socket(fileno=os.dup(self._pipe.fileno())) as end:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))
-        self._left, self._limit = _GRACE, _GRACE
-        self.call(ChildSettings(scratch, drive.allowed))
+        self._left = self._limit = _GRACE
+        self.call(scratch, drive.allowed)
         self._left = self._limit = drive.limit
 
     def call(self, *message: object, length: int | None = None) -> bytes:

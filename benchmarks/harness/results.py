@@ -85,15 +85,6 @@ class ResultTable:
     detail: bool = False  # it stands in the report alone, too long for a screen
     opened: bool = False  # the report shows it unfolded
 
-    def split(self) -> list[tuple[Column, list[Cell]]]:
-        """Split the table into columns with their cells."""
-        columns = [x if isinstance(x, Column) else Column(str(x)) for x in self.columns]
-        lines = [
-            [line.get(column.key) for column in columns] if isinstance(line, Mapping) else line
-            for line in self.cells
-        ]
-        return [(column, [line[i] for line in lines]) for i, column in enumerate(columns)]
-
 
 @dataclass(frozen=True)
 class Panel:

@@ -1,9 +1,9 @@
 """Films of drives, with other cars as ghosts, as MP4 or GIF; and a track for map programs (KML)."""
 
 import itertools
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
@@ -66,10 +66,7 @@ def write_film(
     step = base.control_period * TICK
     every = max(round(1.0 / (RATES[path.suffix.lower()] * step)), 1)
     total = base.config.base.scenario.duration / (every * step) + 1.0
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        use_shared_bar(console, str(path), "pictures") as bar,
-    ):
+    with TemporaryDirectory() as folder, use_shared_bar(console, str(path), "pictures") as bar:
         frames = bar.track(_render_frames(drivers, seed, every), total, task_id=bar.task_ids[0])
         part = Path(folder, "film").with_suffix(path.suffix.lower())
         write = _write_gif if part.suffix == ".gif" else _write_mp4

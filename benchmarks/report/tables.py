@@ -48,7 +48,9 @@ def format_columns(table: ResultTable) -> list[TextColumn]:
         table: Table.
     """
     columns = []
-    for column, cells in table.split():
+    for i, source in enumerate(table.columns):
+        column = source if isinstance(source, Column) else Column(str(source))
+        cells = [x.get(column.key) if isinstance(x, Mapping) else x[i] for x in table.cells]
         texts = [_format_cell(cell, column) for cell in cells]
         values = [_get_value(cell, column.scale) for cell in cells]
         columns.append(TextColumn(column.heading or column.key, texts, values))

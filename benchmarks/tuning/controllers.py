@@ -25,7 +25,7 @@ from ..control.entries import ADAPTIVE, JOINT, REFERENCE_FILTER, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import PairedDrives
 from ..control.tasks import NOMINAL, QUICK_LEAD_IN, ControlTask, list_scored_tasks
-from ..harness.parallel import count_cores, run_cases
+from ..harness.parallel import run_cases
 from ..harness.results import Suite, write_text
 from .search import Range, SearchOptions, make_result_table, make_study_name, run_study
 
@@ -197,7 +197,7 @@ def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
     for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once
         if error := _run_entry(control_task, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {control_task.name}: {error}")
-    evaluate = partial(_evaluate_trials, task, search.jobs or count_cores())
+    evaluate = partial(_evaluate_trials, task, search.workers)
     study = task.study, task.search, replace(search, sampler="tpe")
     return _make_log(task, run_study(*study, evaluate, len(task.seeds), task.start))
 

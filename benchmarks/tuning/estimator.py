@@ -1,16 +1,15 @@
 """Tuning of an estimator: ranges, training and test drives with their errors, entry in files."""
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from rich.console import Console
 
 from ...agents.rollout import rollout
 from ...envs.io import to_toml
@@ -21,19 +20,11 @@ from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
 from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
-from ..harness.parallel import count_cores, run_cases
+from ..harness.parallel import run_cases
 from ..harness.results import ResultTable, Suite, write_text
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from ..studies.estimation import EXPERIMENTS
-from .search import (
-    BATCH,
-    Range,
-    SearchOptions,
-    load_study,
-    make_result_table,
-    make_study_name,
-    run_study,
-)
+from .search import Range, SearchOptions, load_study, make_result_table, make_study_name, run_study
 
 _PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
 _NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
@@ -174,22 +165,13 @@ def _simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode
     return [LoggedEpisode(rollout(env, seed=x).log, make_filter_arguments(base)) for x in seeds]
 
 
-def simulate(
-    task: EstimatorTuning, seeds: Sequence[int], title: str, jobs: int | None,
-    console: Console | None,
-) -> list[LoggedEpisode]:  # fmt: skip
-    """Simulate the drives of some seeds in each scenario in turn, four a case.
-
-    Args:
-        task: Tuning.
-        seeds: Seeds.
-        title: Title of the progress bar.
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-    """
+def _simulate(
+    task: EstimatorTuning, seeds: Sequence[int], title: str, search: SearchOptions
+) -> list[LoggedEpisode]:
+    """Simulate the drives of some seeds in each scenario in turn, four a case."""
     fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
-    done = run_cases(_simulate_case, cases, title, jobs, console)
+    done = run_cases(_simulate_case, cases, title, search.jobs, search.console)
     return [drive for drives in done for drive in drives]
 
 
@@ -224,27 +206,20 @@ def _compute_stable_squares(
         return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
 
 
-def _compute_objective(errors: Array) -> float:
-    """Compute the geometric mean of the scenarios' RMSE from squares (scenarios, seeds)."""
-    return float(np.exp(np.mean(np.log(root_mean(errors)))))
-
-
 def _evaluate_trial(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: dict[str, float]
 ) -> tuple[float, int]:
-    """Evaluate some numbers: the objective, infinite if unstable, and the drives it is of."""
-    return _compute_objective(_compute_stable_squares(task, drives, values)), len(drives)
+    """Evaluate some numbers: the geometric mean of the scenarios' RMSE, and the drives it is of."""
+    errors = _compute_stable_squares(task, drives, values)
+    return float(np.exp(np.mean(np.log(root_mean(errors))))), len(drives)
 
 
 def _search(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], search: SearchOptions
 ) -> dict[str, float]:
     """Search on training drives until the study has so many trials; the best numbers, 3 digits."""
-    evaluate, jobs = functools.partial(_evaluate_trial, task, drives), search.jobs or count_cores()
-
-    def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-        return run_cases(evaluate, batch, jobs=min(jobs, BATCH))
-
+    evaluate = partial(_evaluate_trial, task, drives)
+    evaluate_batch = partial(run_cases, evaluate, jobs=search.workers)
     trials = run_study(task.study, task.search, search, evaluate_batch, len(drives))
     best = min(trials, key=lambda trial: float(trial.user_attrs["objective"]))
     if not math.isfinite(best.user_attrs["objective"]):
@@ -270,10 +245,9 @@ def run(
     if not 1 <= test_seeds <= task.seeds[0]:
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
     load_study(task.study, task.search, search)  # or ValueError, before anything is driven
-    simulate_drives = functools.partial(simulate, task, jobs=search.jobs, console=search.console)
-    training = simulate_drives(task.seeds, title="training drives")
+    training = _simulate(task, task.seeds, "training drives", search)
     numbers = _search(task, training, search)
-    test = simulate_drives(range(test_seeds), title="test drives")
+    test = _simulate(task, range(test_seeds), "test drives", search)
     text = (
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % intervals; "
         f"{search.trials} trials. The default is make_estimator with no more than what is held "

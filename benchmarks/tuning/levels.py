@@ -62,11 +62,9 @@ def _draw_event(rng: np.random.Generator, is_small: bool) -> dict[str, object]:
     """Draw what happens in half of the drives, as fields of a scenario."""
     when = float(rng.uniform(5.0, 12.0))
     force = (150.0, 500.0) if is_small else (500.0, 2000.0)
-    changes: dict[str, object] = {
-        f"{axle}_change": float(rng.uniform(0.6, 1.2)) for axle in ("front", "rear")
-    }
+    front, rear = map(float, rng.uniform(0.6, 1.2, 2))
     events: tuple[dict[str, object], ...] = (
-        changes | {"tyre_change_time": when},
+        {"front_change": front, "rear_change": rear, "tyre_change_time": when},
         {"wind_force": force, "wind_arm": 0.3, "wind_start": when, "wind_length": 3.0},
         {"gps_outage": (6.0, 16.0)},
         {"initial_beta": float(rng.uniform(-0.1, 0.1)), "friction": 0.5},

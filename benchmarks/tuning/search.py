@@ -17,7 +17,7 @@ from rich.console import Console
 from ... import __version__
 from ...envs.numerics import require_extra
 from ...envs.validation import check_choice
-from ..harness.parallel import Bar
+from ..harness.parallel import Bar, count_cores
 from ..harness.results import ResultTable
 
 with require_extra("tune", "tuning needs optuna"):
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Range = tuple[float, float]  # (low, high), both positive
-BATCH = 8  # trials asked for before any result is in: the same search for every number of jobs
+_BATCH = 8  # trials asked for before any result is in: the same search for every number of jobs
 SAMPLERS = ("cma", "tpe")
 STORAGE = "sqlite:///sideslip-tune.db"
 _EDGE = 1.25  # times an end of its range or less: the number counts as being there
@@ -52,6 +52,11 @@ class SearchOptions:
     def __post_init__(self) -> None:
         if self.trials < 1:
             raise ValueError(f"trials must be at least 1, got {self.trials}")
+
+    @property
+    def workers(self) -> int:
+        """Number of processes, the same for every batch, as another one would end the last's."""
+        return min(self.jobs or count_cores(), _BATCH)
 
 
 def make_study_name(subject: str, question: "DataclassInstance", sources: str) -> str:
@@ -96,7 +101,7 @@ def run_study(
             study.enqueue_trial(dict(start))
         shown = bar.add_task("search", total=trials, completed=len(done), unit="trials")
         while len(done) < trials:
-            batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
+            batch = [study.ask(space) for _ in range(min(_BATCH, trials - len(done)))]
             results = evaluate([trial.params for trial in batch])
             for trial, (value, count) in zip(batch, results, strict=True):
                 trial.set_user_attr("seeds", count)
@@ -107,10 +112,8 @@ def run_study(
                 else:
                     study.tell(trial, value)
             done = _list_finished(study, ranges)
-            values = (
-                x.value for x in done if x.state is TrialState.COMPLETE and x.value is not None
-            )
-            best = min(values, default=math.inf)
+            complete = (trial for trial in done if trial.state is TrialState.COMPLETE)
+            best = min((trial.user_attrs["objective"] for trial in complete), default=math.inf)
             bar.update(shown, completed=len(done), description=f"best {best:.4g}")
     return done
 

@@ -146,7 +146,7 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
         asked.append(about)
         return "judged"
 
-    monkeypatch.setattr(train_command, "evaluate_on_tasks", judged)
+    monkeypatch.setattr(train_command, "_evaluate_on_tasks", judged)
     small = ("--num-envs", 7, "--n-eval-envs", 7, "--steps", 448, "--out", "on")
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err

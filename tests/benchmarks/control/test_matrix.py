@@ -222,7 +222,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     wrong = tables["Cells that went wrong"].cells
     assert all("nobody-kf" in line[-1] for line in wrong) and len(wrong) == 2
     first = next(iter(suite.tables))
-    assert first.split()[1][0].key == "score" and len(first.cells) == 7
+    assert vars(first.columns[1])["key"] == "score" and len(first.cells) == 7
     assert {line["tasks"] for line in first.cells} == {(1, 1), (0, 1)}
     assert "is not calibrated" in tables["The oracles"].note
     assert len(suite.explorers) == 1 and len(suite.explorers[0].cells) == len(some) - 2

@@ -9,6 +9,7 @@ pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import fmvss126, outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
+from sideslip.benchmarks.report.tables import format_columns
 from sideslip.benchmarks.suites import SUITES, Request
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
@@ -95,7 +96,7 @@ def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.Mo
     found = suite.STUDY.run(Request(quick=True, jobs=1))
     assert [table.title.split(",")[0] for table in found.tables[:2]] == ["FMVSS 126", "ISO 3888"]
     for table in found.tables:
-        assert all(len(cells) == len(table.cells) for _, cells in table.split())
+        assert all(len(x.texts) == len(table.cells) for x in format_columns(table))
     metrics = {row.metric for row in found.rows}
     assert metrics >= {"amplitude", "speed", "understeer_gradient", "overshoot", "cost", "share"}
     assert [row.verdict for row in found.rows if row.verdict] == ["reproduced", "reproduced"]

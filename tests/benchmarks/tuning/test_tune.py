@@ -29,7 +29,7 @@ def task() -> EstimatorTuning:
 
 @pytest.fixture(scope="module")
 def drives(task: EstimatorTuning) -> list[LoggedEpisode]:
-    return tuning.simulate(task, task.seeds, "", 1, None)
+    return tuning._simulate(task, task.seeds, "", SearchOptions(1, jobs=1))
 
 
 def storage(folder: Path) -> str:
@@ -105,7 +105,7 @@ def test_the_search_is_the_same_for_any_number_of_jobs(
 def test_the_shipped_tuning_of_the_bicycle_model_is_found_again(tmp_path: Path) -> None:
     """Other seeds, another sampler, fewer trials: the minimum is flat, its error is the same."""
     task = tuning.make_estimator_tuning("bicycle-kf", "tie-vision-fig7", seeds=8)
-    drives = tuning.simulate(task, range(8), "", 1, None)
+    drives = tuning._simulate(task, range(8), "", SearchOptions(1, jobs=1))
     options = SearchOptions(120, storage(tmp_path), "tpe", seed=1, jobs=1)
     found = tuning._search(task, drives, options)
     error, shipped = (
@@ -150,7 +150,7 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
         search={"q_beta": (0.11, 0.13)},
         seeds=1,
     )
-    (drive,) = tuning.simulate(task, task.seeds, "", 1, None)
+    (drive,) = tuning._simulate(task, task.seeds, "", SearchOptions(1, jobs=1))
     fast = [LoggedEpisode(drive.log, drive.facts | {"speed": 40.0})]
     with pytest.raises(ValueError, match="its error grows by a factor"):
         search(task, fast, storage(tmp_path), 3)
@@ -267,16 +267,17 @@ def test_several_scenarios_count_alike() -> None:
     """Rows are scenarios, each as if it were alone; the objective is their geometric mean."""
     names = ("tie-vision-fig8", "sine")
     task = tuning.make_estimator_tuning("bicycle-kf", names, seeds=2)
-    drives = tuning.simulate(task, task.seeds, "", 1, None)
+    drives = tuning._simulate(task, task.seeds, "", SearchOptions(1, jobs=1))
     both = tuning._compute_squares(task, drives, {})
     alone = []
     for name in names:
         single = dataclasses.replace(task, scenarios=(name,))
-        own = tuning.simulate(single, task.seeds, "", 1, None)
+        own = tuning._simulate(single, task.seeds, "", SearchOptions(1, jobs=1))
         alone.append(tuning._compute_squares(single, own, {})[0])
     assert np.array_equal(both, alone)
     roots = np.sqrt(np.mean(alone, axis=1))
-    assert tuning._compute_objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
+    objective, _ = tuning._evaluate_trial(task, drives, {})
+    assert objective == pytest.approx(np.sqrt(roots[0] * roots[1]))
     assert task.study != dataclasses.replace(task, scenarios=names[::-1]).study
     with pytest.raises(ValueError, match="scenarios are one or more, each once, got sine, sine"):
         tuning.make_estimator_tuning("bicycle-kf", ("sine", "sine"))
