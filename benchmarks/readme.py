@@ -1,15 +1,13 @@
 """The tables of results in README.md, docs/results/benchmark.md and docs/PAPERS.md.
 
-`python -m sideslip.benchmarks.readme` drives the entries in every task with steering, and writes
-their rows to docs/first.json and two tables. The columns of transfer are those of
-docs/procedures.json, which `sideslip bench procedures --json docs/procedures.json` writes. With
---papers it drives each of the five papers' systems in its paper's simulation, beside the common
-score of the small car's tasks, and writes docs/own_ground.json and the table in docs/PAPERS.md.
+`python -m sideslip.benchmarks.readme` writes the rows of the entries to docs/first.json. Columns of
+transfer are made of docs/procedures.json (`sideslip bench procedures --json`). With --papers the
+papers' systems drive, and docs/own_ground.json and the table of docs/PAPERS.md are written.
 """
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,14 +37,14 @@ from .control.tasks import (
 )
 from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
-from .harness.stats import interval, ratio_of_roots
+from .harness.stats import Estimate, interval, ratio_of_roots
 from .papers import dakf_stability, double_layer, dual_rate, tie_vision, uneven_delay
 from .papers.ledger import PaperFilter
 from .papers.manoeuvres import EstimationSimulation
 
 README, PAGE = Path("README.md"), Path("docs/results/benchmark.md")
 ROWS, TRANSFER = Path("docs/first.json"), Path("docs/procedures.json")
-METRICS = ("cost_vs_nominal", "failure_rate", "score")
+METRICS = COST, FAILURES, SCORE = ("cost_vs_nominal", "failure_rate", "score")
 SPEEDS = dict(zip(TITLES, ("18-28 km/h", "60-90 km/h", "70-110 km/h"), strict=True))
 ENTRIES: dict[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
@@ -90,28 +88,23 @@ def _measure_entries(
         ]
         seeds = make_task_seeds(salt, episodes)
         results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title="README")
-        _check_driven(results)
         suite = Suite("control", "", "")
-        for tier in TITLES:
-            for standing in rank_entries(results, tier):
-                standing.add_rows(suite, salt)
-                if not changes:
-                    suite.add_rows(_score_otherwise(standing), salt=salt)
-        suffix = _DOUBLED if changes else ""
-        rows += [
-            replace(x, scenario=x.scenario + suffix) for x in suite.rows if x.metric in METRICS
-        ]
+        for standing in _rank_driven(results, TITLES):
+            standing.add_rows(suite, salt)
+            if not changes:
+                suite.add_rows(_score_otherwise(standing), salt=salt)
+        end = _DOUBLED if changes else ""
+        rows += [replace(x, scenario=x.scenario + end) for x in suite.rows if x.metric in METRICS]
     return rows
 
 
 def _score_otherwise(standing: Standing) -> list[dict[str, Any]]:
     """Make rows of an entry's score by other constants."""
-    names = {"controller": standing.entry.agent, "estimator": standing.entry.estimator}
+    entry = standing.entry
+    shared = {"controller": entry.agent, "estimator": entry.estimator, "n": standing.n}
     return [
-        names
-        | {"scenario": f"tier {standing.tier}, {label}", "n": standing.n}
-        | {"score": standing.compute_score(*constants)}
-        for label, constants in CONSTANTS.items()
+        shared | {"scenario": f"tier {standing.tier}, {x}", SCORE: standing.compute_score(*numbers)}
+        for x, numbers in CONSTANTS.items()
     ]
 
 
@@ -127,47 +120,42 @@ def _double_ranges() -> dict[str, Any]:
     return world.to_dict()
 
 
-def _check_driven(results: Results) -> None:
-    """Raise ValueError for an entry that could not drive."""
+def _rank_driven(results: Results, tiers: Iterable[str]) -> list[Standing]:
+    """Rank the entries of each tier; ValueError for one that could not drive."""
     for (task, entry), result in results.items():
         if result.error:
             raise ValueError(f"{entry.label} in {task.name}: {result.error}")
+    return [standing for tier in tiers for standing in rank_entries(results, tier)]
 
 
-class _Cells:
-    """Cells of a table: numbers of rows by scenario, controller, estimator and metric."""
+def _read_cells(rows: Sequence[ResultRow]) -> dict[tuple[str, ...], Estimate]:
+    """Read the numbers of rows by scenario, controller, estimator and metric."""
+    return {
+        (x.scenario, x.controller, x.estimator, x.metric): Estimate(x.value, x.low, x.high)
+        for x in rows
+    }
 
-    def __init__(self, rows: Sequence[ResultRow]) -> None:
-        self._rows = {(x.scenario, x.controller, x.estimator, x.metric): x for x in rows}
 
-    def find(self, scenario: str, pairs: Sequence[tuple[str, str]]) -> dict[str, ResultRow]:
-        """The metrics of the first pair that drove the scenario, by name."""
-        for pair in pairs:
-            keys = {metric: (scenario, *pair, metric) for metric in METRICS}
-            metrics = {x: self._rows[key] for x, key in keys.items() if key in self._rows}
-            if metrics:
-                return metrics
-        return {}
-
-    def format(self, scenario: str, pairs: Sequence[tuple[str, str]], interval: bool) -> str:
-        """Cost in % of nominal's, with its interval if asked, and in brackets cars lost in %."""
-        metrics = self.find(scenario, pairs)
-        if not metrics:
-            return ""
-        cost, lost = metrics.get(METRICS[0]), metrics[METRICS[1]]
-        low, high = (100.0 * x for x in (cost.low, cost.high)) if cost else (math.nan, math.nan)
-        ends = f" [{low:.0f}, {high:.0f}]" if interval and math.isfinite(low) else ""
-        number = f"{100.0 * cost.value:.0f}" if cost else "-"
-        return f"{number}{ends} ({100.0 * lost.value:.0f})"
+def _format_cell(
+    cells: Mapping[tuple[str, ...], Estimate], scenario: str, pairs: Iterable[tuple[str, str]]
+) -> str:
+    """Cost in % of nominal's with its interval, and cars lost, of the first pair that drove."""
+    for pair in pairs:
+        cost, lost = (cells.get((scenario, *pair, metric)) for metric in (COST, FAILURES))
+        if lost is not None:
+            shown = "-" if cost is None else cost.inline(100.0, ".0f")
+            return f"{shown} ({100.0 * lost.value:.0f})"
+    return ""
 
 
 def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str:
     """Make README's table: a line an entry, a column a tier, and columns of transfer."""
-    cells, lines = _Cells(rows), []
+    # a line has room for numbers alone, without their intervals
+    cells, lines = _read_cells([replace(x, low=math.nan) for x in rows]), []
     far = {(row.scenario, row.controller, row.metric): row for row in transfer}
     for name, pairs in ENTRIES.items():
         agent = _PROCEDURES.get(pairs[0][0], pairs[0][0])
-        line = [name, *(cells.format(f"tier {tier}", pairs, False) for tier in TITLES)]
+        line = [name, *(_format_cell(cells, f"tier {tier}", pairs) for tier in TITLES)]
         for scenario, metric, factor, form in _TRANSFER.values():
             row = far.get((scenario, agent, metric))
             is_rival = (agent, metric) == (REFERENCE_CONTROLLER, "ratio")  # beside itself: 1
@@ -180,9 +168,9 @@ def _make_table(rows: Sequence[ResultRow], transfer: Sequence[ResultRow]) -> str
 
 def _make_task_table(rows: Sequence[ResultRow]) -> str:
     """Make the table by task: a line a task, a column an entry, with 95 % intervals."""
-    cells = _Cells(rows)
+    cells, entries = _read_cells(rows), PAGE_ENTRIES.values()
     lines = [
-        [task.scenario, *(cells.format(task.name, pairs, True) for pairs in PAGE_ENTRIES.values())]
+        [task.scenario, *(_format_cell(cells, task.name, pairs) for pairs in entries)]
         for task in _list_tasks()
     ]
     return _format_table(lines, list(PAGE_ENTRIES))
@@ -190,11 +178,9 @@ def _make_task_table(rows: Sequence[ResultRow]) -> str:
 
 def _make_doubled_table(rows: Sequence[ResultRow]) -> str:
     """Make the table of the world whose ranges are doubled: a line an entry, a column a tier."""
-    cells, heads = _Cells(rows), [f"tier {tier}{_DOUBLED}" for tier in TITLES]
-    lines = [
-        [name, *(cells.format(x, pairs, True) for x in heads)]
-        for name, pairs in PAGE_ENTRIES.items()
-    ]
+    cells, heads = _read_cells(rows), [f"tier {tier}{_DOUBLED}" for tier in TITLES]
+    entries = PAGE_ENTRIES.items()
+    lines = [[name, *(_format_cell(cells, x, pairs) for x in heads)] for name, pairs in entries]
     return _format_table(lines, heads)
 
 
@@ -228,7 +214,7 @@ PAPERS, SYSTEM_ROWS = Path("docs/PAPERS.md"), Path("docs/own_ground.json")
 _TIER = next(iter(TIERS))  # of the papers' car
 SYSTEM_EPISODES = 32  # a task
 _HEADS = ("the paper's", "ours", "the paper's / %", "ours / %", "its cost / %", "our cost / %")
-_RATIO, _COST = "ratio", "cost_vs_nominal"
+_RATIO = "ratio"
 _RECOMMENDED = PaperFilter(JOINT, JOINT)
 _INFORMED = PaperFilter("informed", FILTER, vehicle="true")
 """The filter against which those of papers without a controller stand: it knows the true car."""
@@ -337,28 +323,24 @@ def _measure_systems(
     pairs = [(task, entry) for task in scored for entry in drivers]
     seeds_by_task = make_task_seeds(salt, SYSTEM_EPISODES)
     common = measure(pairs, seeds_by_task, jobs=jobs, console=console, keep=keep)
-    _check_driven(common)
-    for standing in rank_entries(common, _TIER):
+    for standing in _rank_driven(common, [_TIER]):
         standing.add_rows(suite, salt)
-    names = {_COST: f"tier {_TIER}"}
+    names = {COST: f"tier {_TIER}"}
     return [row for row in suite.rows if row.scenario == names.get(row.metric, row.scenario)]
 
 
 def _make_system_table(rows: Sequence[ResultRow]) -> str:
     """Make the table of docs/PAPERS.md: a line a system and criterion."""
-    cells = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
+    cells, lines = _read_cells(rows), []
 
     def format_cell(scenario: str, entry: Entry, metric: str) -> str:
-        row = cells[scenario, entry.agent, entry.estimator, metric]
-        value, low, high = (100.0 * x for x in (row.value, row.low, row.high))
-        return f"{value:.0f} [{low:.0f}, {high:.0f}]"
+        return cells[scenario, entry.agent, entry.estimator, metric].inline(100.0, ".0f")
 
-    lines = []
     for system in SYSTEMS:
         both = (system.entry, system.recommended)
         ground = [format_cell(system.scenario, entry, _RATIO) for entry in both]
         common_entries = (system.common_entry or system.entry, system.recommended)
-        common = [format_cell(f"tier {_TIER}", entry, _COST) for entry in common_entries]
+        common = [format_cell(f"tier {_TIER}", entry, COST) for entry in common_entries]
         names = [f"`{x.agent}` on `{x.estimator}`" for x in both]
         lines.append([f"{system.paper}, {system.scenario}", *names, *ground, *common])
     return _format_table(lines, _HEADS)

@@ -51,10 +51,10 @@ def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
     table = json.loads((ROOT / "docs/next_car.json").read_text())
     key, speeds = ("YawFusion-v1 x 1024", "us_per_step"), read_json(ROOT / "docs/speed.json")
     (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
-    cells = readme._Cells(read_json(ROOT / readme.ROWS))
+    cells = readme._read_cells(read_json(ROOT / readme.ROWS))
     (best, best_lost), (tuned, tuned_lost) = (
         [
-            [round(100.0 * cells.find(f"tier {tier}", readme.ENTRIES[name])[metric].value)
+            [round(100.0 * cells[f"tier {tier}", *readme.ENTRIES[name][0], metric].value)
              for tier in ("road", "limit")]
             for metric in readme.METRICS[:2]
         ]
