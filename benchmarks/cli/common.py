@@ -37,7 +37,7 @@ def get_command_line() -> str:
 
 def announce_torch() -> None:
     """Say that PyTorch is loaded, which takes seconds; nothing where it is there already."""
-    if "torch" not in sys.modules:
+    if sys.modules.get("torch") is None:
         print("sideslip: loading PyTorch, some seconds ...", file=sys.stderr, flush=True)
 
 

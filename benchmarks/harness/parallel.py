@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -27,11 +26,6 @@ PROCESSES, _RAY = _ENGINES = ("processes", "ray")
 RETRIES = 3  # deaths of its worker or node that a case outlives on a cluster
 _EVERY = 15.0  # s between two lines where no bar can be drawn
 _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
-
-
-def count_cores() -> int:
-    """Count the processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
@@ -74,7 +68,7 @@ def _execute_cases(
     ray = _CLUSTER.get()
     if ray is None:
         # the number asked for is left alone: another one would end the processes of the last call
-        n_jobs = jobs or max(min(count_cores(), len(cases)), 1)
+        n_jobs = jobs or max(min(joblib.cpu_count(), len(cases)), 1)
         pool = joblib.Parallel(n_jobs, return_as="generator")
         yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
         return
@@ -108,15 +102,13 @@ class Bar(progress.Progress):
     """
 
     def __init__(self, console: Console | None) -> None:
-        shown = console is not None and console.is_interactive
+        hidden = console is None or not console.is_interactive
         text, count = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
         times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
         columns = (text, progress.BarColumn(20), count, *times)
         # the pace is that of the whole work, but for the first step: what a stopped run has done
-        super().__init__(
-            *columns, console=console, disable=not shown, speed_estimate_period=math.inf
-        )
-        self._speaks, self._over = console is not None and not shown, Event()
+        super().__init__(*columns, console=console, disable=hidden, speed_estimate_period=math.inf)
+        self._speaks, self._over = console is not None and hidden, Event()
 
     def start(self) -> None:
         """Start to draw or to print lines."""

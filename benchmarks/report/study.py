@@ -22,7 +22,6 @@ Case = TypeVar("Case")
 Condition = TypeVar("Condition")
 Result = TypeVar("Result")
 Results = TypeVar("Results")
-Choice = TypeVar("Choice")
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,6 @@ class Request:
     clairvoyant: Path | None = None  # file of `sideslip calibrate`, None for the package's
     data: Path | None = None  # folder of downloaded logs, for the suite logs
     salt: str = ""  # of the seeds of salted suites, "" for the one of the entries' sources
-
-    def choose(self, usual: Choice, quick: Choice) -> Choice:
-        """Choose by whether the run is quick.
-
-        Args:
-            usual: Choice of a usual run.
-            quick: Choice of a quick run.
-        """
-        return quick if self.quick else usual
 
     def run_cases(
         self, function: Callable[[Case], Result], cases: Sequence[Case], title: str
@@ -108,7 +98,7 @@ class Study(Generic[Results]):
         if module and find_spec(module) is None:
             suite.verdict = absence
             return suite
-        count = request.episodes or request.choose(*self.seeds)
+        count = request.episodes or self.seeds[request.quick]
         results = self.measure(replace(request, episodes=count))
         self.add_tables(suite, results)
         suite.verdict = self.compose_verdict(results)

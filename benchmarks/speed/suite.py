@@ -204,7 +204,7 @@ _SpeedResults = tuple[Mapping[str, Taken], Suite]
 
 def _measure(request: Request) -> _SpeedResults:
     """Measure in this process, where workloads take turns; a quick run compiles nothing."""
-    measured, effort = Suite("speed", "", ""), request.choose(FULL, QUICK)
+    measured, effort = Suite("speed", "", ""), QUICK if request.quick else FULL
     taken, absent = dict[str, Taken](), dict[str, str]()
     for make in (env_steps.make_workloads, plant.make_workloads, env_steps.make_learners):
         workloads = make()

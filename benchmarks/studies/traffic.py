@@ -75,7 +75,7 @@ Results = tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
 def _measure(request: Request) -> Results:
-    seeds, drives = request.choose(*_SEEDS), request.choose(*_DRIVES)
+    seeds, drives = _SEEDS[request.quick], _DRIVES[request.quick]
     swerves = request.run_seeds(_simulate_swerve, CONTROLLERS, seeds, _CHUNK, "highway")
     lane_cases = list(product(READERS, range(drives)))
     rows = iter(request.run_cases(_keep_lane, lane_cases, KEEPING))

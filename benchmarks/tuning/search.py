@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+import joblib
 from rich.console import Console
 
 from ... import __version__
 from ...envs.numerics import require_extra
 from ...envs.validation import check_choice
-from ..harness.parallel import Bar, count_cores
+from ..harness.parallel import Bar
 from ..harness.results import ResultTable
 
 with require_extra("tune", "tuning needs optuna"):
@@ -56,7 +57,7 @@ class SearchOptions:
     @property
     def workers(self) -> int:
         """Number of processes, the same for every batch, as another one would end the last's."""
-        return min(self.jobs or count_cores(), _BATCH)
+        return min(self.jobs or joblib.cpu_count(), _BATCH)
 
 
 def make_study_name(subject: str, question: "DataclassInstance", sources: str) -> str:
