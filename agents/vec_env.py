@@ -85,8 +85,7 @@ class _NativeVecEnv(VecEnv):
         row_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if "final_obs" in infos:
             ended = np.flatnonzero(dones).tolist()
-            finals = _split_infos(infos["final_info"], ended)
-            for i, info in zip(ended, finals, strict=True):
+            for i, info in zip(ended, _split_infos(infos["final_info"], ended), strict=True):
                 info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
                 info["terminal_observation"] = infos["final_obs"][i]
                 row_infos[i] = info

@@ -64,7 +64,7 @@ def _condense_program(
     Q, R = np.kron(np.eye(horizon + 1), model.Q), np.kron(steps, model.R)
     Q[-n:, -n:] = model.solve()[1]
     N = np.vstack([np.kron(steps, model.N), np.zeros((n, horizon * m))])
-    scale = np.tile(limits[: len(design_spec.inputs)], horizon)
+    scale = np.tile(limits[:m], horizon)
     P = scale[:, None] * (Su.T @ Q @ Su + Su.T @ N + N.T @ Su + R) * scale
     F = scale[:, None] * ((Su.T @ Q + N.T) @ Sx)
     size = float(np.diag(P).mean())
@@ -202,8 +202,8 @@ class Design(NamedTuple):
 
     model: PredictionModel
     target: ReferenceParams  # of the nominal car
-    gains: Matrix  # K of `GainTables`, (..., m, n)
-    terminal: Matrix  # T of `GainTables`, (..., 4, n)
+    gains: Matrix  # K of `GainTables` for the states of `prediction`, (..., m, 9 or 11)
+    terminal: Matrix  # T of `GainTables`, likewise, (..., 4 or 6, 9 or 11)
     axes: tuple[Vector, ...]  # knots of speed, front and rear stiffness
     scheduled: int  # 1: gains follow the stiffnesses of the observation
     blocks: Vector  # steps of each block
@@ -235,22 +235,16 @@ def _shift_plan(plan: Vector, blocks: Vector, m: int, steps: float) -> None:
 
 @jit
 def _interpolate_regulator(
-    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector,
-    remembered: int,
-) -> Matrix:  # fmt: skip
-    """Interpolate a table's rows, shape (rows, 9 + remembered), for the states of `prediction`."""
+    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector
+) -> Matrix:
+    """Interpolate a table's rows, shape (rows, 9 or 11), for the states of `prediction`."""
     # per: what turns F_d and N_d into the table's own disturbances, forces or rates
-    values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9 + remembered))
+    values = np.empty(table.shape[3:])
     interpolate_gains(table, axes, v, front, rear, values)
-    n = values.shape[1] - remembered
     for i in range(len(values)):
-        for j in range(n):
-            padded[i, j] = values[i, j]
-        for j in range(remembered):
-            padded[i, 9 + j] = values[i, n + j]
-        padded[i, 7] *= per[0]
-        padded[i, 8] *= per[1]
-    return padded
+        values[i, 7] *= per[0]
+        values[i, 8] *= per[1]
+    return values
 
 
 @jit
@@ -287,8 +281,8 @@ def _prepare_prediction(
     )  # fmt: skip
     a_x = (T_l + T_r) / (car.m * car.r)
     per_force = 1.0 / per[0], 1.0 / per[1]
-    K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force, n)
-    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force, n)
+    K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
+    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
     return PredictionTask(
         model, start, car, driver, a_x, steady, max_moment, K, terminal, design.blocks
     )
@@ -378,10 +372,12 @@ class Nmpc(Lqr):
 
     def _make_design(self, *lasting: Any) -> Design:
         """Make the parts of all decisions from the gains and what lasts when these change."""
-        tables, target = (self.table[..., : -self.width], self._terminal), self._target
-        plant = self.vehicle, self._plant, self.design_spec
-        model = make_prediction(*plant, target, self.authority)
-        gains, terminal = map(np.ascontiguousarray, tables)
+        spec, target = self.design_spec, self._target
+        model = make_prediction(self.vehicle, self._plant, spec, target, self.authority)
+        # a prediction's states have both disturbances, which a design may lack: without effect
+        columns = [7, 7] if spec.disturbances == "none" else []
+        tables = self.table[..., : -self.width], self._terminal
+        gains, terminal = (np.insert(table, columns, 0.0, axis=-1) for table in tables)
         return Design(model, target, gains, terminal, self.axes, int(self.scheduled), *lasting)
 
     def _design_anew(self, car: Vehicle) -> "Nmpc":

@@ -39,7 +39,7 @@ class DesignSpec:
 
     period: int  # control period in ticks
     full_scale: float  # yaw moment at a first input of 1 (N m)
-    steers: bool  # whether steering is the second input
+    steers: bool  # whether added steering (rad) is a second input
     kind: int  # index in `REFERENCES`
     disturbances: str = "none"  # key of `_DISTURBANCES`
     disturbance_time: float = 0.3  # time in which forces decay (s)
@@ -58,11 +58,6 @@ class DesignSpec:
         gamma = 0.0 if self.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2
         steer = self.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if self.steers else 0.0
         return 1.0 / BETA_SCALE**2, gamma, EFFORT_WEIGHT, steer
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: fraction of the yaw moment, and added steering (rad)."""
-        return ("N_z", "delta_f") if self.steers else ("N_z",)
 
 
 @dataclass(frozen=True)
@@ -171,7 +166,7 @@ def make_tick_model(
     """
     lags = [make_lag(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _discretise_plane(vehicle, speed, design_spec)
-    n, m = len(design_spec.states), len(design_spec.inputs)
+    n, m = len(design_spec.states), 1 + design_spec.steers  # inputs: N_z, added steering (rad)
     G, H = np.eye(n), np.zeros((n, m))
     G[:2] = 0.0
     G[:2, :4], H[:2, :1], G[:2, 4:5] = plane[:, :4], plane[:, 4:5], plane[:, 5:6]

@@ -58,7 +58,8 @@ def convert_sb3_policy(
     extractor_class = type(actor.extractor)
     if extractor_class not in (FlattenExtractor, Standardised):
         raise ValueError(f"the observation goes through {extractor_class.__name__}, not as it is")
-    weights, biases, activations, output = _convert_dense(actor.layers)
+    weights, biases, activations = _convert_dense(actor.layers)
+    output = activations.pop() if len(activations) == len(weights) else "linear"
     if len(set(activations)) > 1:
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
     cells = _convert_cells(actor.recurrent)
@@ -135,8 +136,8 @@ def _to_array(parameter: Tensor) -> Array:
     return parameter.detach().cpu().numpy()
 
 
-def _convert_dense(layers: list[nn.Module]) -> tuple[list[Array], list[Array], list[str], str]:
-    """Convert linear layers to weights, biases, activations between them, and the output's."""
+def _convert_dense(layers: list[nn.Module]) -> tuple[list[Array], list[Array], list[str]]:
+    """Convert linear layers to weights, biases and the activations behind them."""
     names = {kind: name for name, kind in TORCH_ACTIVATIONS.items()}
     weights, biases, layer_activations = list[Array](), list[Array](), list[str]()
     for layer in layers:
@@ -151,9 +152,7 @@ def _convert_dense(layers: list[nn.Module]) -> tuple[list[Array], list[Array], l
                 known = ", ".join(names.values())
                 raise ValueError(f"layer {layer} is not known; known: linear, {known}")
             layer_activations.append(names[type(layer)])
-    if len(layer_activations) == len(weights):  # the last one is the output's
-        return weights, biases, layer_activations[:-1], layer_activations[-1]
-    return weights, biases, layer_activations, "linear"
+    return weights, biases, layer_activations
 
 
 def policy_from_zip(

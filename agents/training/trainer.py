@@ -7,7 +7,6 @@ evaluations), and `begun_with.safetensors` where it started from a policy.
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib import import_module
@@ -21,7 +20,7 @@ import numpy as np
 from ... import __version__
 from ...envs.io import from_json
 from ...envs.record import Array
-from ...envs.task import ObservationEntry, make_space
+from ...envs.task import make_space
 from ..env_info import CarVectorEnv, get_layout
 from ..learned.network import CELL_WEIGHTS
 from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
@@ -104,13 +103,6 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
     return SavedTraining(Path(folder), task, record, state)
 
 
-def _is_scaled(file: Path, layout: Sequence[ObservationEntry]) -> bool:
-    """Return whether a zip was trained on `ScaledVecEnv`, by its space as JSON has it."""
-    with ZipFile(file) as archive:
-        space = json.loads(archive.read("data")).get("observation_space", {})
-    return bool(space.get("low") == str(make_space(scale_layout(layout)).low))
-
-
 class _WarmStart(NamedTuple):
     """The tensors with which a model begins."""
 
@@ -137,7 +129,11 @@ class _WarmStart(NamedTuple):
         else:
             layout = get_layout(task.vector_env(1))
             mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
-            scales = get_scales(layout) if _is_scaled(file, layout) else np.ones(len(layout))
+            with ZipFile(file) as archive:
+                space = json.loads(archive.read("data")).get("observation_space", {})
+            # as JSON has the space of a `ScaledVecEnv`
+            is_scaled = space.get("low") == str(make_space(scale_layout(layout)).low)
+            scales = get_scales(layout) if is_scaled else np.ones(len(layout))
             numbers = (mean * scales).tolist(), (scale / scales).tolist(), clip, None
         return cls(str(file), parameters, Standardisation(*numbers), variables or {}, True)
 
