@@ -48,6 +48,29 @@ class Estimate(NamedTuple):
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 
+_RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
+    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "=": np.equal
+}  # fmt: skip
+
+
+class Bound(NamedTuple):
+    """A relation and a number, such as "<= 0.75"."""
+
+    relation: str
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.relation} {self.value:g}"
+
+    def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Tell which of the values meet it; NaN never does.
+
+        Args:
+            values: Numbers, of any shape.
+        """
+        return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
+
+
 def root_mean(squares: Array, axis: int = -1) -> Array:
     """Compute the square root of the mean over the seeds: RMSE from squared errors.
 

@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from functools import partial
 
+from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
-from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
+from .ledger import Analysis, Claim, ClaimPart, PaperFilter, compare
 from .manoeuvres import EstimationSimulation, FollowingSimulation
 
 PAPER = "dakf-stability"

@@ -3,7 +3,8 @@
 from functools import partial
 
 from ...estimators.filters import FILTERS
-from .ledger import Bound, Claim, ClaimPart, PaperFilter, compare
+from ..harness.stats import Bound
+from .ledger import Claim, ClaimPart, PaperFilter, compare
 from .manoeuvres import EstimationSimulation
 
 PAPER = "double-layer-gps"

@@ -16,17 +16,11 @@ from scipy.linalg import expm
 
 from ...envs.record import Array
 from ...envs.scenarios.world import KMH
-from ...envs.vehicle import linear
-from ...envs.vehicle.linear import make_course_model
+from ...envs.vehicle.linear import make_course_model, make_vision_model
 from ...envs.vehicle.parameters import COMS
-from ...estimators.design.gains import (
-    SampledSystem,
-    compute_pseudo_shares,
-    frame_map,
-    joseph_form,
-    kalman_gain,
-)
-from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers, PaperFilter, compare
+from ...estimators.design import gains
+from ..harness.stats import Bound
+from .ledger import Analysis, Claim, ClaimPart, Numbers, PaperFilter, compare
 from .manoeuvres import EstimationSimulation
 
 
@@ -42,7 +36,7 @@ def _make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
 def _make_pseudo_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     """Make the maps with pseudo measurements (14), G from (31)."""
     error, maps = np.eye(len(A)), []
-    for i, share in enumerate(compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)):
+    for i, share in enumerate(gains.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)):
         error = (A @ error if i > 0 else error) - share @ C  # of the sample's innovation
         maps.append(error)
     return maps
@@ -108,7 +102,7 @@ def compute_coms_ranks(seed: int) -> Numbers:
     Args:
         seed: Without effect: nothing is random.
     """
-    A = linear.make_vision_model(COMS, 25.0 * KMH).A
+    A = make_vision_model(COMS, 25.0 * KMH).A
     vision: Matrix = np.array([[Fraction(entry) for entry in row] for row in A])
     course = vision[:3, :3]
     models: dict[str, tuple[Matrix, list[list[int]]]] = {
@@ -146,12 +140,12 @@ def _measure_maps(seed: int) -> Numbers:
     rng = np.random.default_rng(seed)
     a = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
     c = rng.normal(size=(3, 3))
-    square = compare_maps(a, c, kalman_gain(np.eye(3), c, np.eye(3)), RATIO)
+    square = compare_maps(a, c, gains.kalman_gain(np.eye(3), c, np.eye(3)), RATIO)
     Q = np.diag(10.0 ** rng.uniform([-4, -4, -8, -2, -2, -7], [-2, -2, -6, 0, 0, -5])) * 1e-3
     P = np.eye(6) * 1e-2
     for _ in range(5000):  # 5 s of fast measurements
-        L = kalman_gain(P, C, R)
-        P = A @ joseph_form(P, L, C, R) @ A.T + Q
+        L = gains.kalman_gain(P, C, R)
+        P = A @ gains.joseph_form(P, L, C, R) @ A.T + Q
     application = compare_maps(A, C, L, RATIO)
     return {(SQUARE, "difference"): square, (APPLICATION, "difference"): application}
 
@@ -168,8 +162,8 @@ def _measure_gains(seed: int) -> Numbers:
         ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
     }
     for name, q in tunings.items():
-        shares = SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
-        growth = np.linalg.eigvals(frame_map(A, C, shares))
+        shares = gains.SampledSystem(A, np.diag(q) * 1e-3, C, R, RATIO).compute_shares_29()
+        growth = np.linalg.eigvals(gains.frame_map(A, C, shares))
         radii[name, "spectral_radius"] = float(np.abs(growth).max())
     return radii
 

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.record import Array
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ..harness.drives import call_quietly, make_filter_arguments
-from ..harness.stats import Estimate
+from ..harness.stats import Bound, Estimate
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
@@ -44,29 +43,8 @@ class SimulationResult:
         return SimulationResult(joint, self.example or later.example)
 
 
-Results = Mapping[str, SimulationResult]
-"""Results by the name of the simulation or analysis."""
-
+Results = Mapping[str, SimulationResult]  # by the name of the simulation or analysis
 _MIN_AGREEMENT = 0.9  # of the seeds
-
-_RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
-    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "=": np.equal
-}  # fmt: skip
-
-
-class Bound(NamedTuple):
-    """A relation and a number, such as "<= 0.75"."""
-
-    relation: str
-    value: float
-
-    def __str__(self) -> str:
-        return f"{self.relation} {self.value:g}"
-
-
-def _is_met(bound: Bound, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Tell which of the values meet a bound; NaN never does."""
-    return np.asarray(_RELATIONS[bound.relation](np.asarray(values, float), bound.value))
 
 
 @dataclass(frozen=True)
@@ -95,13 +73,9 @@ class ClaimPart:
 
 
 def compare(
-    label: str,
-    scenario: str,
-    one: str,
-    other: str,
-    max_ratio: float | None = None,
+    label: str, scenario: str, one: str, other: str, max_ratio: float | None = None,
     quantity: str = "beta",
-) -> ClaimPart:
+) -> ClaimPart:  # fmt: skip
     """Make a part that states one's number smaller than the other's.
 
     Args:
@@ -132,13 +106,13 @@ class MeasuredPart:
     def agreement(self) -> float:
         """The fraction of seeds that meet what the paper states; NaN where it states nothing."""
         stated = self.part.stated
-        return math.nan if stated is None else float(np.mean(_is_met(stated, self.values)))
+        return math.nan if stated is None else float(np.mean(stated.is_met(self.values)))
 
     @property
     def meets_threshold(self) -> bool | None:
         """Whether the median meets the threshold; None where there is none."""
         threshold = self.part.threshold
-        return None if threshold is None else bool(_is_met(threshold, self.number.value))
+        return None if threshold is None else bool(threshold.is_met(self.number.value))
 
 
 class Claim:
@@ -164,8 +138,8 @@ class Claim:
         Args:
             results: Results of all simulations that the parts name.
         """
-        parts = (MeasuredPart(part, part._measure(results)) for part in self.parts)
-        return MeasuredClaim(self, tuple(parts))
+        parts = tuple(MeasuredPart(part, part._measure(results)) for part in self.parts)
+        return MeasuredClaim(self, parts)
 
 
 @dataclass(frozen=True)
@@ -192,14 +166,12 @@ class MeasuredClaim:
             return "report only"
         if all(x.agreement >= _MIN_AGREEMENT for x, _ in stated):
             return "reproduced"
-        is_any = any(_is_met(bound, x.number.value) for x, bound in stated)
+        is_any = any(bound.is_met(x.number.value) for x, bound in stated)
         return "partly" if is_any else "not reproduced"
 
 
-Numbers = dict[tuple[str, str], float | Array]
-"""One seed's numbers, by subject and quantity."""
-SeedFunction = Callable[[int], tuple[Numbers, Example | None]]
-"""From a seed to its numbers and signals."""
+Numbers = dict[tuple[str, str], float | Array]  # of one seed, by subject and quantity
+SeedFunction = Callable[[int], tuple[Numbers, Example | None]]  # from a seed
 
 
 @dataclass(frozen=True)
@@ -242,8 +214,7 @@ class Analysis(Simulation):
 PAPER_TUNINGS: dict[str, dict[str, float]] = {
     entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
     for entry in read_tunings(Path(__file__).with_name("tunings.toml"))
-}
-"""Options by which a filter is tuned for its paper's simulation, by its name."""
+}  # options by which a filter is tuned for its paper's simulation, by its name
 
 
 @dataclass(frozen=True)

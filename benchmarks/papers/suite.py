@@ -9,14 +9,7 @@ from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, Column, Line, ResultTable, Suite
 from ..report.study import Request, Study
 from ..report.tables import format_verdict, summarise_names
-from . import (
-    dakf_stability,
-    double_layer,
-    dual_rate,
-    tie_vision,
-    tie_vision_theory,
-    uneven_delay,
-)
+from . import dakf_stability, double_layer, dual_rate, tie_vision, tie_vision_theory, uneven_delay
 from .ledger import Claim, Example, MeasuredClaim, MeasuredPart, Simulation, SimulationResult
 
 _MODULES = (
@@ -104,7 +97,10 @@ def _add_tables(suite: Suite, results: LedgerResults) -> None:
         for item in entry.parts:
             record = {"scenario": item.part.scenario, "estimator": item.part.label, **columns}
             suite.add_rows([{**record, "n": len(item.values), item.part.metric: item.number}])
-        verdicts.append([entry.source, claim.text, entry.verdict, _format_checks(entry.parts)])
+        met = [x.meets_threshold for x in entry.parts if x.meets_threshold is not None]
+        missed = f"{met.count(False)} of {len(met)} MISSED"
+        checks = missed if False in met else "met" if met else ""
+        verdicts.append([entry.source, claim.text, entry.verdict, checks])
         remarks += [[entry.source, claim.note]] if claim.note else []
         lines = [_make_line(claim.source, item) for item in entry.parts]
         numbers.setdefault(claim.paper, []).extend(lines)
@@ -127,12 +123,6 @@ def _make_line(source: str, item: MeasuredPart) -> Line:
         "paper states": part.stated and f"{part.stated} ({100.0 * item.agreement:.0f} %)",
         "threshold": part.threshold and f"{part.threshold} {met}",
     }
-
-
-def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
-    checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
-    missed = f"{checked.count(False)} of {len(checked)} MISSED"
-    return missed if False in checked else "met" if checked else ""
 
 
 _SIGNALS = {"beta": "sideslip angle / rad", "yaw_moment": "yaw moment / (N m)"}

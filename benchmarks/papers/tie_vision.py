@@ -24,9 +24,10 @@ from ...envs.numerics.functions import TICK
 from ...envs.record import Array
 from ...envs.scenarios.world import KMH
 from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
-from ...envs.vehicle.parameters import COMS, Vehicle
+from ...envs.vehicle.parameters import COMS
 from ...estimators.design.gains import kalman_gain
-from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers, PaperFilter, compare
+from ..harness.stats import Bound
+from .ledger import Analysis, Claim, ClaimPart, Numbers, PaperFilter, compare
 from .manoeuvres import EstimationSimulation, SlipSimulation
 
 if TYPE_CHECKING:
@@ -45,31 +46,28 @@ class LoopDesign:
     """The choices that Table II leaves open."""
 
     speed: float = 25.0 * KMH  # m/s
-    placement: str = "real"  # of `design_pi`, as the pole
-    pole: float = POLE
+    placement: str = "real"  # of `design_pi`
     integral: str = "forward-euler"  # of `INTEGRALS`
     sensors: str = "gyro"  # at every step: gyro; with psi and y_l; these a step late, (12)-(13)
     q_ratio: float = 25.75  # process variance of beta over gamma's, which psi and y_l have too
     noise: float = 1e-9  # variance of every measurement over gamma's process variance
 
 
-def _make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def _make_plain_loop(design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of PI and plant with beta measured without delay; moment held over dt (s)."""
     import control
 
-    pi = _pi(vehicle, design.speed, design.pole, design.placement)
-    G, H = make_bicycle_model(vehicle, design.speed).discretise(dt)
+    pi = _pi(COMS, design.speed, POLE, design.placement)
+    G, H = make_bicycle_model(COMS, design.speed).discretise(dt)
     plant = control.StateSpace(G, H[:, 1:], [[1.0, 0.0]], 0.0, dt)
     direct = pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
     return plant * control.StateSpace(1.0, pi.k_i * dt, 1.0, direct, dt)
 
 
 @lru_cache(maxsize=1024)
-def _make_filter(
-    vehicle: Vehicle, speed: float, sensors: str, q_ratio: float, noise: float, dt: float
-) -> Parts:
+def _make_filter(speed: float, sensors: str, q_ratio: float, noise: float, dt: float) -> Parts:
     """Make (G, H, C, K): from the yaw moment to what the filter measures, and its steady gain."""
-    model = (make_bicycle_model if sensors == "gyro" else make_vision_model)(vehicle, speed)
+    model = (make_bicycle_model if sensors == "gyro" else make_vision_model)(COMS, speed)
     G, H = model.discretise(dt)
     H, C = H[:, 1:2], model.C
     if sensors == "vision-delayed":
@@ -86,15 +84,14 @@ def _make_filter(
 _pi = lru_cache(maxsize=256)(design_pi)
 
 
-def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def _make_estimator_loop(design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
     # The filter's input is the moment that the PI commands: opened behind both, a filter with the
     # right model would not show in the loop at all.
     import control
 
-    pi = _pi(vehicle, design.speed, design.pole, design.placement)
-    covariances = design.q_ratio, design.noise
-    G, H, C, K = _make_filter(vehicle, design.speed, design.sensors, *covariances, dt)
+    pi = _pi(COMS, design.speed, POLE, design.placement)
+    G, H, C, K = _make_filter(design.speed, design.sensors, design.q_ratio, design.noise, dt)
     # the integral's sum grows by k_i dt error in all three forms
     F, direct = np.eye(len(G)) - K @ C, pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
     beta_x, beta_y = F[:1], K[:1]  # the estimate of beta from the prediction and from y
@@ -121,7 +118,7 @@ class _LoopMatch(NamedTuple):
     off: float
 
 
-def _search(vehicle: Vehicle) -> list[_LoopMatch]:
+def _search() -> list[_LoopMatch]:
     """Search the grid's designs with both margins near Table II's, as stable, best first."""
     import control
 
@@ -130,7 +127,7 @@ def _search(vehicle: Vehicle) -> list[_LoopMatch]:
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
         design, differences = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
-            loop = _make_estimator_loop(vehicle, design, dt)
+            loop = _make_estimator_loop(design, dt)
             end = _compute_response(loop, np.array([-1.0 + 0.0j]))[0].real  # before all crossings
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
                 break
@@ -195,8 +192,6 @@ STATIC, TABLE2 = "tie-vision-static", "tie-vision-table2"
 SINGLE, MULTI, PROPOSED = "single-rate", "multirate", "multirate-residual"
 EQUAL = "multirate, gain margin of single-rate"
 HERTZ = (15.15, 477.46)  # Table II's crossovers
-
-
 BICYCLE, SINGLE_KF, MULTI_KF = "bicycle-kf", "single-rate-kf", "multirate-kf"
 RESIDUAL_KF, EXACT = "multirate-residual-kf", "exact-kf, true model"
 NO_DELAY = "multirate-kf, delay ignored"
@@ -223,11 +218,11 @@ def _measure_static_slip(_: int) -> Numbers:
 
 def _measure_table_two(_: int) -> Numbers:
     """Measure the loops of the search that fit Table II, and the best of 25 km/h."""
-    matches = _search(COMS)
+    matches = _search()
     at_25 = [hit for hit in matches if math.isclose(hit.design.speed, 25.0 * KMH)]
     periods, margins = (CAMERA_PERIOD, TICK), []  # margins in dB, the same PI on the true slip
     for design in (LoopDesign(placement=name) for name in ("real", "radius")):
-        loops = (_make_plain_loop(COMS, design, dt) for dt in periods)
+        loops = (_make_plain_loop(design, dt) for dt in periods)
         margins.append([_compute_gain_margin(loop)[0] for loop in loops])
     numbers: Numbers = {
         ("loops", "count"): float(len(matches)),
@@ -237,7 +232,7 @@ def _measure_table_two(_: int) -> Numbers:
     }
     design = at_25[0].design if at_25 else LoopDesign()
     for label, dt in zip((SINGLE, MULTI), periods, strict=True):
-        omega = _compute_gain_margin(_make_estimator_loop(COMS, design, dt))[1]
+        omega = _compute_gain_margin(_make_estimator_loop(design, dt))[1]
         numbers[label, "crossover"] = round(omega / (2.0 * math.pi), 2)
     return numbers
 

@@ -19,8 +19,9 @@ from ...envs.vehicle.linear import make_vision_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design.gains import kalman_gain
 from ...estimators.make import make_estimator
+from ..harness.stats import Bound
 from .dual_rate import compare_maps
-from .ledger import Analysis, Bound, Claim, ClaimPart, Numbers
+from .ledger import Analysis, Claim, ClaimPart, Numbers
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3

@@ -2,8 +2,9 @@
 
 from functools import partial
 
+from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
-from .ledger import Analysis, Bound, Claim, ClaimPart, PaperFilter, compare
+from .ledger import Analysis, Claim, ClaimPart, PaperFilter, compare
 from .manoeuvres import EstimationSimulation
 
 PAPER = "uneven-delay"

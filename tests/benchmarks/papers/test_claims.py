@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.metrics import METRICS
+from sideslip.benchmarks.harness.stats import Bound
 from sideslip.benchmarks.papers import dual_rate
-from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, SimulationResult
+from sideslip.benchmarks.papers.ledger import Claim, ClaimPart, SimulationResult
 from sideslip.benchmarks.papers.suite import CLAIMS, SIMULATIONS, _split_seeds
 from sideslip.benchmarks.papers.tie_vision_theory import _compute_residuals
 

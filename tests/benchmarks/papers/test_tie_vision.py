@@ -42,10 +42,10 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
     """An impulse of yaw moment on the plant; the filter's gain from its covariance recursion."""
     design = dataclasses.replace(DESIGN, sensors=sensors, integral=integral, noise=1e-3)
     dt = 0.033
-    loop = _make_estimator_loop(COMS, design, dt)
+    loop = _make_estimator_loop(design, dt)
     steps = 40
     _, response = control.impulse_response(loop, np.arange(steps) * dt)
-    pi = design_pi(COMS, V, design.pole, design.placement)
+    pi = design_pi(COMS, V, POLE, design.placement)
 
     model = make_bicycle_model(COMS, V) if sensors == "gyro" else make_vision_model(COMS, V)
     G, H = model.discretise(dt)
@@ -79,8 +79,8 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
 
 def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
     """Why the loop is opened at the plant only: the plain loop is the limit of a perfect filter."""
-    loop = _make_plain_loop(COMS, DESIGN, 0.001)
-    pi = design_pi(COMS, V, DESIGN.pole, DESIGN.placement)
+    loop = _make_plain_loop(DESIGN, 0.001)
+    pi = design_pi(COMS, V, POLE, DESIGN.placement)
     z = np.exp(1j * np.array([1.0, 10.0, 100.0]) * 0.001)
     G, H = make_bicycle_model(COMS, V).discretise(0.001)
     plant = np.array([np.linalg.solve(w * np.eye(2) - G, H[:, 1])[0] for w in z])
@@ -91,7 +91,7 @@ def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
 def test_table_ii_within_half_a_decibel() -> None:
     """Printed are 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
     for printed, dt in zip(PRINTED, (0.033, 0.001), strict=True):
-        decibels, omega = _compute_gain_margin(_make_estimator_loop(COMS, DESIGN, dt))
+        decibels, omega = _compute_gain_margin(_make_estimator_loop(DESIGN, dt))
         assert decibels == pytest.approx(printed, abs=0.5)
         assert omega == pytest.approx(math.pi / dt, rel=1e-12)
 
@@ -100,15 +100,13 @@ def test_table_ii_within_half_a_decibel() -> None:
 def test_the_multirate_loop_has_the_larger_gain_margin_with_the_same_pi(placement: str) -> None:
     """The multirate loop's margin is larger by 20 dB at least."""
     design = dataclasses.replace(DESIGN, placement=placement)
-    slow, fast = (
-        _compute_gain_margin(_make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
-    )
+    slow, fast = (_compute_gain_margin(_make_plain_loop(design, dt))[0] for dt in (0.033, 0.001))
     assert fast - slow >= 20.0
 
 
 @pytest.mark.long
 def test_the_search_finds_the_table_at_25_kmh_among_others() -> None:
-    hits = _search(COMS)
+    hits = _search()
     assert hits == sorted(hits, key=lambda hit: hit.off)
     assert all(hit.off <= 0.5 for hit in hits)
     assert len({hit.design.speed for hit in hits}) > 1  # the table does not say at which speed

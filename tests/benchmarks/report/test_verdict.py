@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable
-from sideslip.benchmarks.harness.stats import Estimate
+from sideslip.benchmarks.harness.stats import Bound, Estimate
 from sideslip.benchmarks.papers import suite as papers
-from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredClaim, MeasuredPart
+from sideslip.benchmarks.papers.ledger import Claim, ClaimPart, MeasuredClaim, MeasuredPart
 from sideslip.benchmarks.procedures import iso
 from sideslip.benchmarks.procedures import suite as procedures
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
@@ -96,9 +96,10 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
     monkeypatch.setattr(procedures, "_find_highest_speed", lambda runs: runs)
     done: dict[ProcedureCase, Any] = {}
     for car in CARS:
-        for k in range(len(ENTRIES)):
-            done[ProcedureCase("fmvss-126", car, k)] = sine(fails=k not in (1, 3, 4))
-            done[ProcedureCase(track, car, k)] = 30.0 if k == 4 else 20.0
+        for name in ENTRIES:
+            fails = name not in ("two-dof", "esc", "lqr")
+            done[ProcedureCase("fmvss-126", car, name)] = sine(fails)
+            done[ProcedureCase(track, car, name)] = 30.0 if name == "lqr" else 20.0
     lines = fits(procedures._make_verdict(done))
     assert "coms: two-dof, esc and lqr; none fails above 3 A" in lines[1]
     assert "coms 108 with lqr (none 72)" in " ".join(lines)
