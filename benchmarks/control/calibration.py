@@ -1,14 +1,12 @@
 """What is measured once and kept in files: what tasks demand, and what the clairvoyant costs.
 
-Tasks are scored where a car without control slips or is lost, never by who gains: `python -m
-sideslip.benchmarks.control.calibration --write` measures all candidates on tuning seeds. An
-episode of the clairvoyant takes ten seconds to solve, so `sideslip calibrate` solves all once, on
-seeds of their own that only the world's version salts. An entry is refused that no longer fits.
+An episode of the clairvoyant takes ten seconds to solve, so `sideslip calibrate` solves all once,
+on seeds of their own that only the world's version salts. An entry is refused that no longer fits.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,6 +81,9 @@ class CalibrationRecord(TaskRecord):
         return [episode.seed for episode in self.episodes]
 
 
+Records = dict[ControlTask, CalibrationRecord]
+
+
 def _derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     """Derive the seeds of a task's calibration; more of them begin with the same ones."""
     texts = [f"clairvoyant {WORLD_VERSION} {task.seed_text} {i}" for i in range(count)]
@@ -143,9 +144,7 @@ def calibrate(
     return [finished[task] for task in tasks]
 
 
-def _read_calibration(
-    path: str | Path = FILE, stale: bool = False
-) -> dict[ControlTask, CalibrationRecord]:
+def _read_calibration(path: str | Path = FILE, stale: bool = False) -> Records:
     """Read the entries of a file by task; stale ones are refused, or left out if `stale`."""
     records = {}
     for i, item in enumerate(read_objects(path), 1):
@@ -176,9 +175,7 @@ def _update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
     write_text(path, json.dumps([asdict(record) for record in ordered], indent=1) + "\n")
 
 
-def read_current(
-    path: Path | None, tasks: Sequence[ControlTask]
-) -> dict[ControlTask, CalibrationRecord]:
+def read_current(path: Path | None, tasks: Sequence[ControlTask]) -> Records:
     """Read the records of tasks; ValueError where the uncontrolled car no longer costs what it did.
 
     Args:
@@ -200,9 +197,7 @@ def read_current(
     return records
 
 
-def measure_foresight(
-    records: Mapping[ControlTask, CalibrationRecord], **options: Any
-) -> dict[ControlTask, Array]:
+def measure_foresight(records: Records, **options: Any) -> dict[ControlTask, Array]:
     """Measure log(J / J_clairvoyant) of oracle-state by task, shape (n,), on seeds it survives.
 
     Args:
@@ -219,44 +214,43 @@ def measure_foresight(
     return foresight
 
 
+# Tasks are scored where a car without control slips or is lost, never by who gains: this module's
+# command, with --write, measures all candidates on tuning seeds.
 _SHORT = {"lead_in": QUICK_LEAD_IN}  # what a manoeuvre demands does not depend on it
 MIN_PEAK = 2.0  # deg, median peak of the slip angle without control; below it nobody needs help
 MIN_LOST = 0.3  # of the cars without control, at the limit
 MAX_SHARE = 0.5  # of these, that the best baseline may lose: what nobody saves separates nobody
 _NUMBERS = ("peak_slip", "lost", "lost_nominal", "lost_oracle", "slip_gap", "yaw_rate_gap")
-_NONE, _NOMINAL = Entry("none"), Entry(NOMINAL)
-_BASELINES = (_NONE, _NOMINAL, *map(Entry, (*ORACLES[PARAMETERS], *ORACLES[STATE])))
+_BASELINES = ("none", NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
 
 
 def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     """Measure what a candidate demands; what could not be driven is in its verdict."""
-    none, nominal = results[task, _NONE], results[task, _NOMINAL]
-    errors = [f"{x}: {results[task, x].error}" for x in (_NONE, _NOMINAL) if results[task, x].error]
+    drives = {name: results[task, Entry(name)] for name in _BASELINES}
+    none, nominal = drives["none"], drives[NOMINAL]
+    pairs = {x: PairedDrives(nominal, drive, task.cost_floor) for x, drive in drives.items()}
+    errors = [f"{x}: {drives[x].error}" for x in ("none", NOMINAL) if drives[x].error]
     best = dict[str, str]()
     for kind, candidates in ORACLES.items():
-        driven = [name for name in candidates if not results[task, Entry(name)].error]
+        driven = [name for name in candidates if not drives[name].error]
         if not driven:
-            errors.append(f"{candidates[0]}: {results[task, Entry(candidates[0])].error}")
+            errors.append(f"{candidates[0]}: {drives[candidates[0]].error}")
         best[kind] = candidates[0]
         if driven and not errors:
-            drives = (results[task, Entry(name)] for name in driven)
-            pairs = [PairedDrives(nominal, drive, task.cost_floor) for drive in drives]
-            best[kind] = driven[int(np.argmax([pair.compute_scores().mean() for pair in pairs]))]
+            best[kind] = max(driven, key=lambda name: pairs[name].compute_scores().mean())
     facts: dict[str, Any] = {**task.record, "world_version": WORLD_VERSION}
     facts |= {"oracle": best[STATE], "knowing": best[PARAMETERS], "n": len(nominal.costs)}
     if errors:
         facts |= dict.fromkeys(_NUMBERS, 0.0)
         return TaskMeasurement(**facts, verdict="; ".join(errors))
-    state = results[task, Entry(best[STATE])]
-    slip, yaw = compute_gaps(PairedDrives(nominal, state, task.cost_floor), task)
-    numbers = {"peak_slip": float(np.degrees(np.median(none["peak_slip"])))}
-    for name, result in (("lost", none), ("lost_nominal", nominal), ("lost_oracle", state)):
-        numbers[name] = float(np.mean(~result.survived))
-    numbers |= {"slip_gap": slip, "yaw_rate_gap": yaw}
-    facts |= {name: round(float(np.nan_to_num(x)), 4) for name, x in numbers.items()}
-    references = (nominal, *(results[task, Entry(name)] for name in best.values()))
-    lost_by_best = min(float(np.mean(~result.survived)) for result in references)
-    verdict = _describe_verdict(task.tier, numbers["peak_slip"], numbers["lost"], lost_by_best)
+    lost = {name: float(np.mean(~drive.survived)) for name, drive in drives.items()}
+    peak = float(np.degrees(np.median(none["peak_slip"])))
+    gaps = compute_gaps(pairs[best[STATE]], task)
+    numbers = (peak, lost["none"], lost[NOMINAL], lost[best[STATE]], *gaps)
+    rounded = (round(float(np.nan_to_num(x)), 4) for x in numbers)
+    facts |= dict(zip(_NUMBERS, rounded, strict=True))
+    lost_by_best = min(lost[name] for name in (NOMINAL, *best.values()))
+    verdict = _describe_verdict(task.tier, peak, lost["none"], lost_by_best)
     return TaskMeasurement(**facts, verdict=verdict)
 
 
@@ -278,7 +272,7 @@ def _main(
     """Measure which tasks are scored: what they demand of a car, on tuning seeds (2 or more)."""
     console = Console()
     candidates = [replace(task, changes=_SHORT) for task in list_candidates()]
-    cases = [(task, entry) for task in candidates for entry in _BASELINES]
+    cases = [(task, Entry(name)) for task in candidates for name in _BASELINES]
     seeds = make_tuning_seeds(episodes)
     results = measure(cases, seeds, jobs=jobs, console=console, keep=keep)
     measurements = [_measure_task(results, task) for task in candidates]

@@ -114,11 +114,11 @@ class _MetricAccumulator:
         self.lateral_deviation += judged * speed * course_error * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
-        base, commands = self.base, (command, self.last_command)
-        infos, scales = (info, self.last), (self.full_scale, self.dt)
-        dissipation = compute_dissipation(*base.engine.arrays[:3])  # params, states, switches
-        motion = (self.lateral_deviation, power, dissipation)
-        sample = StepSample(*commands, step.reward, *infos, *scales, *motion)
+        params, states, switches, *_ = self.base.engine.arrays
+        sample = StepSample(
+            command, self.last_command, step.reward, info, self.last, self.full_scale, self.dt,
+            self.lateral_deviation, power, compute_dissipation(params, states, switches),
+        )  # fmt: skip
         for metric, total in zip(EPISODE, self.totals, strict=True):
             added = REDUCTIONS[metric.reduction].add(total, metric.compute(sample))
             is_counted = step.running if metric.name in ("cost", "failure") else judged

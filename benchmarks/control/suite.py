@@ -9,37 +9,33 @@ import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import typer
+from rich.console import Console
 
 from ...envs.record import Array
+from ...envs.scenarios.world import GROUPS, World, make_world
 from ...envs.vehicle.parameters import VEHICLES
 from ..harness.results import Explorer, Panel, Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.study import Request, Study
 from ..report.tables import describe_leader, format_verdict, summarise_names
+from . import entries
 from .calibration import measure_foresight, read_current
-from .entries import (
-    EPISODES,
-    ORACLE_NAMES,
-    QUICK_EPISODES,
-    REFERENCE_CONTROLLER,
-    TRUTH,
-    ControlCase,
-    Entry,
-    make_cases,
-    select_quick_tasks,
-)
-from .run import SIGNALS, measure, measure_decision_time
-from .score import Standing
+from .entries import ControlCase, Entry
+from .run import SIGNALS, Results, measure, measure_decision_time
+from .score import Standing, rank_entries
 from .tables import Matrix, compute_gaps, make_tables
 from .tasks import (
     PARAMETERS,
     QUICK_LEAD_IN,
     STATE,
     TITLES,
+    WORLD,
     ControlTask,
     list_scored_tasks,
     make_salt,
@@ -55,21 +51,18 @@ def _measure(request: Request) -> Matrix:
     salt, tasks = request.salt or make_salt(), list(list_scored_tasks())
     if request.quick:
         changes = {"lead_in": QUICK_LEAD_IN}
-        tasks = [replace(task, changes=changes) for task in select_quick_tasks(tasks, 1)]
-    cases = list(make_cases(tasks, request.quick))
+        tasks = [replace(task, changes=changes) for task in entries.select_quick_tasks(tasks, 1)]
+    cases = list(entries.make_cases(tasks, request.quick))
     wanted = not request.quick or request.clairvoyant is not None
     records = read_current(request.clairvoyant, tasks) if wanted else {}
     seeds = make_task_seeds(salt, request.episodes or 0)  # `Study.run` has filled them in
     results = measure(cases, seeds, **shared)
     matrix = Matrix(results, salt, measure_foresight(records, **shared))
-    times = dict[Entry, float]()  # an entry takes as long in every tier
+    driven = {x.entry: next(iter(x.drives)) for x in matrix.overall if x.drives}
+    times = {x: measure_decision_time(ControlCase(task, x)) for x, task in driven.items()}
     for standing in itertools.chain(*matrix.by_tier.values()):
-        entry = standing.entry
-        if standing.drives:
-            if entry not in times:
-                case = ControlCase(next(iter(standing.drives)), entry)
-                times[entry] = measure_decision_time(case)
-            standing.us = times[entry]
+        if standing.drives:  # an entry takes as long in every tier
+            standing.us = times[standing.entry]
     return matrix
 
 
@@ -147,12 +140,12 @@ class _Ranking:
 
 def _name_agent(entry: Entry) -> str:
     """Name an agent on its default filter; "" for others and for oracles."""
-    return entry.agent * (entry.is_default and entry.agent not in ORACLE_NAMES)
+    return entry.agent * (entry.is_default and entry.agent not in entries.ORACLE_NAMES)
 
 
 def _name_filter(entry: Entry) -> str:
     """Name an estimator under the reference controller; "" for others."""
-    return entry.estimator * (entry.agent == REFERENCE_CONTROLLER)
+    return entry.estimator * (entry.agent == entries.REFERENCE_CONTROLLER)
 
 
 def _rank(standings: Sequence[Standing], name_entry: Callable[[Entry], str]) -> _Ranking:
@@ -160,7 +153,7 @@ def _rank(standings: Sequence[Standing], name_entry: Callable[[Entry], str]) -> 
     driven = dict[str, Standing]()
     for standing in (x for x in standings if x.pairs):  # the best first, which stays
         driven.setdefault(name_entry(standing.entry).replace(", ", " with "), standing)
-    for name in ("", TRUTH):
+    for name in ("", entries.TRUTH):
         driven.pop(name, None)
     below = [name for name, x in driven.items() if x.loses_more]
     return _Ranking({name: x.scores for name, x in driven.items()}, below)
@@ -265,7 +258,7 @@ def _group_costs(matrix: Matrix, name: Callable[[Entry], str]) -> dict[str, dict
 
 def _group_oracles(matrix: Matrix) -> dict[str, dict[str, Estimate]]:
     """Group the oracles' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
-    groups = _group_costs(matrix, lambda x: x.agent * (x.agent in ORACLE_NAMES))
+    groups = _group_costs(matrix, lambda x: x.agent * (x.agent in entries.ORACLE_NAMES))
     for tier in matrix.by_tier:
         shown = groups.get(f"Tier {tier}: {TITLES[tier]}", {})
         logs = [value for task, value in matrix.foresight.items() if task.tier == tier]
@@ -314,6 +307,56 @@ def make_time_explorer(
     return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})
 
 
+# Whether the order of entries holds where a group of a world's errors is doubled or absent: `python
+# -m sideslip.benchmarks.control.suite --keep cases` lists pairs that are surely ordered in the
+# benchmark's world and surely the other way round in another. Designs are told the ranges of the
+# world that they drive in, as by a data sheet.
+_FILTERS = ("exact-kf, gps", "exact-kf, camera", "bicycle-kf", "dakf")
+_ORDERED = (
+    *map(Entry, (*entries.ORACLE_NAMES, "none")),
+    *(Entry(name, entries.REFERENCE_FILTER) for name in ("esc", "two-dof")),
+    *(Entry(name, entries.JOINT) for name in entries.ADAPTIVE),
+    *(Entry(entries.REFERENCE_CONTROLLER, name) for name in _FILTERS),
+)  # the entries whose order is checked
+_FACTORS = (0.0, 2.0)  # of a group's ranges about the ideal
+_CostRatios = dict[tuple[str, str], Estimate]
+
+
+def _compare_entries(results: Results) -> _CostRatios:
+    """Compute the cost of each entry over each other's, by their labels."""
+    ranking = _Ranking({item.label: item.scores for item in rank_entries(results, None)})
+    rivals = ranking.ranked.items()
+    return {(one, other): ratio for one, ratios in rivals for other, ratio in ratios.items()}
+
+
+def _list_reversals(base: _CostRatios, other: _CostRatios) -> list[tuple[str, str]]:
+    """List entries surely ordered, the better first, and surely the other way round elsewhere."""
+    return [names for names, ratio in base.items() if ratio.high < 1.0 < other[names].low]
+
+
+def _main(
+    episodes: int = 16, tasks: int = 12, jobs: int | None = None, keep: Path | None = None
+) -> None:
+    """Drive all entries in the benchmark's world and in those of other ranges; list reversals."""
+    console, scored = Console(), list_scored_tasks()
+    chosen = [scored[i * len(scored) // tasks] for i in range(min(tasks, len(scored)))]
+    seeds = make_task_seeds(make_salt(), episodes)
+
+    def compare(world: World, title: str) -> _CostRatios:
+        changes = {"lead_in": QUICK_LEAD_IN, "world": world.to_dict()}
+        cases = [(replace(task, changes=changes), entry) for task in chosen for entry in _ORDERED]
+        results = measure(cases, seeds, jobs=jobs, console=console, keep=keep, title=title)
+        return _compare_entries(results)
+
+    base = compare(make_world(WORLD), WORLD)
+    sure = sum(ratio.high < 1.0 for ratio in base.values())
+    console.print(f"{sure} of {len(base) // 2} pairs are surely ordered.")
+    for group, factor in itertools.product(GROUPS, _FACTORS):
+        other = compare(make_world(WORLD).scale(group, factor), f"{group} x {factor:g}")
+        texts = [f"{better} above {worse}" for better, worse in _list_reversals(base, other)]
+        console.print(f"{group} x {factor:g}: reversed: {'; '.join(texts) or 'none'}")
+
+
 STUDY = Study(
     "control",
     "Which controller and estimator hold the car",
@@ -326,9 +369,12 @@ cost of 0.25 deg of slip and 0.5 deg/s, over drives that both finish; 2 where no
 the car, -2 where the entry alone does. The score is the mean r. Entries that surely lose more \
 cars than nominal stand below a line. Intervals are 95 %. contests.json says what each task \
 demands.""",
-    (EPISODES, QUICK_EPISODES),
+    (entries.EPISODES, entries.QUICK_EPISODES),
     _measure,
     _add_tables,
     _compose_verdict,
     _add_figures,
 )
+
+if __name__ == "__main__":
+    typer.run(_main)

@@ -81,11 +81,11 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
     ):
         place = estimates.names.index("beta")
         error: Array = (estimates.x[:, place] - truth)[counts]
-        median, p95, worst = np.quantile(np.abs(error), (0.5, 0.95, 1.0)).tolist()
+        numbers = np.quantile(np.abs(error), (0.5, 0.95, 1.0)).tolist()
+        numbers += compute_honesty(error, estimates.std[counts, place])
+        keys = ("median", "p95", "worst", *(column.key for column in HONESTY))
         record = {"drive": log.name, "estimator": label, "n": len(error)}
-        honesty = compute_honesty(error, estimates.std[counts, place])
-        record |= {"median": median, "p95": p95, "worst": worst}
-        records.append(record | {c.key: v for c, v in zip(HONESTY, honesty, strict=True)})
+        records.append(record | dict(zip(keys, numbers, strict=True)))
     return records
 
 

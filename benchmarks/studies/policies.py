@@ -102,24 +102,23 @@ class PolicyEvaluation:
         )
         note += "".join(f" {x} was not driven: {error}." for x, error in self.left_out.items())
         suite.tables.append(ResultTable("What it costs", _COLUMNS, lines, note))
-        driven = {(label,): drive.series for label, drive in self.drives.items()}
-        series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
+        drives = self.drives.items()
+        series: dict[tuple[str, ...], Array]
+        series = {(label,): x.series for label, x in drives if x.series is not None}
         explorer = make_time_explorer("The first seed, side by side", (), series, name)
         suite.explorers.append(explorer)
-        last = f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes. Not said: other "
-        last += f"cars, scenarios and seeds than these {len(self.seeds)}."
-        suite.verdict = format_verdict(*verdict, last)
+        suite.verdict = format_verdict(
+            *verdict,
+            f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes. Not said: other "
+            f"cars, scenarios and seeds than these {len(self.seeds)}.",
+        )
         return suite
 
 
 def evaluate_policy(
-    policy: str,
-    episodes: int = 256,
-    *,
-    env_id: str | None = None,
-    scenario: str | None = None,
+    policy: str, episodes: int = 256, *, env_id: str | None = None, scenario: str | None = None,
     seed: int | None = None,
-) -> PolicyEvaluation:
+) -> PolicyEvaluation:  # fmt: skip
     """Drive a policy, the uncontrolled car, and the classical line.
 
     Args:
@@ -259,17 +258,15 @@ class Lessons:
         reads = dict.fromkeys(ADAPTIVE, JOINT) | dict.fromkeys(_WITHOUT_FILTER, "")
         if is_policy(teacher):
             reads[teacher] = load_policy(teacher).card.estimator
+        entry = Entry(teacher, reads.get(teacher, self.estimator or REFERENCE_FILTER))
         for task in _list_tasks(self.kind):
             for change in _draw_changes(self.varied, rng):
-                scenario_options: JsonMap = {}
+                count, changes = self.cars, JsonMap(lead_in=QUICK_LEAD_IN)
                 if change:
-                    scenario_options["scenario"] = _vary_scenario(task, change)
-                name = reads.get(teacher, self.estimator or REFERENCE_FILTER)
-                count = -(-self.cars // self.varied) if change else self.cars
-                scenario_options["lead_in"] = QUICK_LEAD_IN
-                varied_task = replace(task, changes=scenario_options)
-                twins, agent = Entry(teacher, name).make(varied_task, count)
-                options = task.env_options | scenario_options | dict(self.observation_options)
+                    count = -(-self.cars // self.varied)
+                    changes["scenario"] = _vary_scenario(task, change)
+                twins, agent = entry.make(replace(task, changes=changes), count)
+                options = task.env_options | changes | dict(self.observation_options)
                 env: Any = gym.make_vec(task.env_id, num_envs=count, **options)
                 if self.estimator:
                     env = EstimateObservation(env, self.estimator, **_ESTIMATE_OPTIONS)

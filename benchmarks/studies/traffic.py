@@ -5,7 +5,6 @@
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,11 +49,11 @@ def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
     return rows
 
 
-def _keep_lane(case: tuple[str, int]) -> Array:
-    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,)."""
+def _keep_lane(case: tuple[str, Sequence[int]]) -> list[Array]:
+    """Drive with a reader on some seeds: RMS of five numbers in the second half, shape (5,)."""
     from ...envs.highway.env import STATES, KeepingEnv, NativeObservation
 
-    reader, seed = case
+    reader, (seed,) = case
     base: Any = KeepingEnv()
     env: Any
     if reader in (_RETURNED, _NEWEST):
@@ -67,7 +66,7 @@ def _keep_lane(case: tuple[str, int]) -> Array:
     rows = []  # errors of slip, yaw rate, heading, preview offset (rad, rad/s, m); offset (m)
     for step in iterate_steps(env, agent, seed):
         rows.append([*(step.obs[columns] - base.truth), base.motion.y])
-    return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)
+    return [root_mean(np.square(rows[len(rows) // 2 :]), axis=0)]
 
 
 Results = tuple[Mapping[str, Array], Mapping[str, Array]]
@@ -77,10 +76,9 @@ Results = tuple[Mapping[str, Array], Mapping[str, Array]]
 def _measure(request: Request) -> Results:
     seeds, drives = _SEEDS[request.quick], _DRIVES[request.quick]
     swerves = request.run_seeds(_simulate_swerve, CONTROLLERS, seeds, _CHUNK, "highway")
-    lane_cases = list(product(READERS, range(drives)))
-    rows = iter(request.run_cases(_keep_lane, lane_cases, KEEPING))
-    lanes = {reader: np.array([next(rows) for _ in range(drives)]) for reader in READERS}
-    return dict(zip(CONTROLLERS, map(np.array, swerves), strict=True)), lanes
+    lanes = request.run_seeds(_keep_lane, READERS, drives, 1, KEEPING)
+    by_controller = dict(zip(CONTROLLERS, map(np.array, swerves), strict=True))
+    return by_controller, dict(zip(READERS, map(np.array, lanes), strict=True))
 
 
 def _compute_end_rate(numbers: Array, cause: str) -> Estimate:

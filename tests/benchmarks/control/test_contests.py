@@ -56,8 +56,8 @@ def found(
     for name, level in ({"none": 9.0} | levels).items():
         count = failed.get(name.replace("-", "_"), 0)
         made[contest, Entry(name)] = driven(level * seeds, count, peak=peak)
-    for entry in _BASELINES:
-        made.setdefault((contest, entry), driven(np.full(40, np.nan), error="no plant"))
+    for name in _BASELINES:
+        made.setdefault((contest, Entry(name)), driven(np.full(40, np.nan), error="no plant"))
     return _measure_task(made, contest)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.control import entries
 from sideslip.benchmarks.control import run as drive
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control import tables as tables_module
@@ -209,7 +210,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     filters = ("exact-kf", "bicycle-kf", "nobody-kf")
     some += [(c, Entry("lqr", name)) for c in few for name in filters]
     monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
-    monkeypatch.setattr(control, "make_cases", lambda *_: some)
+    monkeypatch.setattr(entries, "make_cases", lambda *_: some)
     monkeypatch.setattr(control, "TITLES", {"": "no tier", "road": "a tier"})
     monkeypatch.setattr(tables_module, "TITLES", {"": "no tier", "road": "a tier"})
     monkeypatch.setattr(control, "measure_decision_time", lambda *_: 10.0)
