@@ -46,16 +46,17 @@ def _choose_upright_action(obs: Array) -> npt.NDArray[np.int_]:
 
 
 def _make_episode(
-    env: gym.Env[Any, Any], policy: Callable[[Array], npt.NDArray[np.int_]] | None = None
+    env: Any, policy: Callable[[Array], Any] | None = None, max_steps: int = 0
 ) -> Workload:
     """Make calls of `_CHUNK` steps of one episode, in which a policy acts, or nothing is done."""
     idle = env.action_space.sample() * 0
     obs, _ = env.reset(seed=0)
     actions, over = list[object](), False
-    while not over and len(actions) < EPISODE:
-        actions.append(idle if policy is None else int(policy(obs)))
+    while not over and len(actions) < (max_steps or EPISODE):
+        action = idle if policy is None else policy(obs)
+        actions.append(action if np.ndim(action) else int(action))  # as a user's single one
         obs, _, terminated, truncated, _ = env.step(actions[-1])
-        over = terminated or truncated
+        over = bool(np.all(terminated | truncated))
 
     chunk = min(_CHUNK, len(actions))
     end = position = len(actions) // chunk * chunk
@@ -69,36 +70,25 @@ def _make_episode(
             env.step(action)
         position += chunk
 
-    return Workload(run_chunk, chunk)
+    return Workload(run_chunk, chunk * getattr(env, "num_envs", 1))
 
 
 def _make_batch(env: Any, steps: int = _STEPS) -> Workload:
     """Make calls of some steps of a batch in which nothing is done."""
     env.reset(seed=0)
     idle = np.zeros(env.action_space.shape, env.action_space.dtype)
-    return Workload(lambda: _repeat_step(env, idle, steps), steps * env.num_envs)
 
+    def run_steps() -> None:
+        for _ in range(steps):
+            env.step(idle)
 
-def _repeat_step(env: Any, action: Any, steps: int) -> None:
-    for _ in range(steps):
-        env.step(action)
+    return Workload(run_steps, steps * env.num_envs)
 
 
 def _make_cartpoles() -> Workload:
-    """Make calls of Gymnasium's own batch of carts, from a reset on, with poles kept up."""
-    env: Any = gym.make_vec(CARTPOLE, COUNT, vectorization_mode="vector_entry_point")
-    obs, _ = env.reset(seed=0)
-    actions = []
-    for _ in range(EPISODE // 5):
-        actions.append(_choose_upright_action(obs))
-        obs, *_ = env.step(actions[-1])
-
-    def run_steps() -> None:
-        env.reset(seed=0)
-        for action in actions:
-            env.step(action)
-
-    return Workload(run_steps, len(actions) * COUNT)
+    """Make calls of Gymnasium's own batch of carts, with poles kept up."""
+    env = gym.make_vec(CARTPOLE, COUNT, vectorization_mode="vector_entry_point")
+    return _make_episode(env, _choose_upright_action, EPISODE // 5)
 
 
 def _make_lane_keeping() -> Workload:

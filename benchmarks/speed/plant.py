@@ -86,8 +86,7 @@ class Cars(NamedTuple):
         return Cars(*(array.copy() for array in self))
 
 
-_Advance = Callable[[Cars, int], object]
-"""Moves cars on by some ticks, in place."""
+_Advance = Callable[[Cars, int], object]  # moves cars on by some ticks, in place
 
 
 def _make_cars(count: int, seed: int = 0) -> Cars:

@@ -6,13 +6,10 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("numba_cuda")
-
-from sideslip.benchmarks.speed.ptx import _assemble_kernel, _count_by_kind
-
 torch = pytest.importorskip("torch")
 
 from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
+from sideslip.benchmarks.speed.device import _assemble_kernel, _count_by_kind  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -94,13 +91,13 @@ def test_the_assembler_says_what_a_thread_holds_or_ends_the_count(
 ) -> None:
     """Without one on the path nothing is counted."""
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert _assemble_kernel(TEXT, (9, 0)) == {}
+    assert _assemble_kernel(TEXT) == {}
     ptxas = tmp_path / "ptxas"
     ptxas.write_text(f"#!/bin/sh\necho '{SAID}' >&2\nexit {status}\n")
     ptxas.chmod(0o755)
     if status:
         with pytest.raises(subprocess.CalledProcessError):
-            _assemble_kernel(TEXT, (9, 0))
+            _assemble_kernel(TEXT)
     else:
         held = {"registers": "42", "stack, bytes": "16", "spilled, bytes": "4"}
-        assert _assemble_kernel(TEXT, (9, 0)) == held
+        assert _assemble_kernel(TEXT) == held
