@@ -18,9 +18,9 @@ from ..harness.drives import make_env
 
 Fields = Mapping[str, Any]
 
+# a proving ground without wind: what every procedure's scenario starts from
 CALM: dict[str, Any] = {"name": "procedure", "half_width": 1e6}  # m
 CALM |= {"disturbance_force": 0.0, "disturbance_moment": 0.0}
-"""A proving ground without wind: what every procedure's scenario starts from."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ class Series:
 
 
 POSE = 6  # numbers of a `Motion` in a series, from v_x to Y
-DriveFunction = Callable[[Fields], Series]
-"""From fields of a `Scenario` to what the car did."""
+DriveFunction = Callable[[Fields], Series]  # from fields of a `Scenario` to what the car did
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ _POLICIES = {"coms": "distill-coms-steering", "passenger-car": "distill-car-stee
 _STATES = ["beta", "gamma", "F_d", "N_d"]
 _FORCES: dict[str, Any] = {"outputs": _STATES, "options": {"slow": ["camera", "gps"]}}
 _TYRES = {"outputs": [*_STATES, "front_tyres", "rear_tyres", "inverse_friction"]}
-ENTRIES = (
+_ENTRIES = (
     ProcedureEntry("none"),
     ProcedureEntry("two-dof", "exact-kf", _FORCES),
     ProcedureEntry("model-following", "exact-kf", _FORCES),
@@ -155,23 +154,18 @@ ENTRIES = (
     ProcedureEntry("adaptive-nmpc", "joint", _TYRES, slow=True),
     ProcedureEntry("policy on joint", policies=_POLICIES),
 )
+ENTRIES = {entry.agent: entry for entry in _ENTRIES}
 
 
 @dataclass(frozen=True)
 class ProcedureCase:
-    """A case: a procedure, a car or outside model, a controller's index in `ENTRIES`, seeds."""
+    """A case: a procedure, a car or outside model, a controller of `ENTRIES`, seeds."""
 
     procedure: str
     car: str
-    entry_index: int = 0
+    agent: str = "none"
     seeds: tuple[int, ...] = ()
     quick: bool = False
 
-    @property
-    def agent(self) -> str:
-        """The controller."""
-        return ENTRIES[self.entry_index].agent
 
-
-CaseResults = dict[ProcedureCase, Any]
-"""What each case gives: a result of its procedure's module."""
+CaseResults = dict[ProcedureCase, Any]  # a result of the procedure's module by case

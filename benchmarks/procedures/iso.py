@@ -1,18 +1,8 @@
 """ISO 3888, 4138 and 7401: lane changes between cones, steady circles, transient responses.
 
-ISO 3888: double lane change (part 1) and obstacle avoidance (part 2). Part 1 is driven at a held
-speed, part 2 coasting, until one of `DRIVERS` hits no cone: the highest clean speed is that of car
-and drivers together, below what test drivers do. A slower car's tracks are shortened by its own
-speed over the standards' 80 km/h, but for the widths of the lanes.
-
-ISO 4138: constant steering angle with slowly rising speed. The handling diagram is
-l gamma / v_x - delta_f over a_y; its slope is minus the understeer gradient K:
-delta_f = l / R + K a_y. The linear model's is l times G of dakf-stability (24).
-
-ISO 7401: a step of the steering angle and a swept sine. A step's times count from where the
-steering angle passes half its end value. The sweep's frequency response is S_xy / S_xx of Welch's
-averaged periodograms, whose standard deviation follows from the coherence (Bendat and Piersol,
-Random Data, 9.2), beside the linear model's C (j w I - A)^-1 B + D.
+ISO 3888: double lane change (part 1, at a held speed) and obstacle avoidance (part 2, coasting).
+The highest clean speed is that of car and drivers together, below what test drivers do. A slower
+car's tracks are shortened by its speed over the standards' 80 km/h, but for the lanes' widths.
 """
 
 import math
@@ -146,7 +136,10 @@ LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slop
 
 @dataclass(frozen=True)
 class Handling:
-    """The handling diagram, shape (n,) each, and its slope."""
+    """ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y, (n,) each, and its slope.
+
+    That is minus K: delta_f = l / R + K a_y. The linear model's is l G of dakf-stability (24).
+    """
 
     a_y: Array  # m/s2
     angle: Array  # rad
@@ -196,7 +189,7 @@ _SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
 
 @dataclass(frozen=True)
 class StepResponse:
-    """The numbers of a step of the steering angle."""
+    """ISO 7401's numbers of a step; times count from where the steering passes half its end."""
 
     gain: float  # steady state per rad of steering
     response_time: float  # s, to 90 % of the steady state
@@ -243,7 +236,10 @@ def _find_crossing(t: Array, values: Array, level: float) -> float:
 
 
 def _estimate_frequency_response(t: Array, steer: Array, output: Array) -> FrequencyResponse:
-    """Estimate the frequency response of output to steering from 0.2 to 2 Hz; arrays: (n,)."""
+    """Estimate the frequency response of output to steering from 0.2 to 2 Hz; arrays: (n,).
+
+    S_xy / S_xx by Welch; its deviation by the coherence (Bendat and Piersol, Random Data, 9.2).
+    """
     from scipy.signal import csd, welch
 
     duration = float(t[-1] - t[0])

@@ -36,8 +36,7 @@ _SCENARIO: dict[str, Any] = {
 }  # fmt: skip
 """A lane change within what the outside car was made for, drawn by the seed."""
 
-Law = Callable[[Motion, float], float]
-"""A yaw moment in N m from the true motion and the steering angle."""
+Law = Callable[[Motion, float], float]  # N m, from the true motion and the steering angle
 _SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
 
 

@@ -42,14 +42,14 @@ _TEXT = (
 
 def _measure_case(case: ProcedureCase) -> Any:
     if case.procedure == "outside":
-        return outside.run_episodes(case.car, ENTRIES[case.entry_index], case.seeds)
+        return outside.run_episodes(case.car, ENTRIES[case.agent], case.seeds)
     if case.procedure == "check":
         return outside.run_check()
-    car, entry = CARS[case.car], ENTRIES[case.entry_index]
+    car, entry = CARS[case.car], ENTRIES[case.agent]
     if case.procedure == "fmvss-126":
         multiples, results = _QUICK_MULTIPLES if case.quick else None, []
         for seed in case.seeds:
-            A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car, seed), car)
+            A = fmvss126.measure_reference_angle(ENTRIES["none"].drive(case.car, seed), car)
             results.append(fmvss126.run(entry.drive(case.car, seed), car, A, multiples))
         return results
     drive = entry.drive(case.car, 0 if case.procedure in iso.TRACKS else None)
@@ -62,18 +62,18 @@ def _measure_case(case: ProcedureCase) -> Any:
 
 def _make_cases(quick: bool) -> list[ProcedureCase]:
     """Make the list of what is driven; outside plants only where their extra is installed."""
-    indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
+    agents = [name for name, entry in ENTRIES.items() if not (quick and entry.slow)]
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
     driven = (("fmvss-126", seeds), *((track, ()) for track in iso.TRACKS))
-    triples = product(driven, CARS, indices)
-    cases = [ProcedureCase(name, car, k, some, quick) for (name, some), car, k in triples]
+    triples = product(driven, CARS, agents)
+    cases = [ProcedureCase(name, car, agent, x, quick) for (name, x), car, agent in triples]
     cases += [ProcedureCase(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
     if not _HAS_OUTSIDE:
         return cases
     cases.append(ProcedureCase("check", outside.MODEL))
     outside_seeds = seeds[: len(seeds) if quick else OUTSIDE_EPISODES]
-    pairs = product(OUTSIDE_PLANTS, indices)
-    return cases + [ProcedureCase("outside", model, k, outside_seeds) for model, k in pairs]
+    pairs = product(OUTSIDE_PLANTS, agents)
+    return cases + [ProcedureCase("outside", *pair, outside_seeds) for pair in pairs]
 
 
 def _group_results(done: CaseResults) -> dict[str, CaseResults]:
@@ -127,7 +127,7 @@ class _Table(NamedTuple):
 
 def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
     """Make a line of a table, and the columns of its rows; output: if a case measures several."""
-    estimator = ENTRIES[case.entry_index].get_configuration(case.car)[1]
+    estimator = ENTRIES[case.agent].get_configuration(case.car)[1]
     scenario = f"{case.procedure} {case.car}" + (f", {x}" if (x := more.get("output")) else "")
     names = {"controller": case.agent, "car": case.car, "estimator": estimator}
     return {"scenario": scenario, "salt": "", **names, **more}

@@ -19,7 +19,7 @@ LINEAR = {"small_angle": True, "tyres": "linear", "lags": False, "roll": False}
 
 def linear(name: str) -> DriveFunction:
     """Drives of the small-angle car with linear tyres and no lag."""
-    drive = ENTRIES[0].drive(name)
+    drive = ENTRIES["none"].drive(name)
     return lambda fields: drive({**fields, **LINEAR})
 
 
@@ -76,7 +76,7 @@ def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
 
 @pytest.mark.parametrize(("name", "large"), [("coms", 3.5), ("passenger-car", 6.5)])
 def test_uncontrolled_cars_pass_small_amplitudes_alone(name: str, large: float) -> None:
-    car, drive = CARS[name], ENTRIES[0].drive(name)
+    car, drive = CARS[name], ENTRIES["none"].drive(name)
     A = fmvss126.measure_reference_angle(drive, car)
     result = fmvss126.run(drive, car, A, [1.5, large])
     assert [run.passed for run in result.runs] == [True, True, False, False]
@@ -88,13 +88,13 @@ def test_uncontrolled_cars_pass_small_amplitudes_alone(name: str, large: float) 
 @pytest.mark.parametrize("track", iso.TRACKS)
 def test_a_slow_driver_touches_no_cone(name: str, track: str) -> None:
     car = CARS[name]
-    drive = ENTRIES[0].drive(name)
+    drive = ENTRIES["none"].drive(name)
     runs = [iso.run_track(drive, car, track, share * car.speed) for share in (0.45, 1.1)]
     assert [run.passed for run in runs] == [True, False]
 
 
 def test_a_failed_episode_is_told_and_ends_early() -> None:
-    spun = ENTRIES[0].drive("passenger-car")(
+    spun = ENTRIES["none"].drive("passenger-car")(
         {"steering": "held-step", "amplitude": 0.5, "speed": 30.0, "duration": 5.0}
     )
     assert spun.failed

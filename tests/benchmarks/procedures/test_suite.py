@@ -19,8 +19,8 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     cases = suite._make_cases(quick=False)
     assert len(set(cases)) == len(cases)
     for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
-        mine = {(case.car, case.entry_index) for case in cases if case.procedure == procedure}
-        assert mine == {(car, k) for car in CARS for k in range(len(ENTRIES))}
+        mine = {(case.car, case.agent) for case in cases if case.procedure == procedure}
+        assert mine == {(car, agent) for car in CARS for agent in ENTRIES}
     driven = {case.car: case.seeds for case in cases if case.procedure == "outside"}
     assert set(driven) == set(OUTSIDE_PLANTS)
     assert {len(seeds) for seeds in driven.values()} == {8}
@@ -29,9 +29,9 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
 @pytest.mark.parametrize("car", [*CARS, "drift"])
 def test_each_contestant_has_what_it_reads(car: str) -> None:
     """Policies drive the car that they learned on, outside cars as the passenger car."""
-    names = [each.get_configuration(car)[0] for each in ENTRIES]
+    names = [each.get_configuration(car)[0] for each in ENTRIES.values()]
     assert names[-1] == f"distill-{'coms' if car == 'coms' else 'car'}-steering"
-    for each in ENTRIES:
+    for each in ENTRIES.values():
         _, estimator, estimate = each.get_configuration(car)
         options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
         env = make_env(ENV_ID, estimator, estimate, **options)
@@ -67,7 +67,7 @@ def test_the_interval_of_the_median_amplitude_holds_it() -> None:
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:
-    driven = {ENTRIES[case.entry_index].agent for case in suite._make_cases(quick=True)}
+    driven = {case.agent for case in suite._make_cases(quick=True)}
     assert "adaptive-nmpc" not in driven
     assert {"adaptive-lqr", "policy on joint"} <= driven
 
@@ -90,7 +90,7 @@ def test_the_check_on_the_drift_model_is_reproduced() -> None:
 @pytest.mark.long
 def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("plotly")
-    known = [case for case in suite._make_cases(quick=True) if case.entry_index == 0]
+    known = [case for case in suite._make_cases(quick=True) if case.agent == "none"]
     cases = [case for case in known if case.car != "multi-body"]
     monkeypatch.setattr(suite, "_make_cases", lambda quick: cases)
     found = suite.STUDY.run(Request(quick=True, jobs=1))
