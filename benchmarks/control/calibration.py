@@ -273,8 +273,7 @@ def _main(
     console = Console()
     candidates = [replace(task, changes=_SHORT) for task in list_candidates()]
     cases = [(task, Entry(name)) for task in candidates for name in _BASELINES]
-    seeds = make_tuning_seeds(episodes)
-    results = measure(cases, seeds, jobs=jobs, console=console, keep=keep)
+    results = measure(cases, make_tuning_seeds(episodes), jobs=jobs, console=console, keep=keep)
     measurements = [_measure_task(results, task) for task in candidates]
     table = Table("task", "peak slip / deg", "lost: none, nominal, oracle / %", "verdict")
     for m in measurements:

@@ -160,8 +160,7 @@ class Standing:
         pairs = self.pairs.values()
         if not pairs:
             return False
-        finished = np.concatenate([pair.finished for pair in pairs], axis=1)
-        return stats.is_share_larger(*~finished)
+        return stats.is_share_larger(*~np.concatenate([pair.finished for pair in pairs], axis=1))
 
     @property
     def is_partial(self) -> bool:

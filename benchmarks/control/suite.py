@@ -56,8 +56,7 @@ def _measure(request: Request) -> Matrix:
     wanted = not request.quick or request.clairvoyant is not None
     records = read_current(request.clairvoyant, tasks) if wanted else {}
     seeds = make_task_seeds(salt, request.episodes or 0)  # `Study.run` has filled them in
-    results = measure(cases, seeds, **shared)
-    matrix = Matrix(results, salt, measure_foresight(records, **shared))
+    matrix = Matrix(measure(cases, seeds, **shared), salt, measure_foresight(records, **shared))
     driven = {x.entry: next(iter(x.drives)) for x in matrix.overall if x.drives}
     times = {x: measure_decision_time(ControlCase(task, x)) for x, task in driven.items()}
     for standing in itertools.chain(*matrix.by_tier.values()):

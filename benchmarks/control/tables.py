@@ -103,8 +103,7 @@ def make_tables(matrix: Matrix) -> list[ResultTable]:
         tasks = [task for task in matrix.tasks if task.tier == tier]
         detail.append(make_task_table(f"{title}, task by task", ranked, tasks))
         detail.append(_make_motion_table(f"{title}: the motion", ranked))
-    failures = make_failure_tables(matrix.results)
-    return [*main, _make_oracle_table(matrix), *detail, *failures]
+    return [*main, _make_oracle_table(matrix), *detail, *make_failure_tables(matrix.results)]
 
 
 def make_main_table(

@@ -110,8 +110,7 @@ def compute_coms_ranks(seed: int) -> Numbers:
         "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
-    ranks = {(name, "rank"): _compute_observability_rank(*model) for name, model in models.items()}
-    return {key: float(rank) for key, rank in ranks.items()}
+    return {(x, "rank"): float(_compute_observability_rank(*y)) for x, y in models.items()}
 
 
 PAPER = "dual-rate"
@@ -126,8 +125,7 @@ _GROWS = 1.001  # the unobservable directions stay at 1, to the rounding of a do
 
 def make_extended_model() -> tuple[Array, Array]:
     """Make A and C of (11), the course model at 25 km/h and 1 ms with a random walk per state."""
-    car = COMS.replace(front_stiffness=9100.0, rear_stiffness=9100.0)
-    model = make_course_model(car, SPEED)
+    model = make_course_model(COMS.replace(front_stiffness=9100.0, rear_stiffness=9100.0), SPEED)
     A = np.zeros((6, 6))
     A[:3, :3], A[:3, 3:] = model.A, np.eye(3)
     return expm(A * 1e-3), np.array([[1.0, 0.0, 1.0, 0.0, 0.0, 0.0]])

@@ -38,8 +38,7 @@ class EstimationSimulation(Simulation):
     control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
     def _prepare(self) -> SeedFunction:
-        options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
-        env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
+        env = gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
         base: Any = env.unwrapped
         estimators: dict[str, Estimator] = {}
 

@@ -104,17 +104,19 @@ class ProcedureEntry:
         card = load_policy(name).card
         return name, card.estimator, card.estimator_options
 
-    def make_agent(self, car: str, env: Any) -> Agent:
-        """Make the agent with the options that were tuned for the benchmark.
+    def make(self, car: str, env_id: str, **options: Any) -> tuple[Any, Agent]:
+        """Make an env with the estimator, and the agent as it was tuned for the benchmark.
 
         Args:
             car: One of `CARS`, or an outside model, which is taken for the passenger car.
-            env: Env of the agent.
+            env_id: Id of the env.
+            options: Options of the env.
         """
-        agent, estimator, _ = self.get_configuration(car)
-        vehicle = car if car in CARS else "passenger-car"
-        task = ControlTask(env_id=STEERING, vehicle=vehicle)
-        return make_agent(agent, env, **ControlCase(task, Entry(agent, estimator)).agent_options)
+        agent, estimator, estimate = self.get_configuration(car)
+        env = make_env(env_id, estimator, estimate, **options)
+        task = ControlTask(env_id=STEERING, vehicle=car if car in CARS else "passenger-car")
+        tuned = ControlCase(task, Entry(agent, estimator)).agent_options
+        return env, make_agent(agent, env, **tuned)
 
     def drive(self, car: str, seed: int | None = None) -> DriveFunction:
         """Make the drives of a car; references stay within what friction can hold.
@@ -123,17 +125,15 @@ class ProcedureEntry:
             car: One of `CARS`.
             seed: Seed of what errs in car and sensors; None: nothing errs.
         """
-        _, estimator, estimate = self.get_configuration(car)
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
         options |= {"world": "ideal"} if seed is None else {}
 
         def run_drive(fields: Fields) -> Series:
-            env = make_env(ENV_ID, estimator, estimate, scenario=CALM | dict(fields), **options)
-            base: Any = env.unwrapped
+            env, agent = self.make(car, ENV_ID, scenario=CALM | dict(fields), **options)
             rows = []
-            for step in iterate_steps(env, self.make_agent(car, env), seed or 0):
+            for step in iterate_steps(env, agent, seed or 0):
                 t, steer, moment = (step.info[name] for name in ("t", "steer", "yaw_moment"))
-                rows.append([t, steer, *base.motion[:POSE], moment])
+                rows.append([t, steer, *env.unwrapped.motion[:POSE], moment])
             env.close()
             return replace(Series(*np.array(rows).T), failed=bool(step.info["failure"]))
 

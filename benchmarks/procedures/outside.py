@@ -19,7 +19,6 @@ from ...envs.scenarios.scenario import Scenario
 from ...envs.scenarios.world import Draws
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY
-from ..harness.drives import make_env
 from . import fmvss126
 from .drive import CALM, POSE, DriveFunction, Fields, ProcedureEntry, Series, TestCar
 
@@ -99,8 +98,6 @@ def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> Arr
     """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     options |= {"steering": True, "sensors": "fusion"}
-    _, estimator, estimate = entry.get_configuration(model)
-    env = make_env(_ENV_ID, estimator, estimate, **options)
-    agent = entry.make_agent(model, env)
+    env, agent = entry.make(model, _ENV_ID, **options)
     rollouts = [rollout(env, agent, seed) for seed in seeds]
     return np.array([[x.cost, x.failed, np.abs(x["beta"]).max()] for x in rollouts])

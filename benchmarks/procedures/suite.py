@@ -187,8 +187,7 @@ def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
     speeds = (Column(track, f"{track} / (km/h)", form=".0f") for track in done)
     note = "The highest speed without a cone; any of five drivers may do it."
     title = "ISO 3888, lane change and obstacle avoidance"
-    table = ResultTable(title, (*_KEYS, *speeds), list(lines.values()), note)
-    suite.tables.append(table)
+    suite.tables.append(ResultTable(title, (*_KEYS, *speeds), list(lines.values()), note))
 
 
 def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:

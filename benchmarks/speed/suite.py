@@ -13,6 +13,8 @@ from functools import partial
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import numpy as np
+
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Bound
 from ..report.study import Request, Study
@@ -25,25 +27,16 @@ KERNEL = "cold compile of the dearest kernel"
 _RUNS, _QUICK_RUNS = 5, 2  # fresh processes
 LIMIT = 60.0  # s, on the wall, of a process that has nothing to compile
 
-_WARM = """
-import json, time
-marks = [("interpreter", time.process_time())]
-def done(name):
-    marks.append((name, time.process_time()))
-import gymnasium, numpy
-done("import gymnasium")
-import sideslip
-done("import sideslip")
-import numba
-done("import numba")
-env = gymnasium.make("sideslip/YawFusion-v0")
-done("gym.make")
-env.reset(seed=0)
-done("first reset")
-env.step(numpy.zeros(1, numpy.float32))
-done("first step")
-print(json.dumps(marks))
-"""
+_STEPS = {
+    "interpreter": "import json, time; marks = []",
+    "import gymnasium": "import gymnasium, numpy",
+    "import sideslip": "import sideslip",
+    "import numba": "import numba",
+    "gym.make": "env = gymnasium.make('sideslip/YawFusion-v0')",
+    "first reset": "env.reset(seed=0)",
+    "first step": "env.step(numpy.zeros(1, numpy.float32))",
+}  # what a process does up to its first step
+_WARM = "".join(f"{code}\nmarks.append(time.process_time())\n" for code in _STEPS.values())
 
 _WATCH = """
 import json, logging
@@ -78,11 +71,10 @@ run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
 def _measure_first_step() -> dict[str, float]:
     """Measure the CPU seconds of what a process does up to its first step; kernels are cached."""
     try:
-        marks: list[tuple[str, float]] = json.loads(_run_python(_WARM, limit=LIMIT))
+        marks = json.loads(_run_python(f"{_WARM}print(json.dumps(marks))", limit=LIMIT))
     except subprocess.TimeoutExpired:
         raise AbsentError("no kernels are cached on disk here") from None
-    before = [0.0, *(at for _, at in marks)]
-    return {name: at - before[i] for i, (name, at) in enumerate(marks)}
+    return dict(zip(_STEPS, np.diff(marks, prepend=0.0).tolist(), strict=True))
 
 
 def _measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:

@@ -20,12 +20,11 @@ from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import VEHICLES
 from ...estimators.vector.estimate import EstimateObservation
-from ..control.entries import ADAPTIVE, JOINT, ORACLE_NAMES, REFERENCE_FILTER, ControlCase, Entry
+from ..control.entries import ADAPTIVE, JOINT, REFERENCE_FILTER, ControlCase, Entry
 from ..control.run import Chunk, DriveResult, run_chunk
 from ..control.score import compute_log_ratios
 from ..control.tasks import (
     NOMINAL,
-    ORACLES,
     PARAMETERS,
     QUICK_LEAD_IN,
     ControlTask,
@@ -105,8 +104,7 @@ class PolicyEvaluation:
         drives = self.drives.items()
         series: dict[tuple[str, ...], Array]
         series = {(label,): x.series for label, x in drives if x.series is not None}
-        explorer = make_time_explorer("The first seed, side by side", (), series, name)
-        suite.explorers.append(explorer)
+        suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
         suite.verdict = format_verdict(
             *verdict,
             f"It fails in {100.0 * lines[0]['fails']:.0f} % of the episodes. Not said: other "
@@ -182,7 +180,6 @@ VARIED = {"tyres": (0.4, 2.0), "wind": (-500.0, 500.0), "mass": (0.8, 1.3)}
 VARIED |= {"camera": (0.01, 0.12), "out": (2.0, 6.0)}
 """Drawn in each episode: factors on each axle's tyres, side wind (N); once a lesson: a factor on
 the true car's mass, how late its camera is (s), how long its GPS or its camera is out (s)."""
-_WITHOUT_FILTER = (*ORACLE_NAMES, *(name for names in ORACLES.values() for name in names))
 FILTERS = ("", JOINT)
 
 
@@ -255,10 +252,11 @@ class Lessons:
         from ...agents.training.distill import DistillTask
 
         rng, teacher, lessons = np.random.default_rng(self.seed), self.teacher, []
-        reads = dict.fromkeys(ADAPTIVE, JOINT) | dict.fromkeys(_WITHOUT_FILTER, "")
+        entry = Entry(teacher, JOINT if teacher in ADAPTIVE else self.estimator or REFERENCE_FILTER)
         if is_policy(teacher):
-            reads[teacher] = load_policy(teacher).card.estimator
-        entry = Entry(teacher, reads.get(teacher, self.estimator or REFERENCE_FILTER))
+            entry = Entry(teacher, load_policy(teacher).card.estimator)
+        elif entry.is_oracle:
+            entry = Entry(teacher)
         for task in _list_tasks(self.kind):
             for change in _draw_changes(self.varied, rng):
                 count, changes = self.cars, JsonMap(lead_in=QUICK_LEAD_IN)

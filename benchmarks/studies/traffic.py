@@ -133,8 +133,7 @@ def _add_tables(suite: Suite, results: Results) -> None:
         slip, *errors, offset = map(interval, numbers.T)
         record = {"estimator": reader, "rmse": slip, "offset": offset}
         records.append(record | dict(zip(("rate", "heading", "y_l"), errors, strict=True)))
-    drives = len(lanes[_NEWEST])
-    suite.add_rows(records, controller="lane-keeping", scenario=KEEPING, n=drives)
+    suite.add_rows(records, controller="lane-keeping", scenario=KEEPING, n=len(lanes[_NEWEST]))
     note = "RMS errors of what the controller reads, and where the car was, from half time on."
     suite.tables.append(ResultTable("highway-env's lane keeping", _LANE_COLUMNS, records, note))
 

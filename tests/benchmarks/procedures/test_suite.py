@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("vehiclemodels")
-from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import fmvss126, outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
 from sideslip.benchmarks.report.tables import format_columns
@@ -32,10 +31,7 @@ def test_each_contestant_has_what_it_reads(car: str) -> None:
     names = [each.get_configuration(car)[0] for each in ENTRIES.values()]
     assert names[-1] == f"distill-{'coms' if car == 'coms' else 'car'}-steering"
     for each in ENTRIES.values():
-        _, estimator, estimate = each.get_configuration(car)
-        options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
-        env = make_env(ENV_ID, estimator, estimate, **options)
-        each.make_agent(car, env)
+        each.make(car, ENV_ID, vehicle="coms" if car == "coms" else "passenger-car")
 
 
 def test_a_car_that_passes_its_own_series_does_not_fail_beside_one_with_a_longer_one() -> None:
