@@ -59,8 +59,7 @@ def compare_maps(A: Array, C: Array, L: Array, r: int) -> float:
     return max(float(np.linalg.norm(a - b)) / size for a, b in zip(maps, fast, strict=True))
 
 
-Matrix = npt.NDArray[np.object_]
-"""Matrix of fractions."""
+Matrix = npt.NDArray[np.object_]  # of fractions
 
 
 def _rank(matrix: Matrix) -> int:

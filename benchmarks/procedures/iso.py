@@ -267,8 +267,7 @@ def _compute_linear_response(
     B = model.B[:, 0]
     turned = [np.linalg.solve(2j * np.pi * f * np.eye(2) - model.A, B) for f in frequency]
     beta, gamma = np.array(turned).T
-    a_y = speed * (2j * np.pi * frequency * beta + gamma)
-    return {"gamma": gamma, "a_y": a_y}
+    return {"gamma": gamma, "a_y": speed * (2j * np.pi * frequency * beta + gamma)}
 
 
 def _compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:

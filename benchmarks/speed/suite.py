@@ -180,8 +180,7 @@ def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, 
     suite.tables.insert(0, ResultTable("Targets", header, cells, note, keyed=False))
 
 
-_SpeedResults = tuple[Mapping[str, Taken], Suite]
-"""What was measured: CPU times a unit (us) by name, and their rows and tables."""
+_SpeedResults = tuple[Mapping[str, Taken], Suite]  # us a unit by name, and all rows and tables
 
 
 def _measure(request: Request) -> _SpeedResults:

@@ -233,8 +233,7 @@ def _measure_seeds(case: tuple[Condition, Sequence[int]]) -> list[Outcome | None
     return [_measure_drive(condition, _FIRST_SEED + seed) for seed in seeds]
 
 
-Results = dict[str, dict[str, Any]]
-"""Cells of the table by condition and column."""
+Results = dict[str, dict[str, Any]]  # cells of the table by condition and column
 
 
 def _measure(request: Request) -> Results:

@@ -32,8 +32,7 @@ _COLUMNS = (
 BOUND = "the bound"
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
-Results = list[dict[str, Array]]
-"""Of each experiment by filter and `BOUND`: numbers of `_run_filters`, shape (seeds, 2)."""
+Results = list[dict[str, Array]]  # of each experiment by filter and `BOUND`, shape (seeds, 2)
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,7 @@ def _keep_lane(case: tuple[str, Sequence[int]]) -> list[Array]:
     return [root_mean(np.square(rows[len(rows) // 2 :]), axis=0)]
 
 
-Results = tuple[Mapping[str, Array], Mapping[str, Array]]
-"""Of `_simulate_swerve` by controller, and of `_keep_lane` by reader."""
+Results = tuple[Mapping[str, Array], Mapping[str, Array]]  # by controller, and by reader
 
 
 def _measure(request: Request) -> Results:
