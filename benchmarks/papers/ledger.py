@@ -5,7 +5,7 @@ implementation: the median has to meet it, but it has no part in the verdict.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -171,12 +171,12 @@ class MeasuredClaim:
 
 
 Numbers = dict[tuple[str, str], float | Array]  # of one seed, by subject and quantity
-SeedFunction = Callable[[int], tuple[Numbers, Example | None]]  # from a seed
+Outcomes = Iterator[tuple[Numbers, Example | None]]  # numbers and signals, seed by seed
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation with a unique name; `_prepare` makes the function that measures a seed."""
+    """A simulation with a unique name; `_run` yields what each seed gives."""
 
     size: ClassVar[int] = 5  # seeds of a case
     name: str
@@ -189,15 +189,14 @@ class Simulation:
         Args:
             seeds: Seeds of the case.
         """
-        measure_seed, lines, example = self._prepare(), list[Numbers](), None
-        for seed in seeds:
-            line, signals = measure_seed(seed)
+        lines, example = list[Numbers](), None
+        for seed, (line, signals) in zip(seeds, self._run(seeds), strict=True):
             lines.append(line)
             example = signals if seed == 0 else example
         numbers = {x: np.concatenate([np.atleast_1d(at[x]) for at in lines]) for x in lines[0]}
         return SimulationResult(numbers, example)
 
-    def _prepare(self) -> SeedFunction:
+    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
         raise NotImplementedError
 
 
@@ -207,8 +206,8 @@ class Analysis(Simulation):
 
     function: Callable[[int], Numbers]  # of a seed
 
-    def _prepare(self) -> SeedFunction:
-        return lambda seed: (self.function(seed), None)
+    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
+        return ((self.function(seed), None) for seed in seeds)
 
 
 PAPER_TUNINGS: dict[str, dict[str, float]] = {

@@ -16,7 +16,7 @@ from ...envs.scenarios.scenario import Scenario
 from ...estimators.analysis.limits import compute_error_bound
 from ..harness.drives import SETTLED, make_env, make_filter_arguments
 from . import ledger
-from .ledger import Example, Numbers, PaperFilter, SeedFunction, Simulation
+from .ledger import Example, Numbers, Outcomes, PaperFilter, Simulation
 
 if TYPE_CHECKING:
     from ...estimators.estimator import Estimator
@@ -37,20 +37,18 @@ class EstimationSimulation(Simulation):
     bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
     control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
-    def _prepare(self) -> SeedFunction:
+    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
         env = gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
         base: Any = env.unwrapped
         estimators: dict[str, Estimator] = {}
-
-        def measure_seed(seed: int) -> tuple[Numbers, Example]:
+        for seed in seeds:
             drive = rollout(env, seed=seed)
             if drive.failed:
                 raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
             log, truth = drive.log, drive.log.truth
             numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], log)}
             curves = {"truth": truth}
-            if not estimators:
-                estimators.update(ledger.make_filters(self.filters, base))
+            estimators = estimators or ledger.make_filters(self.filters, base)
             for label, estimator in estimators.items():
                 estimates = estimator.run(log)
                 curves[label] = {name: estimates[name] for name in estimates.names}
@@ -59,9 +57,7 @@ class EstimationSimulation(Simulation):
                 facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
                 std = compute_error_bound(record=log.record, **facts)
                 numbers["bound", "beta"] = _compute_settled_rms(std, log)
-            return numbers, Example(log.time, curves)
-
-        return measure_seed
+            yield numbers, Example(log.time, curves)
 
 
 def _rms(values: npt.ArrayLike) -> float:
@@ -110,20 +106,18 @@ class _AgentSimulation(Simulation):
     scenario: str | Mapping[str, Any]
     entries: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
 
-    def _prepare(self) -> SeedFunction:
-        return self._measure_seed
-
-    def _measure_seed(self, seed: int) -> tuple[Numbers, Example]:
-        numbers: Numbers = {}
-        curves: dict[str, dict[str, Array]] = {}
-        for label in self.entries:
-            episode, values = self._run_episode(label, seed)
-            if episode.failed:  # fewer ticks are no better drive
-                raise RuntimeError(f"{label}: the car of seed {seed} failed")
-            numbers |= {(label, name): value for name, value in values.items()}
-            curves[label] = {name: episode[name] for name in ("beta", "gamma", "yaw_moment")}
-        curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
-        return numbers, Example(episode["t"], curves)
+    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
+        for seed in seeds:
+            numbers: Numbers = {}
+            curves: dict[str, dict[str, Array]] = {}
+            for label in self.entries:
+                episode, values = self._run_episode(label, seed)
+                if episode.failed:  # fewer ticks are no better drive
+                    raise RuntimeError(f"{label}: the car of seed {seed} failed")
+                numbers |= {(label, name): value for name, value in values.items()}
+                curves[label] = {name: episode[name] for name in ("beta", "gamma", "yaw_moment")}
+            curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
+            yield numbers, Example(episode["t"], curves)
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         raise NotImplementedError
