@@ -239,13 +239,13 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
     Returns:
         Gap of slip (deg) and yaw rate (deg/s), NaN where not judged, or both finish no drive.
     """
-    gaps = []
-    for name in ("rms_slip_error", "rms_yaw_error"):
-        drives = (pair.result, pair.nominal)
-        errors, nominal = (drive[name][: pair.n][pair.both] for drive in drives)
-        is_judged = len(errors) and not (name == "rms_yaw_error" and task.reference == "zero-slip")
-        gaps.append(float(np.degrees(np.median(nominal - errors))) if is_judged else math.nan)
-    return gaps[0], gaps[1]
+
+    def compute_gap(name: str) -> float:
+        errors, nominal = (x[name][: pair.n][pair.both] for x in (pair.result, pair.nominal))
+        return float(np.degrees(np.median(nominal - errors))) if len(errors) else math.nan
+
+    slip = compute_gap("rms_slip_error")
+    return slip, math.nan if task.reference == "zero-slip" else compute_gap("rms_yaw_error")
 
 
 def make_failure_tables(results: Results) -> list[ResultTable]:

@@ -190,12 +190,16 @@ def _list_tasks(kind: str) -> list[ControlTask]:
     return [task for task in tasks if task.kind == kind]
 
 
-def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
-    """Draw what lessons change of their task's scenario: nothing, then `VARIED` so many times."""
-    yield {}
+def _draw_scenarios(
+    task: ControlTask, varied: int, rng: np.random.Generator
+) -> Iterator[str | JsonMap]:
+    """Draw the scenarios of a task's lessons: its own, then so many changed by `VARIED`."""
+    yield task.scenario
+    vehicle, full_mass = make_scenario(task.scenario).vehicle, VEHICLES[task.vehicle].mass
     for _ in range(varied):
         start, length = rng.uniform(0.0, 4.0), rng.uniform(*VARIED["out"])
         yield {
+            "base": task.scenario,
             "front_stiffness": VARIED["tyres"],
             "rear_stiffness": VARIED["tyres"],
             "camera_delays": [round(rng.uniform(*VARIED["camera"]), 3)],  # whole ticks
@@ -203,17 +207,8 @@ def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
             "wind_force": VARIED["wind"],
             "wind_start": (0.0, 4.0),
             "wind_length": (1.0, 4.0),
-            "mass": float(rng.uniform(*VARIED["mass"])),
+            "vehicle": {**vehicle, "mass": float(rng.uniform(*VARIED["mass"])) * full_mass},
         }
-
-
-def _vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> JsonMap:
-    """Make a task's scenario with some fields changed; "mass" is a factor on the true car's."""
-    fields, base = dict(change), make_scenario(task.scenario)
-    if "mass" in fields:
-        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
-        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
-    return {"base": task.scenario} | fields
 
 
 @dataclass(frozen=True)
@@ -258,11 +253,9 @@ class Lessons:
         elif entry.is_oracle:
             entry = Entry(teacher)
         for task in _list_tasks(self.kind):
-            for change in _draw_changes(self.varied, rng):
-                count, changes = self.cars, JsonMap(lead_in=QUICK_LEAD_IN)
-                if change:
-                    count = -(-self.cars // self.varied)
-                    changes["scenario"] = _vary_scenario(task, change)
+            for scenario in _draw_scenarios(task, self.varied, rng):
+                count = self.cars if scenario == task.scenario else -(-self.cars // self.varied)
+                changes: JsonMap = {"scenario": scenario, "lead_in": QUICK_LEAD_IN}
                 twins, agent = entry.make(replace(task, changes=changes), count)
                 options = task.env_options | changes | dict(self.observation_options)
                 env: Any = gym.make_vec(task.env_id, num_envs=count, **options)
@@ -301,8 +294,7 @@ def prepare_start(
             tasks, rng = _list_tasks(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if get_algorithm(fields.get("algo", "ppo")).on_tensors:
                 tasks = [c for c in tasks if make_scenario(c.scenario).steering != "driver"]
-            pairs = ((task, x) for task in tasks for x in _draw_changes(varied, rng))
-            fields["scenarios"] = [_vary_scenario(t, x) if x else t.scenario for t, x in pairs]
+            fields["scenarios"] = [x for task in tasks for x in _draw_scenarios(task, varied, rng)]
         return make_finetune_task(policy, **fields)
 
     return policy, make_task

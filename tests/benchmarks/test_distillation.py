@@ -117,16 +117,14 @@ def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
 
 def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
     contest = _list_tasks("coms-zero-slip")[0]
-    _, drawn = policies._draw_changes(1, np.random.default_rng(0))
+    _, drawn = policies._draw_scenarios(contest, 1, np.random.default_rng(0))
+    assert isinstance(drawn, dict)
     change = {key: value for key, value in drawn.items() if not key.endswith("_outage")}
     change |= {"mirror": False}  # which would turn every other wind round by itself
     calm = {key: value for key, value in change.items() if not key.startswith("wind_")}
     aside = []
     for each in (change, calm):
-        options = contest.env_options | {
-            "scenario": policies._vary_scenario(contest, each),
-            "lead_in": 0.0,
-        }
+        options = contest.env_options | {"scenario": each, "lead_in": 0.0}
         cars: Any = gym.make_vec(contest.env_id, num_envs=8, **options).unwrapped
         cars.reset(seed=list(range(8)))
         column = [entry.name for entry in cars.layout].index("gps_Y")
@@ -169,7 +167,8 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
 def test_where_it_is_said_contests_are_varied_too() -> None:
     """Each so often, by the training's seed, and not as a distillation's lessons are."""
     _, task = prepare_start(Path("distill-coms-yaw"), 2)
-    names = [each.scenario for each in _list_tasks("coms-zero-slip")]
+    contests = _list_tasks("coms-zero-slip")
+    names = [each.scenario for each in contests]
     found = task().scenarios
     varied = [each for each in found if not isinstance(each, str)]
     assert [each for each in found if isinstance(each, str)] == names
@@ -178,7 +177,8 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     assert {"gps_outage", "camera_outage"} < {key for each in varied for key in each}
     assert task(seed=0).scenarios == found != task(seed=1).scenarios
     rng = np.random.default_rng(0)
-    taught = [each for _ in names for each in policies._draw_changes(2, rng) if each]
+    drawn = [each for contest in contests for each in policies._draw_scenarios(contest, 2, rng)]
+    taught = [each for each in drawn if not isinstance(each, str)]
     outages = [
         {each[key] for each in those for key in each if key.endswith("_outage")}
         for those in (varied, taught)
