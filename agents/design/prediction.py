@@ -226,8 +226,8 @@ def _compute_commands(
 def _predict_step(
     task: PredictionTask, state: PredictionState, share: Scalar, added_command: Scalar,
     share_beyond: Scalar, steer_beyond: Scalar,
-) -> tuple[PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:  # fmt: skip
-    """Predict one step with held commands: the state after it, and the effort's four residuals."""
+) -> tuple[PredictionState, tuple[Scalar, ...]]:  # fmt: skip
+    """Predict one step with held commands: the state after it, and residuals of effort, change."""
     model, car, driver = task.model, task.car, task.driver
     kind, motor, steering = model.kind, model.motor, model.steering
     max_torque = compute_torque_limit(state.motion.v_x, car)
@@ -250,11 +250,18 @@ def _predict_step(
     per_torque = 0.5 * car.d_r / car.r / model.full_scale
     target_share, share_before = per_torque * (T_r - T_l), per_torque * (state.T_r - state.T_l)
     added_before = state.delta_f - driver
+    mean = model.per_share * apply_lag(target_share, share_before, model.motor_rest[0])
+    deviation = model.per_share * model.motor_rest[1] * (share_before - target_share)
+    # of the step before, whose change costs
+    mean_before = apply_lag(state.command_before, state.share_before, model.motor_rest[0])
+    deviation_before = model.motor_rest[1] * (state.share_before - state.command_before)
     efforts = (
-        model.per_share * apply_lag(target_share, share_before, model.motor_rest[0]),
-        model.per_share * model.motor_rest[1] * (share_before - target_share),
+        mean,
+        deviation,
         model.per_steer * apply_lag(added_target, added_before, model.steering_rest[0]),
         model.per_steer * model.steering_rest[1] * (added_before - added_target),
+        model.per_change * (mean - model.per_share * mean_before),
+        model.per_change * (deviation - model.per_share * deviation_before),
     )
     next_state = PredictionState(
         motion, apply_lag(T_l, state.T_l, motor.end), apply_lag(T_r, state.T_r, motor.end),
@@ -264,19 +271,6 @@ def _predict_step(
         model.decay * state.F_d, model.decay * state.N_d, share_before, target_share,
     )  # fmt: skip
     return next_state, efforts
-
-
-@inline
-def _compute_changes(
-    model: PredictionModel, ago: PredictionState, efforts: tuple[Scalar, Scalar, Scalar, Scalar]
-) -> tuple[Scalar, Scalar]:
-    """Compute residuals of the moment's change: mean, and deviation within the step from `ago`."""
-    mean = apply_lag(ago.command_before, ago.share_before, model.motor_rest[0])
-    deviation = model.motor_rest[1] * (ago.share_before - ago.command_before)
-    return (
-        model.per_change * (efforts[0] - model.per_share * mean),
-        model.per_change * (efforts[1] - model.per_share * deviation),
-    )
 
 
 @noinline
@@ -320,7 +314,6 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             if row == 0:
                 store_element(first, share, 0)
                 store_element(first, added_command, 1)
-            ago = state
             state, efforts = _predict_step(
                 task, state, share, added_command, share_beyond, steer_beyond
             )
@@ -338,9 +331,8 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             store_element(residuals, span * efforts[2], row + 4)
             store_element(residuals, span * efforts[3], row + 5)
             if n_step > N_RESIDUALS:
-                changes = _compute_changes(model, ago, efforts)
-                store_element(residuals, span * changes[0], row + 6)
-                store_element(residuals, span * changes[1], row + 7)
+                store_element(residuals, span * efforts[4], row + 6)
+                store_element(residuals, span * efforts[5], row + 7)
             row += n_step
     for j in range(len(terminal)):
         store_element(residuals, _multiply_row(terminal, j, task, state, beta), row + j)
