@@ -47,12 +47,7 @@ def apply_lag(command: Scalar, value: Scalar, rest: Scalar) -> Scalar:
 
 @jit
 def compute_torque_limit(v_x: Scalar, car: "CarParams") -> Scalar:
-    """Compute a motor's torque limit (N m), driving or braking: T_max, or P / |omega| if less.
-
-    Args:
-        v_x: Longitudinal speed (m/s), at which the wheel rolls.
-        car: `CarParams`.
-    """
+    """Compute a motor's torque limit (N m), driving or braking: T_max, or P / |omega| if less."""
     max_torque = car.T_max
     if any_lane(car.P > 0.0):
         at_speed = car.P * car.r / maximum(absolute(v_x), MIN_SPEED)
@@ -113,11 +108,5 @@ def limit_angle(added: Scalar, driver: Scalar, stop: Scalar) -> Scalar:
 
 @jit
 def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: "CarParams") -> Scalar:
-    """Compute the yaw moment N_z (N m) of two motor torques.
-
-    Args:
-        T_l: Torque of the left motor (N m).
-        T_r: Torque of the right motor (N m).
-        car: `CarParams`.
-    """
+    """Compute the yaw moment N_z (N m) of two motor torques."""
     return 0.5 * car.d_r / car.r * (car.k_r * T_r - car.k_l * T_l)

@@ -92,23 +92,13 @@ def _compute_ramp(road: RoadParams, s: Scalar) -> Scalar:
 
 @jit
 def compute_curvature(road: RoadParams, s: Scalar) -> Scalar:
-    """Compute the curvature of the road at a distance along it (1/m), positive to the left.
-
-    Args:
-        road: `RoadParams`.
-        s: Distance along the road (m).
-    """
+    """Compute the curvature of the road at a distance along it (1/m), positive to the left."""
     return road.curvature * _compute_ramp(road, s)
 
 
 @jit
 def compute_car_curvature(motion: Motion, road: RoadParams) -> Scalar:
-    """Compute the road's curvature at the car (1/m, left positive), a turning road's part included.
-
-    Args:
-        motion: `Motion` of the car.
-        road: `RoadParams`.
-    """
+    """Compute the road's curvature at the car (1/m, left positive), with a turning road's part."""
     kappa = compute_curvature(road, motion.s)
     if any_lane(road.turn != 0.0):
         kappa = kappa + road.turn / maximum(motion.v_x, 1.0)
@@ -227,16 +217,7 @@ def derivative(
     motion: Motion, load: TyreLoad, disturbance: DisturbanceForces, car: CarParams,
     road: RoadParams, variant: Variant,
 ) -> Motion:  # fmt: skip
-    """Compute the time derivative of a Motion.
-
-    Args:
-        motion: `Motion` of the car.
-        load: `TyreLoad` of the inputs.
-        disturbance: `DisturbanceForces`.
-        car: `CarParams`.
-        road: `RoadParams`.
-        variant: `PlantVariant` or `StepVariant` of the plant.
-    """
+    """Compute the time derivative of a Motion."""
     gravity = compute_gravity(motion, road, variant.small_angle, 0.0)
     rate = _compute_rates(motion, load, disturbance, car, gravity, variant)
     course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, variant.small_angle)
@@ -245,13 +226,7 @@ def derivative(
 
 @inline
 def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar:
-    """Compute the sideslip angle (rad): atan2(v_y, v_x) above 0.5 m/s, else 0.
-
-    Args:
-        v_x: Longitudinal velocity (m/s).
-        v_y: Lateral velocity (m/s).
-        small_angle: 1 for the small-angle plant, whose angle is the ratio; else 0.
-    """
+    """Compute the sideslip angle (rad): atan2(v_y, v_x) above 0.5 m/s, else 0."""
     if small_angle:
         return select(v_x > MIN_SPEED, v_y / maximum(v_x, MIN_SPEED), 0.0)
     is_moving = v_x * v_x + v_y * v_y > MIN_SPEED * MIN_SPEED
@@ -349,17 +324,7 @@ def kutta3(
     motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
     car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
 ) -> Motion:  # fmt: skip
-    """Integrate the plant over h seconds by Kutta's third-order rule.
-
-    Args:
-        motion: `Motion` at the start.
-        load: `TyreLoad` at the start, the middle and the end of the step.
-        disturbance: `DisturbanceForces` of the whole step.
-        car: `CarParams`.
-        road: `RoadParams`.
-        h: Length of the step (s).
-        variant: `PlantVariant` or `StepVariant` of the plant.
-    """
+    """Integrate the plant over h seconds by Kutta's third-order rule."""
     gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)
     a = _compute_rates(start, load[0], disturbance, car, gravity, variant)
@@ -377,17 +342,7 @@ def rk4(
     motion: Motion, load: tuple[TyreLoad, TyreLoad, TyreLoad], disturbance: DisturbanceForces,
     car: CarParams, road: RoadParams, h: Scalar, variant: Variant,
 ) -> Motion:  # fmt: skip
-    """Integrate the plant over h seconds, longer in plans, by the classical Runge-Kutta method.
-
-    Args:
-        motion: `Motion` at the start.
-        load: `TyreLoad` at the start, the middle and the end of the step.
-        disturbance: `DisturbanceForces` of the whole step.
-        car: `CarParams`.
-        road: `RoadParams`.
-        h: Length of the step (s).
-        variant: `PlantVariant` or `StepVariant` of the plant.
-    """
+    """Integrate the plant over h seconds, longer in plans, by the classical Runge-Kutta method."""
     gravity = _compute_mid_gravity(motion, road, h, variant.small_angle)
     start = _take_velocity(motion)
     a = _compute_rates(start, load[0], disturbance, car, gravity, variant)

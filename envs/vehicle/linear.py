@@ -44,12 +44,7 @@ class BicyclePlant(NamedTuple):
 
 @jit
 def compute_bicycle_coefficients(car: Vector, V: Scalar) -> BicyclePlant:
-    """Compute the coefficients of the linear bicycle.
-
-    Args:
-        car: `Bicycle`, or its six numbers.
-        V: Speed (m/s).
-    """
+    """Compute the coefficients of the linear bicycle."""
     m, I, l_f, l_r, C_f, C_r = car[0], car[1], car[2], car[3], car[4], car[5]  # noqa: E741
     a11 = -2.0 * (C_f + C_r) / (m * V)
     a12 = -1.0 - 2.0 * (C_f * l_f - C_r * l_r) / (m * V * V)
@@ -149,12 +144,7 @@ def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[A
 
 
 def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """Make the linear bicycle of beta and gamma, from delta_f and N_z to gamma: tie-vision (1)-(2).
-
-    Args:
-        vehicle: Vehicle of the model.
-        speed: Longitudinal speed (m/s), positive.
-    """
+    """Make the linear bicycle of beta, gamma from delta_f and N_z to gamma: tie-vision (1)-(2)."""
     A, B = _make_lateral(vehicle, speed, 2)
     C = np.array([[0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",))
@@ -165,10 +155,6 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
     Inputs are delta_f, N_z and kappa, the road's curvature: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
-
-    Args:
-        vehicle: Vehicle of the model.
-        speed: Longitudinal speed (m/s), positive.
     """
     A, B = _make_lateral(vehicle, speed, 4, 3)
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -180,10 +166,6 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     """Make the model of beta, gamma and psi with a course output, dakf-stability (1)-(3).
 
     Inputs are delta_f and N_z, outputs gamma and the course psi + beta.
-
-    Args:
-        vehicle: Vehicle of the model.
-        speed: Longitudinal speed (m/s), positive.
     """
     A, B = _make_lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
@@ -194,9 +176,6 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
     """Make the model of phi and phi_dot from the measured specific force a_y, double-layer-gps (3).
 
     The body's weight, M_s g h_s phi, is within a_y. The output is phi_dot.
-
-    Args:
-        vehicle: Vehicle of the model.
     """
     A, B, I_x = np.zeros((2, 2)), np.zeros((2, 1)), vehicle.roll_inertia
     ratios = vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x

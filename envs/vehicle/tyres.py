@@ -240,12 +240,6 @@ def compute_slip_rates(
     """Compute the rates (1/s) at which the slip of relaxing tyres follows, of (front, rear).
 
     sigma dt'/dt = |v_along| (t - t'): Pacejka (2006), (7.7). Without a length both are zero.
-
-    Args:
-        motion: `Motion` or `Velocity` of the car.
-        load: `TyreLoad` of the inputs.
-        car: `CarParams`.
-        small_angle: 1 for the small-angle plant, else 0.
     """
     across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
     is_relaxing = car.relaxation > 0.0
@@ -286,15 +280,7 @@ def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar
 def compute_tyre_forces(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Compute (F_yf, F_yr, F_x, N_z): the axles' lateral and the drive force (N), yaw moment (N m).
-
-    Args:
-        motion: `Motion` or `Velocity` of the car.
-        load: `TyreLoad` of the inputs.
-        car: `CarParams`.
-        g_y: Lateral gravity that the car feels on a banked road (m/s2).
-        variant: `PlantVariant` or `StepVariant` of the plant.
-    """
+    """Compute (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), moment (N m)."""
     a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, variant)
     F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, variant.law, variant.small_angle)
     return F_fl + F_fr, F_rl + F_rr, F_x, N_z
@@ -304,15 +290,7 @@ def compute_tyre_forces(
 def compute_tyres(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
-    """Compute four `Tyre` (front, then rear; left first), drive force (N) and yaw moment (N m).
-
-    Args:
-        motion: `Motion` or `Velocity` of the car.
-        load: `TyreLoad` of the inputs.
-        car: `CarParams`.
-        g_y: Lateral gravity that the car feels on a banked road (m/s2).
-        variant: `PlantVariant` or `StepVariant` of the plant.
-    """
+    """Compute four `Tyre` (front, then rear; left first), drive force (N) and yaw moment (N m)."""
     if variant.law == MAGIC_FORMULA and not variant.small_angle:
         return _compute_magic_tyres(motion, load, car, g_y, variant)
     if _has_load_shift(variant):
@@ -399,9 +377,6 @@ def fit_fiala(vehicle: Vehicle) -> Vehicle:
     Least squares of the forces at the standing load, over slips from zero to the peak's with equal
     weights. As fractions of mu F_z, over C t / (mu F_z), both axles have one curve: so one pair of
     factors, on stiffness and friction, fits both.
-
-    Args:
-        vehicle: Vehicle with the Magic Formula's stiffnesses and friction.
     """
     from scipy.optimize import curve_fit
 
