@@ -3,28 +3,40 @@
 A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
 `core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
 Its model stays there and is loaded anew where its speed changed; its state in every call. A user's
-own estimators are an object a row.
+own estimators are an object a row. The records that all read are an env's, or copied together.
 """
 
 import copy
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from functools import cache
+import functools
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.vector import SyncVectorEnv
 
 from ...envs.numerics.jit import compile_call
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
-from ...envs.record import FAST, FAST_WIDTH
+from ...envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array
+from ...envs.task import ObservationEntry
 from ..core.filter import Observed, OutputTable, StepRecord
 from ..core.intersample import NONE
 from ..core.late_samples import BUFFER, LARSEN
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
 from ..estimator import Estimator
-from ..wrappers.estimate import AnyEstimator, EstimatorSpec, write_outputs
+from ..filters import FILTERS
+from ..make import make_estimator
+from ..protocol import EstimatorFactory, ForeignEstimator, get_label
+from ..wrappers.estimate import (
+    AnyEstimator,
+    EstimatorSpec,
+    find_base_env,
+    make_spec,
+    replace_body,
+    write_outputs,
+)
 from .lanes import FilterBank, observe_batch
 
 Build = Callable[..., AnyEstimator]
@@ -105,7 +117,7 @@ def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
     return blocks
 
 
-@cache
+@functools.cache
 def _compile_observe_batch() -> Callable[..., int]:
     """Return `observe_batch` as a plain call, for the types that all banks and records have."""
     counts, numbers, cube = np.zeros(1, np.int64), np.zeros(1), np.zeros((1, 1, 1))
@@ -192,9 +204,7 @@ class BatchEstimator:
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
         """Fit the filters of some rows to their specs; a reset has to follow.
 
-        Args:
-            rows: Indices of the filters.
-            specs: Spec of each; where more than its clocks' phases differ, a filter is built anew.
+        Where more than the phases of the clocks differ, a filter is built anew.
         """
         has_changed = False
         for i, spec in zip(rows, specs, strict=True):
@@ -213,22 +223,12 @@ class BatchEstimator:
             raise ValueError(f"{text}, row 0 has {first} and row {i} {other}")
 
     def reset(self, mask: _Mask) -> None:
-        """Reset some filters to the clocks of their specs.
-
-        Args:
-            mask: Filters to reset, bool, shape (N,).
-        """
+        """Reset some filters to the clocks of their specs."""
         for i in np.flatnonzero(mask).tolist():
             self[i].reset()
 
     def take(self, mask: _Mask | None, record: StepRecord, observed: Observed) -> None:
-        """Process rows and packets of some filters and write their outputs.
-
-        Args:
-            mask: Filters at work, bool, shape (N,); None for all.
-            record: Records of N cars.
-            observed: Observations and outputs of N cars.
-        """
+        """Process rows and packets of some filters and write their outputs."""
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, record.rows)
         bank = FilterBank(self.filters, self._pool, self._places)
         while _compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
@@ -242,11 +242,7 @@ class BatchEstimator:
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this batch or of one with the same specs."""
         self.filters[:] = snapshot
 
     def __repr__(self) -> str:
@@ -279,12 +275,7 @@ class ForeignBatch(BatchEstimator):
         return self._estimators[i]
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does.
-
-        Args:
-            rows: Indices of the estimators.
-            specs: Spec of each of these estimators.
-        """
+        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does."""
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._designs[i]:
                 self._estimators[i] = self._build(**spec._asdict())
@@ -293,13 +284,7 @@ class ForeignBatch(BatchEstimator):
             self[i].sensors = dict(spec.sensors)
 
     def take(self, mask: _Mask | None, record: StepRecord, observed: Observed) -> None:
-        """Process rows and packets as `BatchEstimator.take` does.
-
-        Args:
-            mask: Estimators at work, bool, shape (N,); None for all.
-            record: Records of N cars.
-            observed: Observations and outputs of N cars.
-        """
+        """Process rows and packets as `BatchEstimator.take` does."""
         chosen = (np.arange(len(self)) if mask is None else np.flatnonzero(mask)).tolist()
         obs, table, beta, gamma, out, summary = observed
         for i in self._step_rows(chosen, record):
@@ -318,10 +303,94 @@ class ForeignBatch(BatchEstimator):
         return [estimator.get_state() for estimator in self._estimators]
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this batch or of one with the same specs."""
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)
+
+
+def build_batch(
+    source: str | EstimatorFactory, specs: Sequence[EstimatorSpec], dt: float,
+    options: Mapping[str, Any],
+) -> BatchEstimator:  # fmt: skip
+    """Build an estimator for each spec, compiled together where all are ours and none is late."""
+    build_one = functools.partial(make_estimator, source, dt=dt, **options)
+    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
+        first = build_one(**specs[0]._asdict())
+        if isinstance(first, ForeignEstimator):
+            batch_class = getattr(first.inner, "batch", ForeignBatch)
+            return batch_class(first, specs, dt, build_one)
+        if not first.compiled:
+            return ForeignBatch(first, specs, dt, build_one)
+    return BatchEstimator(get_label(source), specs, dt, build_one)
+
+
+_MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
+BATCHED_MEMBERS = (
+    *_MEMBERS,
+    *(f"final_{name}" for name in _MEMBERS),  # before a car's newest reset
+    *("slow_sensors", "nominal", "held_speed"),  # of each car, as those of a single env
+    *("layout", "dt"),
+)
+"""What a vector env that steps all cars at once offers."""
+
+
+class BatchedRecords:
+    """The records of a vector env that offers `BATCHED_MEMBERS`."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self.layout: tuple[ObservationEntry, ...] = env.layout
+        self.dt: float = env.dt
+
+    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
+        """Return the newest step's records, or with "final_" those of episodes that just ended."""
+        arrays = (getattr(self._env, prefix + name) for name in _MEMBERS)
+        types = (np.float64, np.int64) * 2
+        records: Any = map(np.ascontiguousarray, arrays, types)  # copied where they are not
+        return StepRecord(*records)
+
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
+        """Make the specs of some rows' estimators."""
+        env = self._env
+        cars = {i: replace_body(env.nominal[i], env.scenario[i]) for i in rows}
+        return [EstimatorSpec(cars[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+
+    def annotate(self, label: str, beta: Array, std: Array, mask: _Mask) -> None:
+        """Pass estimates (rad) of some rows to an env that draws, beside the truth."""
+        if hasattr(self._env, "annotate"):
+            self._env.annotate(label, beta, std, mask)
+
+
+class SyncRecords:
+    """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
+
+    def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
+        self._bases = bases = [find_base_env(sub_env) for sub_env in env.envs]
+        layouts = [sub_env.get_wrapper_attr("layout") for sub_env in env.envs]
+        for i, layout in enumerate(layouts):
+            if layout != layouts[0]:
+                raise ValueError(f"environment {i} of the vector env has another layout than 0")
+        self.layout: tuple[ObservationEntry, ...] = layouts[0]
+        self.dt: float = bases[0].dt
+        N = len(bases)
+        fast = np.zeros((N, max(len(base.rows) for base in bases), FAST_WIDTH))
+        packets = np.zeros((N, max(len(base.packets) for base in bases), PACKET_WIDTH))
+        self._records = StepRecord(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
+
+    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
+        """Copy the records of some environments, those before a reset with "final_"."""
+        records = self._records
+        for i in rows:
+            ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in _MEMBERS)
+            records.fast[i, :n], records.packets[i, :m] = ticks[:n], arrived[:m]
+            records.rows[i], records.count[i] = n, m
+        return records
+
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
+        """Make the specs of some rows' estimators."""
+        return [make_spec(self._bases[i]) for i in rows]
+
+    def annotate(self, label: str, beta: Array, std: Array, mask: _Mask) -> None:
+        """Pass estimates (rad) of some rows to the envs that draw."""
+        for i in np.flatnonzero(mask):
+            self._bases[i].annotate(label, float(beta[i]), float(std[i]))

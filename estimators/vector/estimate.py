@@ -1,30 +1,19 @@
 """Observations of vector environments: all rows' estimates in one compiled call, or the truth."""
 
-import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
-from ...envs.task import Infos, ObservationEntry
+from ...envs.record import FAST_WIDTH
+from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.vehicle.parameters import VehicleSource
 from ..core.filter import Observed, StepRecord
-from ..filters import FILTERS
-from ..make import make_estimator
-from ..protocol import EstimatorFactory, ForeignEstimator, get_label
-from ..wrappers.estimate import (
-    BETA,
-    NEES,
-    STD,
-    Arguments,
-    EstimatorSource,
-    EstimatorSpec,
-    find_base_env,
-    make_spec,
-    replace_body,
-)
+from ..wrappers.estimate import BETA, NEES, STD, Arguments, EstimatorSource, EstimatorSpec
 from ..wrappers.truth import (
     STIFFNESSES,
     TruthEntries,
@@ -33,79 +22,132 @@ from ..wrappers.truth import (
     refuse_stacked,
     set_stiffness,
 )
-from .batch import BatchEstimator, ForeignBatch
-from .records import AnyVectorEnv, Mask, Observations, Snapshot, VectorObservation
+from .batch import BATCHED_MEMBERS, BatchedRecords, SyncRecords, build_batch
 
-_MEMBERS = ("rows", "ticks_done", "packets", "delivered")  # of a `StepRecord` in the env
-_BATCHED_MEMBERS = (
-    *_MEMBERS,
-    *(f"final_{name}" for name in _MEMBERS),  # before a car's newest reset
-    *("slow_sensors", "nominal", "held_speed"),  # of each car, as those of a single env
-    *("layout", "dt"),
-)
-"""What a vector env that steps all cars at once offers."""
+Mask = npt.NDArray[np.bool_]
+Observations = npt.NDArray[np.float32]
+Snapshot = dict[str, Any]
+AnyVectorEnv = VectorEnv[Any, Any, Any]
 
 
-class _BatchedRecords:
-    """The records of a vector env that offers `_BATCHED_MEMBERS`."""
+class VectorObservation(VectorWrapper[Observations, Any, Observations, Any, Any]):
+    """A wrapper that appends entries of its own to the observations of all rows.
 
-    def __init__(self, env: Any) -> None:
-        self._env = env
-        self.layout: tuple[ObservationEntry, ...] = env.layout
-        self.dt: float = env.dt
+    A row whose episode ended begins anew in the next step or, where the env resets it within the
+    step that ends it, in that one. `spec` is the env's, without this wrapper.
+    """
 
-    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
-        """Return the newest step's records, or with "final_" those of episodes that just ended."""
-        arrays = (getattr(self._env, prefix + name) for name in _MEMBERS)
-        types = (np.float64, np.int64) * 2
-        records: Any = map(np.ascontiguousarray, arrays, types)  # copied where they are not
-        return StepRecord(*records)
+    layout: tuple[ObservationEntry, ...]
 
-    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """Make the specs of some rows' estimators."""
-        env = self._env
-        cars = {i: replace_body(env.nominal[i], env.scenario[i]) for i in rows}
-        return [EstimatorSpec(cars[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+    def __init__(self, env: AnyVectorEnv) -> None:
+        super().__init__(env)
+        self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
+        self._ended: Mask | None = None  # rows that the next step resets; None: all are to be
 
-    def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
-        """Pass estimates (rad) of some rows to an env that draws, beside the truth."""
-        if hasattr(self._env, "annotate"):
-            self._env.annotate(label, beta, std, rows)
+    def _set_layout(self, layout: tuple[ObservationEntry, ...]) -> None:
+        """Set the entries of a row's observation."""
+        self.layout, self.single_observation_space = layout, make_space(layout)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
+    def _begin(self, mask: Mask) -> None:
+        """Begin the new episodes of some rows."""
+        raise NotImplementedError
 
-class _SyncRecords:
-    """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
+    def _append(self, obs: Observations, infos: Infos, mask: Mask) -> Observations:
+        """Make the observations of all rows, of which some got a new one, and their `infos`."""
+        raise NotImplementedError
 
-    def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
-        self._bases = bases = [find_base_env(sub_env) for sub_env in env.envs]
-        layouts = [sub_env.get_wrapper_attr("layout") for sub_env in env.envs]
-        for i, layout in enumerate(layouts):
-            if layout != layouts[0]:
-                raise ValueError(f"environment {i} of the vector env has another layout than 0")
-        self.layout: tuple[ObservationEntry, ...] = layouts[0]
-        self.dt: float = bases[0].dt
-        N = len(bases)
-        fast = np.zeros((N, max(len(base.rows) for base in bases), FAST_WIDTH))
-        packets = np.zeros((N, max(len(base.packets) for base in bases), PACKET_WIDTH))
-        self._records = StepRecord(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
+    def _finish(self, infos: Infos, ended: Mask) -> None:
+        """Make `final_obs` and `final_info` of rows that ended within the step."""
+        raise NotImplementedError
 
-    def read(self, prefix: str, rows: Iterable[int]) -> StepRecord:
-        """Copy the records of some environments, those before a reset with "final_"."""
-        records = self._records
-        for i in rows:
-            ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in _MEMBERS)
-            records.fast[i, :n], records.packets[i, :m] = ticks[:n], arrived[:m]
-            records.rows[i], records.count[i] = n, m
-        return records
+    def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
+        """Restore the flags after an error of the env, unless it may have moved some rows."""
+        self._ended = ended_before
 
-    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """Make the specs of some rows' estimators."""
-        return [make_spec(self._bases[i]) for i in rows]
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Reset the rows, or those of options["reset_mask"], as `gymnasium.vector.VectorEnv` does.
 
-    def annotate(self, label: str, beta: Array, std: Array, rows: Mask) -> None:
-        """Pass estimates (rad) of some rows to the envs that draw."""
-        for i in np.flatnonzero(rows):
-            self._bases[i].annotate(label, float(beta[i]), float(std[i]))
+        Args:
+            seed: Seed of row 0, or a list (N,).
+            options: Options of the env. ResetNeeded if a mask leaves out rows and no step succeeded
+                since the last whole reset.
+        """
+        mask = None if options is None else options.get("reset_mask")
+        rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
+        ended_before, self._ended = self._ended, None
+        if ended_before is None and not rows.all():
+            text = "reset all rows first: no step succeeded since then, or none was made"
+            raise ResetNeeded(text)
+        try:
+            obs, infos = self.env.reset(seed=seed, options=options)
+        except Exception as error:
+            self._restore_ended(ended_before, error)
+            raise
+        self._ended = np.zeros_like(rows) if ended_before is None else ended_before & ~rows
+        self._begin(rows)
+        return self._append(obs, infos, rows), infos
+
+    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, Infos]:
+        """Step all rows as Gymnasium does; ResetNeeded before `reset` and after a step that failed.
+
+        Args:
+            actions: Actions of all rows.
+        """
+        ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
+        if ended_before is None:
+            text = "call reset() first: before the first step, and after one that failed"
+            raise ResetNeeded(text)
+        try:
+            obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        except Exception as error:
+            self._restore_ended(ended_before, error)
+            raise
+        ended = np.logical_or(terminated, truncated)
+        if not self._same_step:
+            self._begin(ended_before)
+        elif ended.any():
+            self._finish(infos, ended)
+            self._begin(ended)
+        obs = self._append(obs, infos, np.ones_like(ended))
+        self._ended = ended
+        return obs, rewards, terminated, truncated, infos
+
+    def get_state(self) -> Snapshot:
+        """Return a snapshot for `set_state`; TypeError where the env makes none."""
+        env: Any = self.env
+        if not hasattr(env, "get_state"):
+            text = "makes no snapshots; the vector env that gym.make_vec builds by itself does"
+            raise TypeError(f"{type(env).__name__} {text}")
+        ended = None if self._ended is None else self._ended.copy()
+        return {"env": env.get_state(), "ended": ended} | self._get_memory()
+
+    def set_state(self, snapshot: Snapshot) -> None:
+        """Restore a snapshot of this env or of one built with the same arguments."""
+        env: Any = self.env
+        env.set_state(snapshot["env"])
+        self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
+        self._set_memory(snapshot)
+
+    def _get_memory(self) -> Snapshot:
+        """Return a snapshot of what the wrapper has beside the env."""
+        raise NotImplementedError
+
+    def _set_memory(self, snapshot: Snapshot) -> None:
+        """Restore what `_get_memory` returned."""
+        raise NotImplementedError
+
+    def _read_rows(self, name: str, rows: Sequence[int]) -> list[Any]:
+        """Read an attribute of some rows' episodes; TypeError where it is out of reach."""
+        base: Any = self.unwrapped
+        if isinstance(base, SyncVectorEnv):
+            return [getattr(base.envs[i].unwrapped, name) for i in rows]
+        if not hasattr(base, name):
+            raise TypeError(f"{type(base).__name__} does not offer the {name} of its rows")
+        values = getattr(base, name)
+        return [values[i] for i in rows]
 
 
 class EstimateObservation(VectorObservation):
@@ -139,17 +181,11 @@ class EstimateObservation(VectorObservation):
     """
 
     def __init__(
-        self,
-        env: AnyVectorEnv,
-        estimator: EstimatorSource | None = None,
-        outputs: Sequence[str] = ("beta", "gamma"),
-        std: bool = True,
-        replace: bool = False,
-        vehicle: VehicleSource | None = None,
-        options: Mapping[str, object] | None = None,
-        name: str | None = None,
-        **misplaced: object,
-    ) -> None:
+        self, env: AnyVectorEnv, estimator: EstimatorSource | None = None,
+        outputs: Sequence[str] = ("beta", "gamma"), std: bool = True, replace: bool = False,
+        vehicle: VehicleSource | None = None, options: Mapping[str, object] | None = None,
+        name: str | None = None, **misplaced: object,
+    ) -> None:  # fmt: skip
         self._records = _find_records(env)
         clocks = self._records.make_specs([0])[0].sensors
         values = estimator, outputs, std, replace, vehicle, options, name
@@ -164,7 +200,7 @@ class EstimateObservation(VectorObservation):
         self._calibration = np.ones((env.num_envs, 2, FAST_WIDTH))
         specs, arguments = self._make_specs(range(env.num_envs)), self._arguments
         self._first_vehicle, dt = specs[0].vehicle, self._records.dt
-        self.estimator = _build_batch(arguments.estimator, specs, dt, arguments.options)
+        self.estimator = build_batch(arguments.estimator, specs, dt, arguments.options)
         inner = getattr(env, "layout", self._records.layout)
         self._outputs = self._arguments.make_outputs(self.estimator.names, inner)
         self._set_layout(self._outputs.layout)
@@ -172,7 +208,7 @@ class EstimateObservation(VectorObservation):
 
     def _restore_ended(self, ended_before: Mask | None, error: Exception) -> None:
         # such an env raises these before it moves any row
-        if isinstance(self._records, _BatchedRecords) and isinstance(error, TypeError | ValueError):
+        if isinstance(self._records, BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
     def _get_memory(self) -> Snapshot:
@@ -187,7 +223,7 @@ class EstimateObservation(VectorObservation):
         """Make the specs of some rows' estimators."""
         specs, car = self._records.make_specs(rows), self._arguments.vehicle
         if self._arguments.is_told_truth:
-            truths = self._get_truths(rows)
+            truths = self._read_rows("car_truth", rows)
             self._calibration[rows] = [item.calibration for item in truths]
             pairs = zip(specs, truths, strict=True)
             return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
@@ -253,23 +289,7 @@ class EstimateObservation(VectorObservation):
                 self._records.annotate(self._outputs.title, values, summary[:, STD], mask)
 
 
-def _build_batch(
-    source: str | EstimatorFactory, specs: Sequence[EstimatorSpec], dt: float,
-    options: Mapping[str, Any],
-) -> BatchEstimator:  # fmt: skip
-    """Build an estimator for each spec, compiled together where all are ours and none is late."""
-    build_one = functools.partial(make_estimator, source, dt=dt, **options)
-    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
-        first = build_one(**specs[0]._asdict())
-        if isinstance(first, ForeignEstimator):
-            batch_class = getattr(first.inner, "batch", ForeignBatch)
-            return batch_class(first, specs, dt, build_one)
-        if not first.compiled:
-            return ForeignBatch(first, specs, dt, build_one)
-    return BatchEstimator(get_label(source), specs, dt, build_one)
-
-
-def _find_records(env: AnyVectorEnv) -> _SyncRecords | _BatchedRecords:
+def _find_records(env: AnyVectorEnv) -> SyncRecords | BatchedRecords:
     """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
         text = f"{type(env).__name__} is no vector environment; the wrapper of a single one"
@@ -288,11 +308,11 @@ def _find_records(env: AnyVectorEnv) -> _SyncRecords | _BatchedRecords:
             "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
         )
     if isinstance(layer, SyncVectorEnv):
-        return _SyncRecords(layer)
-    if missing := [name for name in _BATCHED_MEMBERS if not hasattr(layer, name)]:
+        return SyncRecords(layer)
+    if missing := [name for name in BATCHED_MEMBERS if not hasattr(layer, name)]:
         text = "EstimateObservation reads the records of a sideslip vector environment"
         raise TypeError(f"{text}; {type(layer).__name__} has no {', '.join(missing)}")
-    return _BatchedRecords(layer)
+    return BatchedRecords(layer)
 
 
 class TruthObservation(VectorObservation):
@@ -331,8 +351,8 @@ class TruthObservation(VectorObservation):
         self._ended = np.ones(env.num_envs, np.bool_)
 
     def _begin(self, mask: Mask) -> None:
-        rows = np.flatnonzero(mask)
-        for i, truth in zip(rows, self._get_truths(rows.tolist()), strict=True):
+        rows = np.flatnonzero(mask).tolist()
+        for i, truth in zip(rows, self._read_rows("car_truth", rows), strict=True):
             self._values[i], self._calibration[i] = self._entries.read(truth)
 
     def _finish(self, infos: Infos, ended: Mask) -> None:
@@ -341,16 +361,10 @@ class TruthObservation(VectorObservation):
             infos["final_obs"][i] = self._entries.append(infos["final_obs"][i], *car, None)
 
     def _append(self, obs: Observations, infos: Infos, mask: Mask) -> Observations:
-        true_states: Any = None
+        states = None
         if self._entries.states:
-            base: Any = self.unwrapped
-            if isinstance(base, SyncVectorEnv):
-                true_states = np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
-            elif hasattr(base, "true_state"):
-                true_states = np.asarray(base.true_state)
-            else:
-                raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
-        return self._entries.append(obs, self._values, self._calibration, true_states)
+            states = np.array(self._read_rows("true_state", range(self.num_envs)))
+        return self._entries.append(obs, self._values, self._calibration, states)
 
     def _get_memory(self) -> Snapshot:
         return {"values": self._values.copy(), "calibration": self._calibration.copy()}

@@ -319,14 +319,9 @@ def _process_packets(
 
 @jit_nrt
 def _advance_block(
-    b: LaneBlock,
-    first: int,
-    bank: FilterBank,
-    fast: Matrix,
-    rows: int,
-    packets: Matrix,
+    b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, rows: int, packets: Matrix,
     counts: Vector,
-) -> int:
+) -> int:  # fmt: skip
     """Advance filters that are `here` by `rows` rows; return fewer where one has no gains."""
     # first: filter in the first lane; fast (N, k, FAST_WIDTH), packets (N, capacity, PACKET_WIDTH)
     filters = bank.filters

@@ -14,7 +14,8 @@ from sideslip.envs.numerics.functions import TICK
 from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.filter import Observed, OutputTable, StepRecord
-from sideslip.estimators.vector.estimate import EstimateObservation, _build_batch
+from sideslip.estimators.vector.batch import build_batch
+from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from sideslip.estimators.wrappers.estimate import EstimatorSpec
 from tests.envs import batches
@@ -44,7 +45,7 @@ def make_batch(
     """Filters side by side, reset to tick 0; a list has what each one is told."""
     told = vehicle, sensors or {}, speed
     lists = [each if isinstance(each, list) else [each] * count for each in told]
-    batch = _build_batch(name, list(map(EstimatorSpec, *lists)), dt, options)
+    batch = build_batch(name, list(map(EstimatorSpec, *lists)), dt, options)
     batch.reset(np.ones(count, np.bool_))
     return batch
 
