@@ -29,7 +29,7 @@ from .sensors.slow import (
     load_detector,
 )
 from .task import REPORT
-from .validation import check_mapping, describe_unknown
+from .validation import check_mapping, check_options
 from .vehicle.dynamics import Motion
 
 if TYPE_CHECKING:
@@ -53,9 +53,7 @@ class CameraSimulator:
             from .sensors.camera.images import Appearance, Pinhole, RoadRenderer, RoadScene
             from .sensors.camera.lane_finder import LaneFinder
         fields = check_mapping("appearance", appearance or {})
-        known = Appearance.__dataclass_fields__
-        if unknown := [name for name in fields if name not in known]:
-            raise TypeError(f"appearance: {describe_unknown('field', unknown, known)}")
+        check_options("appearance", Appearance.__init__, fields)
         style = Appearance(**fields)
         self.delay, self._scene_class = delay, RoadScene
         self.finder = LaneFinder(Pinhole(), style.lane_width)

@@ -131,27 +131,15 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
     _spec: EnvSpec | None = None
 
     def __init__(
-        self,
-        sensors: str = "vision",
-        scenario: ScenarioSource = "random-steering",
-        vehicle: VehicleSource = "coms",
-        nominal: VehicleSource | None = None,
-        control_period: int = 10,
-        reference: str = "zero-slip",
-        fast: str = "summary",
-        with_map: bool = False,
-        yaw_first: bool = True,
-        steering: bool = False,
-        on_bad_action: str = "raise",
-        vision: str = "analytic",
-        delay: str | None = None,
-        appearance: Mapping[str, Any] | None = None,
-        render_mode: str | None = None,
-        strict: bool = True,
-        world: WorldSource = "ideal",
-        lead_in: float = 0.0,
+        self, sensors: str = "vision", scenario: ScenarioSource = "random-steering",
+        vehicle: VehicleSource = "coms", nominal: VehicleSource | None = None,
+        control_period: int = 10, reference: str = "zero-slip", fast: str = "summary",
+        with_map: bool = False, yaw_first: bool = True, steering: bool = False,
+        on_bad_action: str = "raise", vision: str = "analytic", delay: str | None = None,
+        appearance: Mapping[str, Any] | None = None, render_mode: str | None = None,
+        strict: bool = True, world: WorldSource = "ideal", lead_in: float = 0.0,
         **slow: Mapping[str, Any] | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         car = make_vehicle(vehicle, strict)
         nominal_vehicle = car if nominal is None else make_vehicle(nominal, strict)
         self.config = EnvConfig(
@@ -171,8 +159,6 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             raise ValueError("appearance is of pictures: vision='image'")
         self.layout: tuple[ObservationEntry, ...] = self.config.layout
         self.observation_space, self.action_space = self.config.make_spaces()
-        self._action_width = self.config.action_width
-        self._fail_on_bad_action = on_bad_action == "fail"
         self._row = make_episode_arrays(self.config)
         self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
@@ -220,8 +206,8 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
         """
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
-        command = parse_action(action, self._action_width, self._fail_on_bad_action)
-        camera, row = self.camera, self._row
+        camera, row, config = self.camera, self._row, self.config
+        command = parse_action(action, config.action_width, config.on_bad_action == "fail")
         before = row.z if camera is None else row.z.copy()
         done = self._advance(command)
         if done <= 0:

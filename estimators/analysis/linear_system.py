@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import Array
+from ...envs.validation import check_choice
 from ..design.gains import (
     DUAL_RATE_GAINS,
     DUAL_RATE_RULES,
@@ -55,24 +56,12 @@ class DualRate:
     """
 
     def __init__(
-        self,
-        A: npt.ArrayLike,
-        B: npt.ArrayLike,
-        C: npt.ArrayLike,
-        ratio: int,
-        *,
-        Q: npt.ArrayLike,
-        R: npt.ArrayLike,
-        disturbed: Sequence[int] | None = None,
-        leak: npt.ArrayLike = 1.0,
-        rate: npt.ArrayLike = 0.0,
-        Q_d: npt.ArrayLike = 0.0,
-        intersample: str = "pseudo",
-        gains: str = "constant",
-        poles: npt.ArrayLike | None = None,
-        start: npt.ArrayLike | None = None,
-        allow_unstable: bool = False,
-    ) -> None:
+        self, A: npt.ArrayLike, B: npt.ArrayLike, C: npt.ArrayLike, ratio: int, *,
+        Q: npt.ArrayLike, R: npt.ArrayLike, disturbed: Sequence[int] | None = None,
+        leak: npt.ArrayLike = 1.0, rate: npt.ArrayLike = 0.0, Q_d: npt.ArrayLike = 0.0,
+        intersample: str = "pseudo", gains: str = "constant", poles: npt.ArrayLike | None = None,
+        start: npt.ArrayLike | None = None, allow_unstable: bool = False,
+    ) -> None:  # fmt: skip
         a, b, c = (_parse_matrix(name, M) for name, M in zip("ABC", (A, B, C), strict=True))
         m, rows = len(a), _parse_disturbed(disturbed, len(a))
         if a.shape != (m, m) or len(b) != m or c.shape[1] != m:
@@ -84,12 +73,14 @@ class DualRate:
         F, self._B, self._drift = np.zeros((n, n)), np.zeros((n, b.shape[1])), np.zeros(n)
         F[:m, :m], self._B[:m] = a, b
         F[rows, range(m, n)] = 1.0  # (5)
-        F[m:, m:] = _parse_square("leak", leak, d)  # (11)
-        self._drift[m:] = _parse_vector("rate", rate, d)
+        F[m:, m:] = _parse_array("leak", leak, d, d)  # (11)
+        self._drift[m:] = _parse_array("rate", rate, d)
         noise = np.zeros((n, n))
-        noise[:m, :m] = _parse_covariance("Q", Q, m)  # (12)
-        noise[m:, m:] = _parse_covariance("Q_d", Q_d, d)
-        measured, r = np.hstack([c, np.zeros((q, d))]), _parse_covariance("R", R, q, definite=True)
+        noise[:m, :m] = _parse_array("Q", Q, m, m)  # (12)
+        noise[m:, m:] = _parse_array("Q_d", Q_d, d, d)
+        measured, r = np.hstack([c, np.zeros((q, d))]), _parse_array("R", R, q, q)
+        for name, M in (("Q", noise[:m, :m]), ("Q_d", noise[m:, m:]), ("R", r)):
+            check_covariance(name, M, definite=name == "R")
         placed = _parse_poles(intersample, gains, poles, n)
         system = SampledSystem(F, noise, measured, r, int(ratio))
         with np.errstate(invalid="ignore", over="ignore"):
@@ -100,7 +91,7 @@ class DualRate:
         P = system.compute_covariances(shares)  # after each step of a cycle
         self._std = np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
         self._start = np.zeros(n)
-        self._start[:m] = _parse_vector("start", 0.0 if start is None else start, m)
+        self._start[:m] = _parse_array("start", 0.0 if start is None else start, m)
         self.reset()
 
     def _check_stability(self, F: Array, C: Array, allow_unstable: bool) -> None:
@@ -130,7 +121,7 @@ class DualRate:
         Args:
             u: Input of the step, shape (p,).
         """
-        u = _parse_vector("u", u, self._B.shape[1])
+        u = _parse_array("u", u, self._B.shape[1])
         self.x = self._F @ self.x + self._B @ u + self._drift
         self.k, self._since = self.k + 1, self._since + 1
         if self._since < self.ratio:
@@ -146,7 +137,7 @@ class DualRate:
             raise ValueError(f"a sample comes every {self.ratio} steps, this is step {self.k}")
         if self._since == 0:
             raise ValueError(f"step {self.k} has had its sample")
-        self._innovation = _parse_vector("y", y, len(self._C)) - self._C @ self.x
+        self._innovation = _parse_array("y", y, len(self._C)) - self._C @ self.x
         self._since = 0
         self.x = self.x + self.shares[0] @ self._innovation
 
@@ -190,12 +181,8 @@ def _parse_poles(
     intersample: str, gains: str, poles: npt.ArrayLike | None, n: int
 ) -> npt.NDArray[np.complex128] | None:
     """Parse the poles to place, (n,); ValueError for a contradiction or an unknown rule or gain."""
-    for name, word, known in (
-        ("intersample", intersample, DUAL_RATE_RULES),
-        ("gains", gains, DUAL_RATE_GAINS),
-    ):
-        if word not in known:
-            raise ValueError(f"{name} is one of {', '.join(known)}, got {word!r}")
+    check_choice("intersample", intersample, DUAL_RATE_RULES)
+    check_choice("gains", gains, DUAL_RATE_GAINS)
     if gains == "from-29" and intersample != "pseudo":
         raise ValueError("gains 'from-29' are those of intersample='pseudo'")
     if (gains == "placed") != (poles is not None):
@@ -216,26 +203,12 @@ def _parse_matrix(name: str, value: npt.ArrayLike) -> Array:
     return M
 
 
-def _parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """Parse a finite vector (n,), or a number that stands for n equal ones; else ValueError."""
-    v = np.array(value, np.float64)
-    v = np.full(n, v) if v.ndim == 0 else v
-    if v.shape != (n,) or not np.isfinite(v).all():
-        raise ValueError(f"{name} is finite and has shape ({n},), got {value!r}")
-    return v
-
-
-def _parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """Parse a finite matrix (n, n), its diagonal (n,) or one number for it; else ValueError."""
+def _parse_array(name: str, value: npt.ArrayLike, *shape: int) -> Array:
+    """Parse finite numbers; one stands for equal ones, (n,) for a diagonal; else ValueError."""
     M = np.array(value, np.float64)
-    M = np.diag(_parse_vector(name, M, n)) if M.ndim < 2 else M
-    if M.shape != (n, n) or not np.isfinite(M).all():
-        raise ValueError(f"{name} is finite and has shape ({n}, {n}) or ({n},), got {value!r}")
-    return M
-
-
-def _parse_covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
-    """Parse a covariance (n, n), given as for `_parse_square`; else ValueError."""
-    M = _parse_square(name, value, n)
-    check_covariance(name, M, definite)
+    M = np.full(shape[:1], M) if M.ndim == 0 else M
+    M = np.diag(M) if M.ndim < len(shape) else M
+    if M.shape != shape or not np.isfinite(M).all():
+        shapes = " or ".join(str(shape[i:]) for i in range(len(shape)))
+        raise ValueError(f"{name} is finite and has shape {shapes}, got {value!r}")
     return M

@@ -114,11 +114,9 @@ class _Reader:
 
 
 def parse_config(
-    name: str,
-    row: FilterDefinition,
-    sensors: Mapping[str, SlowSensor],
+    name: str, row: FilterDefinition, sensors: Mapping[str, SlowSensor],
     options: Mapping[str, object],
-) -> FilterConfig:
+) -> FilterConfig:  # fmt: skip
     """Parse the options of a filter.
 
     TypeError says that an option is unknown or a value of the wrong type. ValueError says that a
@@ -168,16 +166,9 @@ def parse_config(
     chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
     prior = _parse_prior(states, first.forces, chosen, reader)
     reader.check_unread()
-    return FilterConfig(
-        name=name,
-        row=row,
-        sensors={sensor: sensors[sensor] for sensor in used},
-        models=layers,
-        noise_over_speed={name: noise[name] * models.COURSE_SPEED for name in growing},
-        Q=Q,
-        prior=prior,
-        **chosen,
-    )
+    chosen["noise_over_speed"] = {key: noise[key] * models.COURSE_SPEED for key in growing}
+    chosen["sensors"] = {sensor: sensors[sensor] for sensor in used}
+    return FilterConfig(name=name, row=row, models=layers, Q=Q, prior=prior, **chosen)
 
 
 def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) -> FilterModel:

@@ -14,6 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from ...envs.engine.views import TRUE_STATE, CarTruth
 from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
+from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
@@ -66,13 +67,11 @@ class TruthEntries:
         units = {name: unit for name, unit in fields.items() if unit is not None} | _MOTORS
         entries = list(inner)
         for name in parameters:
-            if name not in units:
-                raise ValueError(f"a vehicle has no parameter {name!r}; it has: {', '.join(units)}")
+            check_choice("parameter of a vehicle", name, units)
             limits = -_MAX_PARAMETER, _MAX_PARAMETER
             entries.append(ObservationEntry(f"true_{name}", units[name], *limits))
         for name in states:
-            if name not in _STATES:
-                raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
+            check_choice("true state", name, _STATES)
             unit, limit = _STATES[name]
             entries.append(ObservationEntry(f"{name}_hat", unit, -limit, limit))
         names = [entry.name for entry in entries]
@@ -139,12 +138,7 @@ def choose_vehicle(
 
 
 def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
-    """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays.
-
-    Args:
-        estimator: The estimator.
-        vehicle: Vehicle with the stiffnesses (N/rad).
-    """
+    """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays."""
     if isinstance(estimator, Estimator):
         for f in estimator.filters:
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
@@ -200,12 +194,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[_Floats, dict[str, Any]]:
-        """Reset the env and read its car.
-
-        Args:
-            seed: Seed of the env, or None.
-            options: Options of the env's reset, or None.
-        """
+        """Reset the env and read its car."""
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
         self._values, self._calibration = self._entries.read(base.car_truth)
@@ -227,11 +216,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         return {"env": self.env.get_wrapper_attr("get_state")()} | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()

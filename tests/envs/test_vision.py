@@ -181,7 +181,7 @@ REFUSED: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     (ID, {"vision": "image", "delay": "late"}, ValueError, "unknown delay 'late'"),
     (ID, IMAGE | {"appearance": {"wear": 2.0}}, ValueError, "shadow and wear are shares"),
     (ID, IMAGE | {"camera": {"delays": [0.0]}}, ValueError, "a picture takes a tick at least"),
-    (ID, IMAGE | {"appearance": {"ware": 0.1}}, TypeError, "appearance: unknown field 'ware'; did"
+    (ID, IMAGE | {"appearance": {"ware": 0.1}}, TypeError, "appearance: unknown option 'ware'; did"
      " you mean 'wear'"),
     ("sideslip/YawGps-v0", {"vision": "image"}, ValueError, "needs a camera"),
 ]  # fmt: skip

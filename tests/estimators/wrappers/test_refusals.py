@@ -110,8 +110,8 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (wrap("multirate-kf", CART), TypeError, "CartPoleEnv has no rows"),
     (wrap("exact-kf", PLAIN, name="plain"), ValueError, TWICE),
     # the true car
-    (truth(["colour"]), ValueError, "no parameter 'colour'; it has: mass"),
-    (truth([], ["mood"]), ValueError, "no true state 'mood'; there is: beta"),
+    (truth(["colour"]), ValueError, "unknown parameter of a vehicle 'colour'; "),
+    (truth([], ["mood"]), ValueError, "unknown true state 'mood'; known: beta"),
     (truth(["mass"], make=truth(["mass"])), ValueError, "two are stacked"),
     (truth([], ["beta"], make=wrap("exact-kf")), ValueError, "beta_hat would stand twice"),
     (truths(lambda: SyncVectorEnv([FUSED])), TypeError, "has no layout"),
