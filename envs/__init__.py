@@ -1,4 +1,13 @@
-"""The car, its sensors and the Gymnasium environment around them."""
+"""The car, its sensors and the Gymnasium environment around them.
+
+Args:
+    name: Name of a value, for messages.
+    value: Value to check or to format.
+    what: Kind of what is checked, for messages.
+    known: Known names.
+    minimum: Smallest number.
+    maximum: Largest number; None for no limit.
+"""
 
 # A second copy under another name breaks pickles and poisons numba's cache.
 if __name__ != "sideslip.envs":

@@ -28,11 +28,7 @@ _REPR.maxstring = _REPR.maxother = 80
 
 
 def short_repr(value: object) -> str:
-    """Format a value for a message, shortened.
-
-    Args:
-        value: Any value.
-    """
+    """Format a value for a message, shortened."""
     try:
         return _REPR.repr(value)
     except Exception:  # such as an integer of thousands of digits
@@ -49,34 +45,20 @@ def join_names(names: Iterable[str]) -> str:
 
 
 def is_finite(value: Any) -> TypeGuard[float]:
-    """Check whether a value is a number within +-MAX_NUMBER; True and False are none.
-
-    Args:
-        value: Any value.
-    """
+    """Check whether a value is a number within +-MAX_NUMBER; True and False are none."""
     is_number = isinstance(value, int | float | np.integer | np.floating)
     return is_number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
 
 
 def check_number(name: str, value: object) -> float:
-    """Check a number and convert it to float; ValueError, with its name, for another value.
-
-    Args:
-        name: Name of the number, for messages.
-        value: Value that should be a finite number.
-    """
+    """Check a number and convert it to float; ValueError, with its name, for another value."""
     if not is_finite(value):
         raise ValueError(f"{name} {short_repr(value)} is no finite number")
     return float(value)
 
 
 def check_mapping(name: str, value: object) -> Mapping[str, Any]:
-    """Check a mapping; TypeError, with its name, for another value.
-
-    Args:
-        name: Name of the mapping, for messages.
-        value: Value that should be a mapping.
-    """
+    """Check a mapping; TypeError, with its name, for another value."""
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
     return value
@@ -97,13 +79,7 @@ def describe_unknown(what: str, values: Iterable[object], known: Iterable[str]) 
 
 
 def check_choice(what: str, value: object, known: Iterable[str]) -> None:
-    """Check that a value is a known name; ValueError, with the nearest one, for another.
-
-    Args:
-        what: What the value names.
-        value: Value that should be a known name.
-        known: Known names.
-    """
+    """Check that a value is a known name; ValueError, with the nearest one, for another."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(describe_unknown(what, [value], known))
 
@@ -127,15 +103,7 @@ def check_options(what: str, function: Callable[..., object], options: Iterable[
 def check_int(
     name: str, value: object, what: str, minimum: int = 1, maximum: int | None = None
 ) -> int:
-    """Check a number of `what`; TypeError for no integer, ValueError out of its limits.
-
-    Args:
-        name: Name of the number, for messages.
-        value: Value that should be an integer.
-        what: What is counted.
-        minimum: Smallest number.
-        maximum: Largest number; None for no limit.
-    """
+    """Check a number of `what`; TypeError for no integer, ValueError out of its limits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
     if value < minimum or (maximum is not None and value > maximum):

@@ -208,11 +208,7 @@ class Estimator:
         self.step(np.zeros((0, FAST_WIDTH)), np.asarray(packet)[None])
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a whole record; errors as in `prepare_record`.
-
-        Args:
-            source: Record, or a log that has one.
-        """
+        """Reset, then filter a record, or that of a log; errors as in `prepare_record`."""
         return self.run_with_health(source, math.inf)[0]
 
     def run_with_health(
@@ -240,11 +236,7 @@ class Estimator:
         return Estimates(time, X, S, self.names, nis), healthy
 
     def prepare_record(self, source: Log | Record) -> Record:
-        """Reset for a record and return it; ValueError where rows, tick or columns do not fit.
-
-        Args:
-            source: Record, or a log that has one.
-        """
+        """Reset for a record and return it; ValueError where rows, tick or columns do not fit."""
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
             raise ValueError(f"{self.name}: the record is empty")
@@ -262,11 +254,7 @@ class Estimator:
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this estimator or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this estimator or of one built with the same arguments."""
         self.filters[:] = snapshot
 
     @property

@@ -63,9 +63,7 @@ FILTERS: dict[str, FilterDefinition] = {
         slow=_CAMERA, intersample="pseudo-residual", delay="stored", source="uneven-delay (11)-(22)"
     ),
     "constant-delay-kf": FilterDefinition(
-        slow=_CAMERA,
-        intersample="pseudo-residual",
-        delay="constant",
+        slow=_CAMERA, intersample="pseudo-residual", delay="constant",
         source="uneven-delay 5, the rival in Fig. 5",
     ),
     "vision-only-kf": FilterDefinition(
@@ -78,12 +76,8 @@ FILTERS: dict[str, FilterDefinition] = {
         slow=_GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
     ),
     "double-layer": FilterDefinition(
-        slow=_GPS,
-        intersample="pseudo-residual",
-        gains="covariance",
-        disturbances="walk",
-        second="velocity-roll",
-        hdop_table=((1.0, 1.0), (20.0, 20.0)),
+        slow=_GPS, intersample="pseudo-residual", gains="covariance", disturbances="walk",
+        second="velocity-roll", hdop_table=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
     # linear observers: the poles of `lob-2` and `lob` have the least error of beta of a grid from 1
@@ -95,47 +89,30 @@ FILTERS: dict[str, FilterDefinition] = {
         model="roll", fast=("roll_rate",), source="double-layer-gps 6.2 and (3), Tseng 2003"
     ),
     "kinematic-velocity-kf": FilterDefinition(
-        model="kinematic",
-        fast=("wheel",),
-        gains="covariance",
+        model="kinematic", fast=("wheel",), gains="covariance",
         source="double-layer-gps 6.3 and (4)-(5), Chen 2008",
     ),
     "dual-rate": FilterDefinition(
-        slow=_GPS,
-        fast=(),
-        intersample="dual-rate",
-        disturbances="walk-all",
-        delay="ignore",
+        slow=_GPS, fast=(), intersample="dual-rate", disturbances="walk-all", delay="ignore",
         source="dual-rate (4)-(35), (37)-(38)",
     ),
     "lob": FilterDefinition(
-        fast=("gyro", "accel_y"),
-        gains="placed",
-        poles=(-2.0, -2.0),
+        fast=("gyro", "accel_y"), gains="placed", poles=(-2.0, -2.0),
         source="dakf-stability VI.A, [5]: gamma and a_y of (1)",
     ),
     "yaw-moment-observer": FilterDefinition(
         model="yaw-moment", gains="placed", poles=(-20.0, -25.0), source="dakf-stability (2), [11]"
     ),
     "lateral-force-observer": FilterDefinition(
-        model="tyre-forces",
-        fast=("gyro", "accel_y"),
-        gains="placed",
-        poles=(-20.0, -25.0, -30.0),
+        model="tyre-forces", fast=("gyro", "accel_y"), gains="placed", poles=(-20.0, -25.0, -30.0),
         source="dakf-stability (1)-(2), [11]",
     ),
     "exact-kf": FilterDefinition(
-        slow=SLOW_NAMES,
-        gains="covariance",
-        disturbances="forces",
+        slow=SLOW_NAMES, gains="covariance", disturbances="forces",
         source="docs/reference/papers.md",
     ),
     "joint": FilterDefinition(
-        slow=SLOW_NAMES,
-        uses_all=True,
-        gains="covariance",
-        disturbances="forces",
-        options=_JOINT,
+        slow=SLOW_NAMES, uses_all=True, gains="covariance", disturbances="forces", options=_JOINT,
         source="docs/explanation/estimation.md, beyond the papers",
     ),
-}
+}  # fmt: skip

@@ -2,4 +2,7 @@
 
 `traffic` has the networks and the vehicles, `env` the environments. highway-env's y axis points to
 the right: every number is mirrored once, where it crosses into or out of this room.
+
+Args:
+    motion: `Motion` of our car.
 """

@@ -88,16 +88,11 @@ class HighwayEnv(StabilityEnv):
     """
 
     def __init__(
-        self,
-        road: str = "straight",
+        self, road: str = "straight",
         hazard: Mapping[str, Range] | None = {},  # never written
-        traffic: int = 3,
-        sensors: str = "fusion",
-        scenario: ScenarioSource = "wet-evasion",
-        vehicle: VehicleSource = "passenger-car",
-        reference: str = "lagged",
-        **options: Any,
-    ) -> None:
+        traffic: int = 3, sensors: str = "fusion", scenario: ScenarioSource = "wet-evasion",
+        vehicle: VehicleSource = "passenger-car", reference: str = "lagged", **options: Any,
+    ) -> None:  # fmt: skip
         check_choice("road", road, ROADS)
         if hazard is not None:
             check_options("hazard", Hazard.__init__, check_mapping("hazard", hazard))

@@ -329,11 +329,7 @@ class Traffic:
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """Step the road by `PERIOD` ticks.
-
-        Args:
-            motion: `Motion` of our car at the end of these ticks.
-        """
+        """Step the road by `PERIOD` ticks, at whose end our car has a motion."""
         self.ego.set_motion(motion)
         self.road.act()
         self.road.step(1e-3 * PERIOD)
@@ -349,11 +345,7 @@ class Traffic:
         return not bool(self.ego.lane.on_lane(self.ego.position, margin=0.5 * self.ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Locate our car on the present lane of its route.
-
-        Args:
-            motion: `Motion` of our car.
-        """
+        """Locate our car on the present lane of its route."""
         while True:
             lane = self.course.route[self._lane]
             position = locate_on_lane(lane, motion.X, motion.Y, motion.psi)

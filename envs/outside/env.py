@@ -187,13 +187,9 @@ class OutsideEnv(PlantEnv):
     plant: OutsidePlant
 
     def __init__(
-        self,
-        model: str = "drift",
-        sensors: str = "fusion",
-        scenario: ScenarioSource = "random-steering",
-        reference: str = "model",
-        **options: Any,
-    ) -> None:
+        self, model: str = "drift", sensors: str = "fusion",
+        scenario: ScenarioSource = "random-steering", reference: str = "model", **options: Any,
+    ) -> None:  # fmt: skip
         check_choice("model", model, OUTSIDE_PLANTS)
         if "vehicle" in options:
             raise TypeError("an outside plant is its own vehicle; only nominal can be given")

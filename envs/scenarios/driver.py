@@ -45,10 +45,6 @@ def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
     """Compute the driver's steering command at a tick: the angle at the wheels (rad).
 
     The profile is an array: a tuple goes through memory in every call.
-
-    Args:
-        tick: Tick since the start of the episode.
-        profile: Array that begins with the STEERING_WIDTH numbers of `write_steering`.
     """
     angle = 0.0
     for i in range(SINES):
@@ -151,11 +147,6 @@ def write_steering(kind: int, d: Draws, profile: Vector) -> None:
     whose heading angles cancel. The sine with dwell stays at its second peak for `hold`
     (FMVSS 126). The ramp rises within `hold`, the held step within 0.2 s, and both stay. The sweep
     goes from `frequency` to `frequency_2` within `hold`, evenly in Hz, and stays there.
-
-    Args:
-        kind: Index of the kind in `STEERING_KINDS`.
-        d: `Draws`.
-        profile: Array for the profile, at least STEERING_WIDTH long.
     """
     for i in range(STEERING_WIDTH):
         profile[i] = 0.0
@@ -213,14 +204,7 @@ _LEAD_FREQUENCIES = 0.2, 0.35  # Hz, about: whole waves, so that heading and ang
 def write_gentle_steering(
     length: Scalar, speed: Scalar, target: "ReferenceParams", profile: Vector
 ) -> None:
-    """Write the gentle steering before a manoeuvre: two sines.
-
-    Args:
-        length: Its length (ticks), positive.
-        speed: Speed of the car (m/s).
-        target: `ReferenceParams` of the nominal car.
-        profile: Array of the profile, at least STEERING_WIDTH long.
-    """
+    """Write the gentle steering before a manoeuvre: two sines."""
     k, seconds, v = _LEAD_START, length * TICK, maximum(speed, 1.0)
     gain = maximum(1.0 + target.G * v * v, MIN_STEER_FACTOR) / (target.per_l * v * v)
     profile[k], profile[k + 3] = _LEAD_ACCELERATION * gain, length
@@ -246,16 +230,7 @@ def compute_target_angle(
     motion: Motion, path: TrackPath, road: RoadParams, target: "ReferenceParams",
     driver: DriverParams, stop: Scalar,
 ) -> Scalar:  # fmt: skip
-    """Compute the steering angle (rad) that brings the car onto the path, within +-stop.
-
-    Args:
-        motion: `Motion` of the car.
-        path: `TrackPath`.
-        road: `RoadParams`.
-        target: `ReferenceParams` of the nominal car, which the driver knows.
-        driver: `DriverParams`.
-        stop: Largest angle (rad).
-    """
+    """Compute the steering angle (rad) that brings the car onto the path, within +-stop."""
     v = motion.v_x
     distance = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
@@ -274,17 +249,7 @@ def compute_driver_angle(
     angle: Scalar, motion: Motion, path: TrackPath, road: RoadParams, target: "ReferenceParams",
     driver: DriverParams, stop: Scalar,
 ) -> Scalar:  # fmt: skip
-    """Compute the driver's steering angle (rad) a tick later.
-
-    Args:
-        angle: Present angle at the wheels (rad).
-        motion: `Motion` of the car.
-        path: `TrackPath`.
-        road: `RoadParams`.
-        target: `ReferenceParams` of the nominal car, which the driver knows.
-        driver: `DriverParams`.
-        stop: Largest angle (rad).
-    """
+    """Compute the driver's steering angle (rad) a tick later."""
     target_angle = compute_target_angle(motion, path, road, target, driver, stop)
     return limit_rate(angle, apply_lag(target_angle, angle, driver.rest), driver.slew)
 
@@ -305,12 +270,7 @@ class SpeedProfile(NamedTuple):
 
 @inline
 def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> tuple[Scalar, Scalar]:
-    """Compute the speed (m/s) and the acceleration (m/s2) that the driver wants at a tick.
-
-    Args:
-        tick: Tick since the start of the episode.
-        profile: `SpeedProfile`.
-    """
+    """Compute the speed (m/s) and the acceleration (m/s2) that the driver wants at a tick."""
     acceleration = select((tick >= profile.start) & (tick < profile.end), profile.acceleration, 0.0)
     elapsed = (minimum(maximum(tick, profile.start), profile.end) - profile.start) * TICK
     speed = profile.speed + profile.acceleration * elapsed
@@ -358,11 +318,6 @@ class Wind(NamedTuple):
 
 @jit
 def compute_wind(tick: Scalar, wind: Wind) -> tuple[Scalar, Scalar, Scalar]:
-    """Compute force (N), yaw and roll moment (N m) of the wind from this tick to the next.
-
-    Args:
-        tick: Tick since the start of the episode.
-        wind: `Wind`.
-    """
+    """Compute force (N), yaw and roll moment (N m) of the wind from this tick to the next."""
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
     return force, force * wind.arm, 0.0 - force * wind.height

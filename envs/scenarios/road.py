@@ -106,15 +106,7 @@ PATHS = ("road", *_TRACKS)
 def make_sections(
     track: str, width: float, start: float = 0.0, scale: float = 1.0, side: float = 1.0
 ) -> tuple[Section, ...]:
-    """Make the lanes of a track for a vehicle's width, in the order of driving.
-
-    Args:
-        track: Name of the track, of `PATHS`; "road" has no lanes. ValueError for another.
-        width: Width of the vehicle (m).
-        start: Place along the road where the first lane begins (m).
-        scale: Factor on the lengths.
-        side: 1, or -1 to mirror the track.
-    """
+    """Make the lanes of a track in the order of driving, none of "road"; ValueError for others."""
     if track not in PATHS:
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
     return tuple(
@@ -128,10 +120,6 @@ def make_path(track: str, width: float) -> TrackPath:
 
     It keeps to a lane's centre but for `_TRANSITION_OVERLAP` at the ends, where the sides of the
     car stay between the cones.
-
-    Args:
-        track: Name of the track, of `PATHS`.
-        width: Width of the vehicle (m).
     """
     shifts = []
     for before, after in pairwise(make_sections(track, width)):
@@ -144,14 +132,7 @@ def make_path(track: str, width: float) -> TrackPath:
 
 @jit
 def transform_path(path: TrackPath, start: Scalar, scale: Scalar, side: Scalar) -> TrackPath:
-    """Shift, scale and mirror the path of a track.
-
-    Args:
-        path: `TrackPath` that begins at 0.
-        start: Place along the road where it begins (m).
-        scale: Factor on the lengths.
-        side: 1, or -1 to mirror it.
-    """
+    """Shift, scale and mirror the path of a track that begins at 0."""
     return TrackPath(
         side * path.shift_1, start + scale * path.start_1, scale * path.length_1,
         side * path.shift_2, start + scale * path.start_2, scale * path.length_2,
@@ -164,14 +145,7 @@ _WEAVE, _WEAVE_TIME = 1.0, 5.0  # m from side to side, s: gentle, 0.8 m/s2
 
 @jit
 def add_weave(path: TrackPath, start: Scalar, speed: Scalar, duration: Scalar) -> TrackPath:
-    """Add a gentle weave before the track, in whole waves.
-
-    Args:
-        path: `TrackPath`.
-        start: Place along the road where it begins (m).
-        speed: Speed of the car (m/s).
-        duration: Time that it takes (s), positive.
-    """
+    """Add a gentle weave before the track, in whole waves."""
     distance = maximum(speed, _MIN_SPEED) * duration
     rate = 2.0 * PI * maximum(floor(duration / _WEAVE_TIME + 0.5), 1.0) / distance
     weave = (_WEAVE, start, start + distance, rate)
@@ -180,12 +154,7 @@ def add_weave(path: TrackPath, start: Scalar, speed: Scalar, duration: Scalar) -
 
 @jit
 def compute_path_offset(path: TrackPath, s: Scalar) -> Scalar:
-    """Compute the path's offset (m) to the left of the road's centre line; its slope is continuous.
-
-    Args:
-        path: `TrackPath`.
-        s: Distance along the road (m).
-    """
+    """Compute the path's offset (m) to the left of the road's centre, whose slope is continuous."""
     first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
     offset = first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)
     if any_lane(path.weave != 0.0):

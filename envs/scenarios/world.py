@@ -126,12 +126,7 @@ def _draw_numbers(
 
 @jit
 def draw_car(d: Draws, car: CarParams) -> CarParams:
-    """Load a car, whose load rolls with the body, and draw its tyres' stiffness.
-
-    Args:
-        d: `Draws`.
-        car: `CarParams` of the vehicle.
-    """
+    """Load a car, whose load rolls with the body, and draw its tyres' stiffness."""
     laden, shift = 1.0 + d.load, d.gravity_shift * (car.l_f + car.l_r)
     drawn = (
         car.m * laden, car.I * laden * d.inertia, car.l_f + shift, car.l_r - shift,

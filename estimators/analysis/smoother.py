@@ -106,14 +106,9 @@ class _FilteredBlock(NamedTuple):
 
 @jit
 def _filter_forwards(
-    f: FilterRecord,
-    gains: GainTables,
-    fast: Matrix,
-    packets: Matrix,
-    position: int,
-    nis: Vector,
+    f: FilterRecord, gains: GainTables, fast: Matrix, packets: Matrix, position: int, nis: Vector,
     block: _FilteredBlock,
-) -> int:
+) -> int:  # fmt: skip
     """Filter fast rows, and packets from `position` on that arrive by then; return those done."""
     n, dense = f.n, f.dense
     F, before, x, P, Q = block

@@ -109,12 +109,6 @@ def assemble(
 
     ValueError says that a schedule does not fit ticks, that a sensor can be later than the filter's
     window, or that options do not go together.
-
-    Args:
-        config: Parsed options of the filter.
-        vehicle: The filter's vehicle.
-        dt: Tick (s).
-        speed: Speed (m/s) if it is held, None where it is measured.
     """
     layers, first = np.zeros(len(config.models), FILTER).view(np.recarray), 0
     for f, model in zip(layers, config.models, strict=True):

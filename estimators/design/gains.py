@@ -46,11 +46,6 @@ def kalman_gain(P: Array, C: Array, R: Array) -> Array:
 
     With R = 0 it is a generalised inverse of C: the Moore-Penrose one for P = I, the P-weighted
     one for a covariance P; with P = I, R = lambda I it is Tikhonov's.
-
-    Args:
-        P: Covariance of the state, shape (n, n).
-        C: Measurement matrix, shape (p, n).
-        R: Covariance of the measurement noise, shape (p, p).
     """
     PC = P @ C.T
     return np.asarray(np.linalg.solve((C @ PC + R).T, PC.T).T, np.float64)
@@ -60,12 +55,6 @@ def joseph_form(P: Array, K: Array, C: Array, R: Array) -> Array:
     """Compute the covariance (n, n) after a correction: (I - K C) P (I - K C)^T + K R K^T.
 
     A sum of two squares stays symmetric and positive semidefinite under rounding.
-
-    Args:
-        P: Covariance before it, shape (n, n).
-        K: Any gain, shape (n, p).
-        C: Measurement matrix, shape (p, n).
-        R: Covariance of the measurement noise, shape (p, p).
     """
     rest = np.eye(len(P)) - K @ C
     return np.asarray(rest @ P @ rest.T + K @ R @ K.T)
@@ -90,12 +79,7 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:
-    """Compute F (n, n) of a step: G on the dense states, the others decay.
-
-    Args:
-        f: Memory of the filter.
-        G: Transition of the dense states, shape (dense, n).
-    """
+    """Compute F (n, n) of a step: G on the dense states, the others decay."""
     n, dense = int(f.n), len(G)
     F = np.zeros((n, n))
     F[:dense] = G
@@ -264,13 +248,7 @@ def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
-    """Compute the map (n, n) from the error before a sample to that before the next one.
-
-    Args:
-        F: Transition matrix of a step, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        shares: B_i, shape (steps, n, q).
-    """
+    """Compute the map (n, n) from the error before a sample to that before the next one."""
     M, eps = np.eye(len(F)), C
     for B in shares:
         M = F @ (M - B @ eps)

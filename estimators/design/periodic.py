@@ -66,14 +66,9 @@ _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is
 
 @jit
 def _iterate_gains(
-    filters: FilterRecords,
-    lags: Vector,
-    cycles: int,
-    tolerance: float,
-    table: Matrix,
-    before: Vector,
-    gains: GainTables,
-) -> int:
+    filters: FilterRecords, lags: Vector, cycles: int, tolerance: float, table: Matrix,
+    before: Vector, gains: GainTables,
+) -> int:  # fmt: skip
     """Run a covariance filter over its schedule until its gains settle; return the cycles used."""
     # filled: table (rows, columns), and before (total, total), the covariance before the last
     # frame; lags (pattern,): steps from capture to arrival
@@ -130,12 +125,7 @@ def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]
 
 
 def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
-    """Allocate zeros for gains (cells of speed, rows, columns); (1, 1, 1) where P gives them.
-
-    Args:
-        f: Memory of the filter.
-        schedule: Schedule of its slow sensor.
-    """
+    """Allocate zeros for gains (cells of speed, rows, columns); (1, 1, 1) where P gives them."""
     cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
     return np.zeros((cells, *_compute_table_shape(f, schedule)) if f.periodic else (1, 1, 1))
 
@@ -187,11 +177,7 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
 
 
 def build_measurement_rows(f: FilterRecord) -> Array:
-    """Build C (m + p, total): the fast rows, then the slow ones, of first clones if any.
-
-    Args:
-        f: Memory of the filter.
-    """
+    """Build C (m + p, total): the fast rows, then the slow ones, of first clones if any."""
     s, m = int(f.first_slow), int(f.fasts)
     p = int(f.rows[s]) if s >= 0 else 0
     C = np.zeros((m + p, int(f.total)))
@@ -269,14 +255,7 @@ def _design_cached(key: bytes) -> tuple[Array, Array]:
 def design_and_map(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, Array]:
-    """Design the gains (rows, columns) at a speed and the error's map over a cycle, both read-only.
-
-    Args:
-        f: Memory of the filter, left as it is.
-        schedule: Schedule of its slow sensor.
-        speed: Speed (m/s).
-        config: Parsed options of the filter.
-    """
+    """Design gains (rows, columns) at a speed and the error's map over a cycle, both read-only."""
     return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
 
 

@@ -295,17 +295,11 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
     """
 
     def __init__(
-        self,
-        env: gym.Env[_Floats, Any],
-        estimator: EstimatorSource | None = None,
-        outputs: Sequence[str] = ("beta", "gamma"),
-        std: bool = True,
-        replace: bool = False,
-        vehicle: VehicleSource | None = None,
-        options: Mapping[str, object] | None = None,
-        name: str | None = None,
-        **misplaced: object,
-    ) -> None:
+        self, env: gym.Env[_Floats, Any], estimator: EstimatorSource | None = None,
+        outputs: Sequence[str] = ("beta", "gamma"), std: bool = True, replace: bool = False,
+        vehicle: VehicleSource | None = None, options: Mapping[str, object] | None = None,
+        name: str | None = None, **misplaced: object,
+    ) -> None:  # fmt: skip
         self._base = find_base_env(env)
         values = estimator, outputs, std, replace, vehicle, options, name
         self._arguments = Arguments.read(self._base.slow_sensors, *values, **misplaced)
@@ -353,22 +347,13 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[_Floats, Infos]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
-
-        Args:
-            seed: Seed of the env, or None.
-            options: Options of the env's reset, or None.
-        """
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, Infos]:
-        """Step the env; the estimator takes its record before the observation is made.
-
-        Args:
-            action: Action of the env.
-        """
+        """Step the env; the estimator takes its record before the observation is made."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
@@ -379,11 +364,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         return {"env": inner, "steps": steps, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`; ValueError for one of an env with other step limits.
-        """
+        """Restore a snapshot of such an env; ValueError if its number of step limits is another."""
         limits, steps = self._find_step_limits(), snapshot.get("steps", [])
         if len(limits) != len(steps):
             has = f"the snapshot has {len(steps)} step limits"
