@@ -280,7 +280,7 @@ def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar
 def compute_tyre_forces(
     motion: State, load: TyreLoad, car: Car, g_y: Scalar, variant: Variant
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Compute (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), moment (N m)."""
+    """Compute (F_yf, F_yr, F_x, N_z): the axles' lateral forces, drive force (N), moment (N m)."""
     a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, variant)
     F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, variant.law, variant.small_angle)
     return F_fl + F_fr, F_rl + F_rr, F_x, N_z
