@@ -1,4 +1,4 @@
-"""LQR: yaw moment, and steering where there is some, of least cost; for tyres, and for a lane."""
+"""LQR by yaw moment and, where there is some, steering: of motion, adapted to tyres, in a lane."""
 
 import copy
 import math
