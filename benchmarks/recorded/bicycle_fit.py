@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from ...envs.engine.config import make_car
 from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle import dynamics
@@ -64,13 +65,6 @@ PRIOR = Theta(0.4, 0.4, 0.2, 0.05, 0.01, 0.01, 0.5, 0.1, 0.1, 0.1, 0.3)
 inertia, one of I/(m l_f l_r), is narrow: with both stiffnesses it leaves the yaw rate as it is."""
 
 
-_FIXED = (  # fields of the car that the simulation reads, in this order
-    "mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness",
-    "front_track", "rear_track", "wheel_radius", "friction", "roll_moment_arm", "roll_inertia",
-    "roll_stiffness", "roll_damping", "gravity_height", "antenna_ahead",
-)  # fmt: skip
-
-
 @jit
 def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
     """The plant's load in row i with the steering logged at a place between the rows."""
@@ -82,24 +76,20 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
 
 @jit
 def _simulate_windows(
-    rows: Any, starts: Any, theta: Any, fixed: Any, law: int, h: float, out: Any
+    rows: Any, starts: Any, theta: Any, car: CarParams, law: int, h: float, out: Any
 ) -> None:
     """Fill out (3, windows, rows): yaw rate, lateral specific force, sideslip angle of the GPS."""
-    roll = int(law != LINEAR)
-    m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
-    car = CarParams(
-        m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
-        fixed[5] * np.exp(theta[1]), fixed[6], fixed[7], fixed[8], 1.0, mu, 0.0,
-        fixed[10], fixed[11], fixed[12], fixed[13], fixed[14], 0.0, 0.0, mu, 0.0, 0.0,
-        1.0, 1.0, 0.0,
-    )  # fmt: skip
+    inertia = (car.I * np.exp(theta[2]),)
+    tyres = car.C_f * np.exp(theta[0]), car.C_r * np.exp(theta[1])
+    car = CarParams(*(car[:1] + inertia + car[2:4] + tyres + car[6:]))
     road = dynamics.RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     push = dynamics.DisturbanceForces(0.0, 0.0, 0.0)
-    variant = PlantVariant(0, law, roll)
+    variant = PlantVariant(0, law, int(law != LINEAR))
     for w in range(len(starts)):
         at = starts[w]
         V, gamma = rows[2, at], rows[0, at] - theta[5]
-        v_y = l_r * gamma - m * l_f * V * V * gamma / (2.0 * car.C_r * (l_f + l_r))
+        v_y = car.l_r * gamma
+        v_y -= car.m * car.l_f * V * V * gamma / (2.0 * car.C_r * (car.l_f + car.l_r))
         phi = phi_dot = 0.0
         after = _compute_load(rows, at, at + 0.5 + theta[8] / h, theta, car)
         for k in range(out.shape[2]):
@@ -114,7 +104,7 @@ def _simulate_windows(
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot, 0.0, 0.0)
             slope = dynamics.derivative(motion, after, push, car, road, variant)
             out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
-            out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
+            out[2, w, k] = np.arctan2(v_y + car.forward * gamma, V)
 
 
 def _compute_courses(log: Log, every: int, count: int) -> Array:
@@ -201,9 +191,9 @@ class Windows:
         """
         rows = sum(round(seconds / self.dt) for seconds in (_BURN, _WINDOW, _MARGIN))
         out = np.empty((3, len(self.starts), rows))
-        fixed = np.array([getattr(self.car, name) for name in _FIXED])
-        law = TYRE_LAWS.index(self.tyres)
-        _simulate_windows(self.rows, self.starts, np.array(theta), fixed, law, self.dt, out)
+        stiff = self.car.replace(transfer_height=0.0, relaxation=0.0)  # as the fit assumes
+        car, law = CarParams(*map(float, make_car(stiff))), TYRE_LAWS.index(self.tyres)
+        _simulate_windows(self.rows, self.starts, np.array(theta), car, law, self.dt, out)
         return out
 
     def compute_residual(self, theta: Theta) -> Array:
