@@ -118,15 +118,10 @@ def _make_signals(track: _Track) -> list[_Signal]:
 
 
 def _compare(signal: _Signal) -> dict[str, _NoiseLawResult]:
-    """Fit each law of the noise on the first half."""
-    hdop, laws = signal.track.hdop, HDOP_LAWS.items()
-    return {name: _fit_law(signal, _compute_law_size(hdop, weight)) for name, weight in laws}
-
-
-def _compute_law_size(hdop: Array, weight: float) -> Array:
-    """Compute the noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
+    """Fit each law on the first half: noise of size 1 + weight (double-layer's table - 1)."""
     knots, factors = zip(*FILTERS["double-layer"].hdop_table, strict=True)
-    return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
+    excess = np.interp(signal.track.hdop, knots, factors) - 1.0
+    return {law: _fit_law(signal, 1.0 + weight * excess) for law, weight in HDOP_LAWS.items()}
 
 
 def _compute_gain(result: _NoiseLawResult, other: _NoiseLawResult) -> Estimate:

@@ -11,6 +11,7 @@ from sideslip.benchmarks.recorded import receiver
 from sideslip.benchmarks.report.tables import LETTERS, LINES
 from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
+from sideslip.estimators.filters import FILTERS
 from tests.benchmarks.conftest import Run
 from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence
 
@@ -24,11 +25,11 @@ def drive(weight: float, count: int = 500, seed: int = 0) -> list[Epoch]:
     hdop = np.round(np.exp(rng.normal(0.9, 0.7, count)).clip(0.8, 15.0), 1)
     force = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]) * Q
     x = np.array([[0.0, 0.0], [8.0, 8.0]])
-    epochs = []
-    for k in range(count):
+    knots, factors = zip(*FILTERS["double-layer"].hdop_table, strict=True)
+    sizes, epochs = NOISE * (1.0 + weight * (np.interp(hdop, knots, factors) - 1.0)), []
+    for k, size in enumerate(sizes):
         push = np.linalg.cholesky(force) @ rng.normal(size=(2, 2))
         x = np.array([[1.0, 1.0], [0.0, 1.0]]) @ x + push
-        size = NOISE * receiver._compute_law_size(hdop[k : k + 1], weight)[0]
         place = x[0] + size * rng.normal(size=2)
         speed = math.hypot(*x[1])
         course = math.atan2(x[1, 1], x[1, 0]) + 0.05 * size / speed * rng.normal()
