@@ -70,6 +70,10 @@ class SignalCalibration(NamedTuple):
         return self
 
 
+AS_LOGGED = SignalCalibration()
+"""The calibration of a log whose steering is the angle at the wheels, and nothing is late."""
+
+
 def read_wires(source: VehicleSource | None) -> SignalCalibration:
     """Read the calibration in a vehicle's file, which errors name; that of others is unknown.
 

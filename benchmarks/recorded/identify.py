@@ -15,7 +15,7 @@ from ...envs.record import PACKET, Array, Log
 from ...envs.recordings.log_file import read_parts
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
-from ...estimators.wires import SignalCalibration, apply_wires
+from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..report.tables import format_verdict
@@ -54,17 +54,15 @@ class IdentificationResult:
 
 
 def identify(
-    logs: Sequence[Log],
-    car: Vehicle,
-    wires: SignalCalibration | None = None,
+    logs: Sequence[Log], car: Vehicle, stated: SignalCalibration = AS_LOGGED,
     tyres: str | None = None,
-) -> IdentificationResult:
+) -> IdentificationResult:  # fmt: skip
     """Fit the car to the parts of a log, and the noise of its sensors.
 
     Args:
         logs: Parts of the log; ValueError for swapped columns.
         car: Stated car, where the search starts.
-        wires: Stated calibration, where the search starts.
+        stated: Stated calibration, where the search starts.
         tyres: "linear", as stiff as the log's accelerations have them, without roll, or "fiala", as
             stiff as at small slips, with the stated friction and roll; None: what errs less on
             held-out stretches; another: ValueError.
@@ -74,7 +72,6 @@ def identify(
     if what := quality.find_swapped(logs):
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
-    stated = wires or SignalCalibration()
     logs = [apply_wires(log, SignalCalibration(at=stated.at)) for log in logs]
     if "gps" in stated.at:
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
@@ -92,8 +89,8 @@ def identify(
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
-    slips = motion.estimate_slips(logs, result.car, result.wires._replace(at={}))
-    both = (motion.estimate_slips(logs, car, stated._replace(at={})), slips)
+    slips = motion.estimate_slips(logs, result.car, result.wires)
+    both = (motion.estimate_slips(logs, car, stated), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
     findings, noise, latency = motion.make_sensor_findings(logs, slips)
     result.findings += findings
@@ -131,8 +128,10 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     """Fill in all that the car's motion tells. near: whether the stated ratio may be right."""
     car, stated = result.car, result.wires
     peak_accel = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.scored_rows], 95))
-    held = ["gain"] if near and peak_accel > _MILD else []
-    without = (*held, *(() if w.accel else _OF_ACCEL), *(() if w.course else ("gps_delay",)))
+    doubt, without = "", (*(() if w.accel else _OF_ACCEL), *(() if w.course else ("gps_delay",)))
+    if near and peak_accel > _MILD:
+        doubt = f"at {peak_accel:.0f} m/s2 a saturating axle would look like another ratio"
+        without += ("gain",)
     free = [name for name in (*Theta._fields[:8], "gps_delay") if name not in without]
     if len(laws) > 1 and peak_accel > _MAX_FRICTION_SHARE * car.friction * GRAVITY:
         laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
@@ -145,7 +144,7 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     factors = {key: math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()}
     values = {key: getattr(car, key) * factor for key, factor in factors.items()}
     fitted = car.replace(**values, name=f"{car.name}-identified")
-    result.findings = _make_car_findings(stated, w, (best, free_too), held, peak_accel) + rows
+    result.findings = _make_car_findings(stated, w, best, free_too, doubt) + rows
     share = fitted.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
     if not POSSIBLE[0] <= share <= POSSIBLE[1]:
         low, high = POSSIBLE
@@ -208,17 +207,13 @@ def _evaluate_folds(w: Windows, best: BicycleFit) -> Array:
 
 
 def _make_car_findings(
-    stated: SignalCalibration,
-    w: Windows,
-    fits: tuple[BicycleFit, BicycleFit],
-    held: Sequence[str],
-    peak_accel: float,
+    stated: SignalCalibration, w: Windows, best: BicycleFit, free: BicycleFit, doubt: str
 ) -> list[Finding]:
-    """Findings of `_list_parameters`; intervals with the shift by free latencies in fit 2."""
-    findings, (best, free) = [], fits
+    """Findings of `_list_parameters`, intervals with the shift to `free`; doubt: of the ratio."""
+    findings = []
     for name, label, value, unit in _list_parameters(w.car, stated):
-        at = float(getattr(best.theta, name))
-        half = math.hypot(best.halves.get(name, math.inf), float(getattr(free.theta, name)) - at)
+        at, shifted = float(getattr(best.theta, name)), float(getattr(free.theta, name))
+        half = math.hypot(best.halves.get(name, math.inf), shifted - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
         remark = "" if is_determined else motion.WIDE
         if name in _OF_CAR:
@@ -226,9 +221,7 @@ def _make_car_findings(
         elif label == "steering sign":
             is_determined, at, half, remark = True, math.copysign(1.0, at), math.inf, ""
         elif name == "gain":
-            at, half = 1.0 / abs(at), half / at**2
-            if held:
-                remark = f"at {peak_accel:.0f} m/s2 a saturating axle would look like another ratio"
+            at, half, remark = 1.0 / abs(at), half / at**2, doubt or remark
         elif unit.startswith("deg"):
             at, half = math.degrees(at), math.degrees(half)
         findings.append(Finding(label, value, at, half, unit, is_determined, remark))
@@ -237,13 +230,13 @@ def _make_car_findings(
 
 def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     """RMS of the sideslip's error (rad) where logs have the truth; NaN where none has."""
-    errors = [np.zeros(0)]
-    for log, slip in zip(logs, slips, strict=True):
-        if "beta" in log.truth:
-            errors.append((slip - log.truth["beta"])[LoggedMotion(log).is_moving])
-    combined = np.concatenate(errors)
-    combined = combined[np.isfinite(combined)]
-    return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
+    errors = [
+        (slip - log.truth.get("beta", math.nan))[LoggedMotion(log).is_moving]
+        for log, slip in zip(logs, slips, strict=True)
+    ]
+    known = np.concatenate(errors)
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
 
 
 _FINDINGS_NOTE = (
@@ -273,14 +266,10 @@ _VALIDATION_NOTE = (
 
 
 def identify_file(
-    log: str | Path,
-    vehicle: VehicleSource,
-    mapping: Sequence[str] = (),
-    wires: SignalCalibration | None = None,
-    tyres: str | None = None,
-    until: float | None = None,
+    log: str | Path, vehicle: VehicleSource, mapping: Sequence[str] | None = None,
+    wires: SignalCalibration = AS_LOGGED, tyres: str | None = None, until: float | None = None,
     validate: bool = False,
-) -> tuple[IdentificationResult, Suite]:
+) -> tuple[IdentificationResult, Suite]:  # fmt: skip
     """Read a drive and identify its car; return the result and its suite.
 
     Args:
@@ -352,15 +341,13 @@ def _split_blocks(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
 
 
 def _make_validation_table(
-    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration | None, tyres: str | None
+    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration, tyres: str | None
 ) -> ResultTable:
     """Compare a car from odd blocks of a log with the even ones; where none is found, why."""
-    moved = [apply_wires(log, SignalCalibration(at=wires.at if wires else {})) for log in logs]
+    moved = [apply_wires(log, SignalCalibration(at=wires.at)) for log in logs]
     odd, even = _split_blocks(moved)
-    wires = wires and wires._replace(at={})
-    result = identify(odd, car, wires, tyres)
-    w = Windows.from_logs(even, car) if even else None
-    reason = result.reason
+    result = identify(odd, car, wires._replace(at={}), tyres)
+    w, reason = Windows.from_logs(even, car) if even else None, result.reason
     if w is None or not len(w.starts):
         reason = reason or "no window of 5 s is held out"
     title = "Does the found car stay within assumed corridors of ISO 19364 / 22140?"

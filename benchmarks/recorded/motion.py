@@ -64,17 +64,12 @@ def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) 
     """
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
-    steered = wires._replace(latency={})
+    steered = wires._replace(latency={}, at={})
     return [estimator.run(apply_wires(log, steered))["beta"] for log in logs]
 
 
-def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
-    """Compute a statistic of the sum of blocks, and half of its 95 % interval.
-
-    Args:
-        blocks: Sums of blocks that are taken for independent, shape (count, ...).
-        statistic: Function of such sums.
-    """
+def _jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
+    """Compute a statistic of the sum of independent blocks, and half of its 95 % interval."""
     total, count = blocks.sum(axis=0), len(blocks)
     without = np.array([statistic(total - block) for block in blocks])
     return statistic(total), margin_of_error((count - 1.0) * without)
@@ -139,17 +134,13 @@ class FixDifferences(NamedTuple):
             beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
             return float(self.times[i] + beside * (self.times[1] - self.times[0]))
 
-        return jackknife(np.array(self.blocks), find_minimum)
+        return _jackknife(np.array(self.blocks), find_minimum)
 
-    def estimate_noise(self, late: float) -> tuple[float, float]:
-        """Estimate the fixes' standard deviation, and half of its 95 % interval.
-
-        Args:
-            late: Latency (s).
-        """
+    def _estimate_noise(self, late: float) -> tuple[float, float]:
+        """Estimate the fixes' standard deviation at a latency, and half of its 95 % interval."""
         at = int(np.argmin(np.abs(self.times - late)))
         blocks = np.array(self.blocks)  # a difference has twice the variance
-        return jackknife(blocks, lambda sums: math.sqrt(0.5 * _compute_remainder(sums, None)[at]))
+        return _jackknife(blocks, lambda sums: math.sqrt(0.5 * _compute_remainder(sums, None)[at]))
 
 
 def _compute_remainder(sums: Array, share: float | None) -> Array:
@@ -179,7 +170,7 @@ def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
         blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
     # each block: sum of squares and count
-    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
+    return _jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
 
 
 def make_sensor_findings(
@@ -218,7 +209,7 @@ def make_sensor_findings(
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
         if fixes.blocks:
-            noise[NOISES[name]], half = fixes.estimate_noise(late)
+            noise[NOISES[name]], half = fixes._estimate_noise(late)
             sd = scale * noise[NOISES[name]]
             findings.append(Finding(f"noise of {name}", math.nan, sd, scale * half, unit, True))
     return findings, noise, {"gps": late} if pays else {}

@@ -3,11 +3,10 @@
 A drive with truth and without a slow sensor gets a GPS course made of the truth and the gyro.
 """
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,15 @@ import numpy as np
 
 from ... import __version__
 from ...envs.record import FAST, Array, Log
-from ...envs.recordings.log_file import make_packet_rows, read_parts
+from ...envs.recordings.log_file import make_packets, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.sensors.link import SlowSensor
-from ...envs.sensors.slow import COURSE_SPEED
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.design.models import MEASUREMENTS
 from ...estimators.make import make_estimator
-from ...estimators.wires import SignalCalibration, apply_wires
+from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_honesty
@@ -88,7 +86,7 @@ def _emulate_course(log: Log, settings: Settings, seed: int) -> Log:
     """Add a GPS that measures the course alone to a log with truth.
 
     course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
-    ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
+    ticks that are whole periods, none where the truth is unknown.
     """
     record, motion, beta = log.record, LoggedMotion(log), log.truth["beta"]
     if settings.course_rate * record.dt > 1.0 + 1e-6:
@@ -100,16 +98,14 @@ def _emulate_course(log: Log, settings: Settings, seed: int) -> Log:
     captured = np.arange(-record.first % rows, len(beta), rows)
     noise = np.random.default_rng(seed).standard_normal(len(captured))
     exact = (beta + motion.heading)[captured] + math.radians(settings.bias_deg)
-    course = exact + math.radians(settings.course_noise_deg) * noise
-    sent = np.isfinite(course) & (captured + late < len(beta))
-    ticks = (record.first + captured[sent]).astype(np.float64)
-    values = np.full((len(ticks), 4), np.nan)
-    values[:, 0] = np.arctan2(np.sin(course[sent]), np.cos(course[sent]))
-    quality = (motion.speed[captured][sent] >= COURSE_SPEED).astype(np.float64)
-    packets = make_packet_rows("gps", ticks, ticks + late, values, quality)
+    course = np.full(len(beta), np.nan)
+    course[captured] = exact + math.radians(settings.course_noise_deg) * noise
+    course[max(len(beta) - late, 0) :] = np.nan  # these would arrive after the end
+    values = {"time": log.time, "speed_x": motion.speed, "course": course}
+    values["gps_latency"] = np.full(len(beta), late * record.dt)
+    packets, _ = make_packets(values, record.first, record.dt)
     gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
-    record = dataclasses.replace(record, packets=packets)
-    return dataclasses.replace(log, record=record, slow={"gps": gps})
+    return replace(log, record=replace(record, packets=packets), slow={"gps": gps})
 
 
 def _make_drives(log: Log, settings: Settings) -> list[Log]:
@@ -122,9 +118,7 @@ def _make_drives(log: Log, settings: Settings) -> list[Log]:
     if settings.emulated and "beta" in log.truth and not log.slow:
         drives = [_emulate_course(log, settings, settings.seed + i) for i in range(settings.seeds)]
     fast[:, FAST.gyro] += math.radians(settings.gyro_bias_degps)
-    records = [dataclasses.replace(drive.record, fast=fast) for drive in drives]
-    pairs = zip(drives, records, strict=True)
-    return [dataclasses.replace(drive, record=record) for drive, record in pairs]
+    return [replace(drive, record=replace(drive.record, fast=fast)) for drive in drives]
 
 
 @dataclass
@@ -196,14 +190,14 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
         numbers = []
         for drive in drives:
             estimates = estimator.run(drive)
-            place = estimates.names.index("beta")
-            result.traces.setdefault(name, estimates.x[:, place])
+            result.traces.setdefault(name, estimates["beta"])
             if slow is not None and np.isfinite(estimates.nis).any():
                 values = len(MEASUREMENTS[slow].rows)  # of a packet, each of which adds 1
                 result.nis.setdefault(name, float(np.nanmean(estimates.nis)) / values)
             if truth is not None:
-                wrong = (estimates.x[:, place] - truth)[counts]
-                honesty = compute_honesty(wrong, estimates.std[counts, place])
+                wrong = (estimates["beta"] - truth)[counts]
+                deviation = estimates.std[counts, estimates.names.index("beta")]
+                honesty = compute_honesty(wrong, deviation)
                 numbers.append((np.mean(wrong**2), *honesty))
         if truth is not None:
             result.scores[name] = np.array(numbers)
@@ -255,15 +249,10 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 
 def replay_file(
-    log: str | Path,
-    vehicle: VehicleSource = "passenger-car",
-    *,
-    mapping: Sequence[str] | None = None,
-    wires: SignalCalibration | None = None,
-    nominal: VehicleSource = "passenger-car",
-    until: float | None = None,
-    **settings: Any,
-) -> Suite:
+    log: str | Path, vehicle: VehicleSource = "passenger-car", *,
+    mapping: Sequence[str] | None = None, wires: SignalCalibration = AS_LOGGED,
+    nominal: VehicleSource = "passenger-car", until: float | None = None, **settings: Any,
+) -> Suite:  # fmt: skip
     """Read a drive and replay it, each part of a log with holes by itself.
 
     Args:
@@ -280,14 +269,14 @@ def replay_file(
         raise ValueError(f"{log}: a receiver's log (NMEA); replay_nmea reads it")
     if vehicle != "identify" and (until is not None or nominal != "passenger-car"):
         raise ValueError("--until and --nominal are for --vehicle identify")
-    wires, tables, unknown = wires or SignalCalibration(), [], ""
+    tables, unknown = list[ResultTable](), ""
     if vehicle == "identify":
-        result, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
+        result, shown = identify_file(log, nominal, mapping, wires, "linear", until)
         vehicle, tables, unknown = result.car, shown.tables, result.reason
         latency = {**result.wires.latency, **wires.latency}
         wires = result.wires._replace(latency=latency, noise={**result.wires.noise, **wires.noise})
     car = make_vehicle(vehicle)
-    logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
+    logs, remarks = read_parts(log, parse_mapping(mapping), start=until or 0.0)
     logs = [apply_wires(part, wires) for part in logs]
     present = {name for part in logs for name in part.slow}
     settings = {"noise": wires.noise} | settings | {"emulated": not present}
@@ -378,7 +367,7 @@ def _add_rows(
     suite: Suite, result: ReplayResult, scenario: str, car: Vehicle, how: Settings
 ) -> Any:
     """Add rows of every number of a result, and return the records, best first."""
-    plain = dataclasses.asdict(how) | {"estimators": list(how.estimators or ESTIMATORS)}
+    plain = asdict(how) | {"estimators": list(how.estimators or ESTIMATORS)}
     del plain["figures"], plain["emulated"]  # these move no number
     spec = json.dumps({"vehicle": car.to_dict(), "settings": plain})
     records = {}
@@ -436,8 +425,5 @@ def _draw_figures(suite: Suite, result: ReplayResult, log: Log) -> None:
 
 def _select_traces(figure: Any, result: ReplayResult) -> Any:
     """The figure with only truth, gyro-only and the best estimator in sight."""
-    best = next(iter(result.rmse), "exact-kf")
-    for trace in figure.data:
-        if trace.name in result.traces and trace.name not in (GYRO_ONLY, best):
-            trace.visible = "legendonly"
-    return figure
+    hidden = result.traces.keys() - {GYRO_ONLY, next(iter(result.rmse), "exact-kf")}
+    return figure.update_traces({"visible": "legendonly"}, lambda trace: trace.name in hidden)

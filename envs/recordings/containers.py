@@ -36,7 +36,6 @@ _TRACES = {  # reader of python-can, by what its files begin with
 _BAG = re.compile(rb"\x89MCAP|SQLite format 3")
 _LONGEST_STEP_BACK = 0.25  # s, by which frames of a bus may come out of order
 _LONGEST_LATENCY = 5.0  # s; beyond it a bag's log has another clock than its headers
-DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
 _NO_VALUE = re.compile(
     r"(?<!no[ _-])(?<![a-z])(sna|n/?a|err(or)?|fault|init)(?![a-z])|(un|not[ _-]?)avail|"
     r"invalid|not.?valid",
@@ -89,7 +88,7 @@ def _join_channels(
 
 
 def read_table(
-    source: "LogSource", is_wanted: Callable[[str], bool], mapping: Mapping[str, str]
+    source: "LogSource", is_wanted: Callable[[str], bool], mapping: Mapping[str, str], dbc: str
 ) -> LogTable:
     """Read a log's columns, a file's kind recognised by its beginning.
 
@@ -99,7 +98,8 @@ def read_table(
     Args:
         source: Path of a file or of a ROS 2 bag's folder, or the table itself.
         is_wanted: Whether a column's name is looked for.
-        mapping: Our column names to the file's; under `DBC` the description of CAN frames.
+        mapping: Our column names to the file's.
+        dbc: Path of the description of CAN frames, "" for none.
     """
     if not isinstance(source, str | Path):
         return _make_table(source)
@@ -118,9 +118,9 @@ def read_table(
             raise ValueError("the file is empty")
     try:
         if head.startswith(b"MDF "):
-            return _read_mdf(path, is_wanted, mapping.get(DBC, ""))
+            return _read_mdf(path, is_wanted, dbc)
         if reader := next((name for name, text in _TRACES.items() if re.match(text, head)), ""):
-            return _read_can(path, reader, is_wanted, mapping.get(DBC, ""))
+            return _read_can(path, reader, is_wanted, dbc)
         if is_folder or _BAG.match(head):
             return _read_bag(path, mapping)
         if head.startswith(b"PAR1"):
@@ -329,7 +329,6 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
         import mcap_ros2.decoder  # noqa: F401
         from rosbags.rosbag2 import Reader
 
-    mapping = {name: label for name, label in mapping.items() if name != DBC}
     channels = {label: _Channel() for label in mapping.values()}
     fields: dict[str, list[str]] = {}
     for label in channels:

@@ -142,6 +142,8 @@ def _split_line(line: str, separator: str) -> list[str]:
 
 
 Mask = npt.NDArray[np.bool_]
+Quantities = dict[str, Array]
+"""Quantities of a log by name, in SI units, angles in rad, shape (n,) each; NaN where unknown."""
 SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sample is
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
@@ -159,7 +161,7 @@ _MIN_INTERVALS = 5  # between samples, from which their period is found
 
 
 def find_samples(
-    values: dict[str, Array], needed: Collection[str], kinds: Mapping[str, str], is_strict: bool
+    values: Quantities, needed: Collection[str], kinds: Mapping[str, str], is_strict: bool
 ) -> list[str]:
     """Reduce a table to its samples, in the rows of the fastest needed quantity, in place.
 
@@ -170,7 +172,7 @@ def find_samples(
     between the rows moves to the next: no estimator may have it before it was captured.
 
     Args:
-        values: Quantities by name, (n,) each, angles in rad; NaN where unknown.
+        values: Quantities of the log.
         needed: The quantities without which there is no drive.
         kinds: Of `KINDS`, by slow quantity, as far as they are known; others are recognised.
         is_strict: Whether shuffled rows stay as they are.
@@ -179,7 +181,7 @@ def find_samples(
     return remarks + _align_clocks(values, needed)
 
 
-def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
+def _sort_rows(values: Quantities, needed: Collection[str], is_strict: bool) -> list[str]:
     time = values["time"]
     n_back = int((np.diff(time) < 0.0).sum())
     is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
@@ -200,7 +202,7 @@ def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: boo
     return [f"Time steps back in {n_back} of {len(time)} rows: they were sorted by it."]
 
 
-def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[str]:
+def _keep_samples(values: Quantities, kinds: Mapping[str, str]) -> list[str]:
     remarks = []
     for first, *others in SENSORS.values():
         if first not in values or kinds.get(first) == "fresh":
@@ -264,7 +266,7 @@ def _find_period(lengths: Array) -> float:
     return period if typical > 1.0 and is_rare else 0.0
 
 
-def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str]:
+def _align_clocks(values: Quantities, needed: Collection[str]) -> list[str]:
     elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
     known = {name: np.isfinite(column) for name, column in values.items() if name != "time"}
     base = max(known.keys() & needed, key=lambda name: (known[name].sum(), name))

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from ..numerics.functions import TICK
 from ..record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Fast, Log, Record
 from ..sensors.link import SlowSensor
 from ..sensors.slow import COURSE_SPEED, SLOW_NAMES
-from .dialect import LATENCIES, LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
+from .dialect import LATENCIES, LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH, Quantities
 from .tables import name_log, read_quantities
 
 if TYPE_CHECKING:
@@ -32,20 +33,15 @@ _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
-def _make_log(
-    values: dict[str, Array], name: str, dt: float | None = None, origin: float | None = None
-) -> Log:
-    """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s).
+def _make_log(values: Quantities, name: str, dt: float | None = None, origin: float = 0.0) -> Log:
+    """Make the log of quantities; dt None finds the clock's step (s).
 
-    Its first tick is that of the first row, by the time from `origin` (s) on; None: from 0, or from
-    a first row below it, for no tick is negative. A logged input (steering, torque, command) acts
-    from its row to the next, so it stands one row later in the record; rows slower than 100 Hz take
-    the mean of both rows' steering.
+    Its first tick is that of the first row, by the time from `origin` (s) on. A logged input
+    (steering, torque, command) acts from its row to the next, so it stands one row later in the
+    record; rows slower than 100 Hz take the mean of both rows' steering.
     """
     dt = find_step(values["time"]) if dt is None else dt
-    start = float(values["time"][0])
-    origin = min(start, 0.0) if origin is None else origin
-    first = round((start - origin) / dt)
+    first = round((float(values["time"][0]) - origin) / dt)
     fast, present = make_fast_rows(values)
     packets, slow = make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
@@ -54,28 +50,6 @@ def _make_log(
         both = " and ".join(SENSORS["camera"])
         raise ValueError(f"no row has both {both}: a camera's sample is of both")
     return Log(record, slow, _compute_truth(values), name, origin)
-
-
-def make_packet_rows(
-    sensor: str, captured: Array, arrived: Array, values: Array, quality: Array
-) -> Array:
-    """Make the packets of one sensor in capture order, shape (count, PACKET_WIDTH).
-
-    Args:
-        sensor: Name of the sensor, "camera" or "gps".
-        captured: Ticks of capture, shape (count,).
-        arrived: Ticks of arrival, shape (count,).
-        values: Values in SI units, shape (count, up to VALUES).
-        quality: Quality, shape (count,).
-    """
-    packets = np.zeros((len(captured), PACKET_WIDTH))
-    packets[:, PACKET.sensor] = SLOW_NAMES.index(sensor)
-    packets[:, PACKET.captured] = captured
-    packets[:, PACKET.arrived] = arrived
-    packets[:, PACKET.quality] = quality
-    packets[:, PACKET.sequence] = np.arange(len(captured))
-    packets[:, PACKET.value : PACKET.value + values.shape[1]] = values
-    return packets
 
 
 def find_step(time: Array) -> float:
@@ -106,11 +80,11 @@ def find_step(time: Array) -> float:
     return dt
 
 
-def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
+def make_fast_rows(values: Quantities) -> tuple[Array, tuple[str, ...]]:
     """Make the fast rows, shape (n, FAST_WIDTH), and the names of those that carry something.
 
     Args:
-        values: Quantities in SI units, shape (n,) each.
+        values: Quantities of the log.
     """
     fast, present = np.zeros((len(values["time"]), FAST_WIDTH)), set()
     if not {"wheel_left", "wheel_right"} <= values.keys():
@@ -130,17 +104,15 @@ def make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     return fast, tuple(name for name in Fast._fields if name in present)
 
 
-def make_packets(
-    values: dict[str, Array], first: int, dt: float
-) -> tuple[Array, dict[str, SlowSensor]]:
+def make_packets(values: Quantities, first: int, dt: float) -> tuple[Array, dict[str, SlowSensor]]:
     """Make the packets, shape (count, PACKET_WIDTH), and slow sensors by name.
 
     Args:
-        values: Quantities in SI units, shape (n,) each; NaN where a slow sensor has no sample.
+        values: Quantities of the log.
         first: Tick of the first row.
         dt: Tick (s).
     """
-    packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
+    parts, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     absent = np.full(len(values["time"]), np.nan)
     for sensor, names in SENSORS.items():
         known = np.flatnonzero(np.isfinite(values.get(names[0], absent)))
@@ -148,23 +120,29 @@ def make_packets(
             known = known[np.isfinite(values.get(names[1], absent)[known])]
         if not len(known):
             continue
-        ticks = (first + known).astype(np.float64)
-        columns = np.stack([values.get(name, absent)[known] for name in names], axis=1)
-        quality = np.ones(len(known))
-        if sensor == "gps":
-            columns[:, 0] = np.arctan2(np.sin(columns[:, 0]), np.cos(columns[:, 0]))
-            quality[values["speed_x"][known] < COURSE_SPEED] = 0.0
         late = np.nan_to_num(values.get(LATENCIES[sensor], absent)[known]) / dt
         late = np.maximum(np.ceil(late - _STILL), 0.0)  # no estimator has it before it came
-        packets.append(make_packet_rows(sensor, ticks, ticks + late, columns, quality))
+        packets = np.zeros((len(known), PACKET_WIDTH))
+        packets[:, PACKET.sensor] = SLOW_NAMES.index(sensor)
+        packets[:, PACKET.captured] = first + known
+        packets[:, PACKET.arrived] = packets[:, PACKET.captured] + late
+        packets[:, PACKET.quality] = 1.0
+        packets[:, PACKET.sequence] = np.arange(len(known))
+        for place, name in enumerate(names, PACKET.value):
+            packets[:, place] = values.get(name, absent)[known]
+        if sensor == "gps":
+            course = packets[:, PACKET.value]
+            packets[:, PACKET.value] = np.arctan2(np.sin(course), np.cos(course))
+            packets[values["speed_x"][known] < COURSE_SPEED, PACKET.quality] = 0.0
+        parts.append(packets)
         n = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
         phase, delays = (first + int(known[0])) % n * dt, (float(late.min()) * dt,)
         clocks[sensor] = SlowSensor(n * dt, delays, phase, jitter=float(np.ptp(late)) * dt)
-    rows = np.concatenate(packets)
+    rows = np.concatenate(parts)
     return rows[np.lexsort((rows[:, PACKET.sensor], rows[:, PACKET.arrived]))], clocks
 
 
-def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
+def _compute_truth(values: Quantities) -> dict[str, Array]:
     """Compute the sideslip angle (rad) where the log knows it; 0 at a standstill."""
     if not TRUTH & values.keys():
         return {}
@@ -181,11 +159,9 @@ _SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
 
 def read_parts(
-    source: "LogSource",
-    mapping: Mapping[str, str] | None = None,
-    start: float = 0.0,
+    source: "LogSource", mapping: Mapping[str, str] | None = None, start: float = 0.0,
     end: float | None = None,
-) -> tuple[list[Log], list[str]]:
+) -> tuple[list[Log], list[str]]:  # fmt: skip
     """Read whole drives of a table, and sentences on what was done (needs the extra `report`).
 
     Without both wheel speeds both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN
@@ -243,7 +219,7 @@ def read_parts(
     return logs, remarks
 
 
-def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tuple[int, str]]]:
+def _split_pieces(values: Quantities) -> tuple[list[Quantities], list[tuple[int, str]]]:
     """Split the log into whole drives on even clocks; list (count, text) of what was done."""
     time, pieces, short, dropped, holes = values["time"], [], 0, 0, 0
     steps = np.diff(time)
@@ -276,19 +252,15 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     ]
 
 
-def _resample_evenly(
-    values: dict[str, Array], dt: float, tolerance: float = math.inf
-) -> dict[str, Array]:
+def _resample_evenly(values: Quantities, dt: float, tolerance: float = math.inf) -> Quantities:
     """Resample the quantities to an even clock: interpolated, slow samples in the nearest row.
 
     A clock that is even already, its step within the tolerance (a fraction) of dt, stays.
     """
     time = values["time"]
-    try:
+    with suppress(ValueError):
         if abs(find_step(time) / dt - 1.0) <= tolerance:
             return values
-    except ValueError:
-        pass
     even = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / dt) + 1)
     resampled = {name: np.interp(even, time, column) for name, column in values.items()}
     for name in SLOW_QUANTITIES & values.keys():

@@ -14,12 +14,13 @@ from ..io import read_document
 from ..record import Array
 from ..validation import join_names, short_repr
 from ..vehicle.parameters import GRAVITY
-from .containers import DBC, LogTable, read_table
-from .dialect import KINDS, LATENCIES, find_samples, find_unit
+from .containers import LogTable, read_table
+from .dialect import KINDS, LATENCIES, Quantities, find_samples, find_unit
 
 if TYPE_CHECKING:
     from .containers import LogSource
 
+DBC = "dbc"  # name in a mapping of the file that describes a CAN trace
 _LARGEST = 1e15  # in SI units
 _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
@@ -72,7 +73,7 @@ def parse_column_name(name: str) -> tuple[str, float, float]:
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
 
-def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
+def parse_mapping(texts: Sequence[str] | None) -> dict[str, str]:
     """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
 
     Raises FileNotFoundError for a TOML file that does not exist, and ValueError for a text of
@@ -82,7 +83,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
         texts: NAME=COLUMN, dbc=FILE that describes a CAN trace, and TOML files, a DBC beside them.
     """
     mapping: dict[str, str] = {}
-    for text in texts:
+    for text in texts or ():
         name, _, column = (part.strip() for part in text.partition("="))
         if text.endswith(".toml") and not column:
             entries = read_document(Path(text), "mapping")
@@ -104,7 +105,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 def read_columns(
     source: "LogSource", mapping: Mapping[str, str], needed: Sequence[str]
-) -> tuple[dict[str, Array], dict[str, str], list[str]]:
+) -> tuple[Quantities, dict[str, str], list[str]]:
     """Read a log's known columns in SI units as they stand: rows unsorted, NaN where empty.
 
     An empty column counts as absent. Raises ValueError for a missing column, one given twice, a
@@ -117,13 +118,14 @@ def read_columns(
         needed: Quantities that must be present.
 
     Returns:
-        Quantities by name, shape (n,) each, kinds of samples that names tell, and remarks.
+        Quantities, kinds of samples that names tell, and remarks.
     """
     mapped = {name: column for name, column in mapping.items() if name != DBC}
     wanted = {*COLUMNS, *map(str.casefold, mapped.values())}
     table = read_table(
-        source, lambda name: name.casefold() in wanted or bool(_match_column(name, "")), mapping
-    )
+        source, lambda name: name.casefold() in wanted or bool(_match_column(name, "")), mapped,
+        mapping.get(DBC, ""),
+    )  # fmt: skip
     remarks = [*table.remarks]
     columns = _find_columns(table, mapped, remarks)
     if missing := [_make_column_name(name) for name in needed if name not in columns]:
@@ -143,12 +145,10 @@ def read_columns(
 
 
 def read_quantities(
-    source: "LogSource",
-    mapping: Mapping[str, str],
-    needed: Sequence[str],
+    source: "LogSource", mapping: Mapping[str, str], needed: Sequence[str],
     gaps: Collection[str] | None,
-) -> tuple[dict[str, Array], list[str]]:
-    """Read a log's quantities in SI units by name, shape (n,), and sentences on how they were read.
+) -> tuple[Quantities, list[str]]:  # fmt: skip
+    """Read a log's quantities, and sentences on how they were read.
 
     Rows in messages count from 1 below the header. Raises the errors of `read_columns`, and
     ValueError for NaN in a quantity without gaps.
@@ -175,7 +175,7 @@ def name_log(source: "LogSource") -> str:
     return str(source) if isinstance(source, str | Path) else "the frame"
 
 
-def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
+def _check_complete(values: Quantities, quantities: Sequence[str]) -> None:
     for quantity in quantities:
         if (unknown := np.isnan(values[quantity])).any():
             name, row = _make_column_name(quantity), int(np.argmax(unknown)) + 1
@@ -204,18 +204,17 @@ def _find_columns(
         if quantity in quantities:
             raise ValueError(f"{quantity} is mapped twice")
         quantities.add(quantity)
-    best: dict[str, tuple[int, list[tuple[int, str]]]] = {}
+    candidates: dict[str, list[tuple[int, int, str]]] = {}  # level, place and name by quantity
     for place, (label, unit) in enumerate(zip(names, table.units, strict=True)):
-        match = _match_column(label, unit)
-        options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
-        for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = _NAMES[name][0] if name else ""
-            if name and level < best.get(quantity, (3,))[0]:
-                best[quantity] = level, [(place, name)]
-            elif name and level == best[quantity][0]:
-                best[quantity][1].append((place, name))
+        options = [(0, name) for name, c in mapping.items() if c.casefold() == label.casefold()]
+        if match := _match_column(label, unit):
+            options.append((1 if match == label.casefold() else 2, match))
+        for level, name in options:
+            candidates.setdefault(_NAMES[name][0], []).append((level, place, name))
     columns = {}
-    for quantity, (level, ((place, name), *others)) in best.items():
+    for quantity, matches in candidates.items():
+        level = min(matches)[0]
+        (_, place, name), *others = [x for x in matches if x[0] == level]
         label, unit = names[place], table.units[place]
         name_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
         if unit not in ("", "count", name_unit):
@@ -223,7 +222,7 @@ def _find_columns(
                 rule = f"--map {quantity}_{unit}={label} or --map {name}={label} says which it is"
                 raise ValueError(f"{label} has the unit {unit} in the file; {rule}")
             remarks.append(f"{label} is read as {name}, though its unit in the file is {unit}.")
-        for other, alias in others:
+        for _, other, alias in others:
             if alias != name:
                 raise ValueError(f"{quantity} is given twice, as {name} and {alias}")
             if not table.frame.iloc[:, place].equals(table.frame.iloc[:, other]):
@@ -243,15 +242,12 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
     import pandas as pd
 
     column, label = table.frame.iloc[:, place], str(table.frame.columns[place])
-    for kind in ("datetime64_any", "timedelta64", "bool"):
-        if getattr(pd.api.types, f"is_{kind}_dtype")(column.dtype):
-            raise ValueError(f"column {label!r} holds {column.dtype}; expected numbers")
-    numbers = column
-    if not pd.api.types.is_numeric_dtype(column.dtype):
-        try:
-            numbers = pd.to_numeric(column, errors="coerce")
-        except OverflowError as error:
-            raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
+    if column.dtype.kind in "Mmb":  # times, durations, truth values
+        raise ValueError(f"column {label!r} holds {column.dtype}; expected numbers")
+    try:
+        numbers = pd.to_numeric(column, errors="coerce")
+    except OverflowError as error:
+        raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
     quantity, factor, offset = parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:

@@ -27,7 +27,7 @@ from sideslip.benchmarks.recorded.replay import TRUTH_WARNING, replay_file
 from sideslip.benchmarks.report.html import write_report
 from sideslip.benchmarks.report.tables import print_suite
 from sideslip.envs.record import FAST, PACKET, Array, Log
-from sideslip.envs.recordings.log_file import make_packet_rows
+from sideslip.envs.recordings.log_file import make_packets
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 
 from .simulated import decimated
@@ -103,10 +103,10 @@ def times(factor: float) -> Change:
 def filled(log: Log, value: float) -> Log:
     """A course of one value between its fixes."""
     fixes = log.record.packets
-    courses = np.full((len(log.time), 1), value)
-    courses[(fixes[:, PACKET.captured] - log.record.first).astype(int), 0] = fixes[:, PACKET.value]
-    ticks = log.record.ticks.astype(np.float64)
-    packets = make_packet_rows("gps", ticks, ticks, courses, np.ones(len(courses)))
+    courses = np.full(len(log.time), value)
+    courses[(fixes[:, PACKET.captured] - log.record.first).astype(int)] = fixes[:, PACKET.value]
+    values = {"time": log.time, "speed_x": LoggedMotion(log).speed, "course": courses}
+    packets, _ = make_packets(values, log.record.first, log.record.dt)
     return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
 
 

@@ -18,13 +18,13 @@ from sideslip.benchmarks.recorded.identify import (
     _split_blocks,
     identify,
 )
-from sideslip.benchmarks.recorded.motion import Finding, _estimate_white_noise, jackknife
+from sideslip.benchmarks.recorded.motion import Finding, _estimate_white_noise, _jackknife
 from sideslip.benchmarks.recorded.quality import find_contradictions, find_saturated, find_swapped
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies.logs import STUDY
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR
-from sideslip.estimators.wires import SignalCalibration, move_course
+from sideslip.estimators.wires import AS_LOGGED, SignalCalibration, move_course
 
 from .drawn_cars import drawn_car
 from .simulated import as_table, drive
@@ -92,7 +92,7 @@ def test_the_fit_is_exact_on_the_plant_itself() -> None:
 def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
     values = np.random.default_rng(0).normal(size=50)
     blocks = np.stack([values, np.ones(50)], axis=1)
-    value, half = jackknife(blocks, lambda sums: float(sums[0] / sums[1]))
+    value, half = _jackknife(blocks, lambda sums: float(sums[0] / sums[1]))
     assert value == pytest.approx(values.mean())
     assert half == pytest.approx(2.0096 * values.std(ddof=1) / math.sqrt(50), rel=1e-4)
 
@@ -216,14 +216,14 @@ def test_a_found_car_stays_within_the_corridors_and_a_wrong_one_does_not() -> No
     odd, even = _split_blocks([log])
     rows = sum(len(block.time) for block in (*odd, *even))
     assert rows == len(log.time) and odd[0].time[-1] < even[0].time[0]
-    found = _make_validation_table([log], PASSENGER_CAR, None, None)
+    found = _make_validation_table([log], PASSENGER_CAR, AS_LOGGED, None)
     assert "assumptions" in found.note and len(found.cells) == 2
     assert [cell[-1] for cell in found.cells] == ["yes", "yes"]
     for block in even:  # another car drives them: it turns 1.3 times as much
         start = block.record.first - log.record.first
         part = slice(start, start + len(block.time))
         log.record.fast[part, [FAST.gyro, FAST.accel_y]] *= 1.3
-    other = _make_validation_table([log], PASSENGER_CAR, None, None)
+    other = _make_validation_table([log], PASSENGER_CAR, AS_LOGGED, None)
     assert [cell[-1] for cell in other.cells] == ["no", "no"]
 
 
@@ -244,5 +244,5 @@ def test_an_antenna_ahead_is_moved_before_the_car_is_sought() -> None:
 
 def test_a_log_without_excitation_is_not_validated() -> None:
     log, _ = drive(1)
-    table = _make_validation_table([_split_blocks([log])[0][0]], PASSENGER_CAR, None, None)
+    table = _make_validation_table([_split_blocks([log])[0][0]], PASSENGER_CAR, AS_LOGGED, None)
     assert not table.cells and table.note.startswith("Not validated")
