@@ -105,7 +105,7 @@ def write_output(
     Args:
         console: Console that prints.
         suites: Results to print and write.
-        options: With files of the report (html) and the rows (json, parquet), None for none.
+        options: With files of the report (html) and, perhaps, the rows (json, parquet); None: none.
         brief: Whether verdicts and a table are printed instead of all tables.
     """
     html = options["html"]
@@ -114,8 +114,8 @@ def write_output(
     for suite in () if brief else suites:
         print_suite(console, suite)
     rows = [row for suite in suites for row in suite.rows]
-    for path, write in ((options["json"], write_json), (options["parquet"], write_parquet)):
-        if path is not None:
+    for kind, write in (("json", write_json), ("parquet", write_parquet)):
+        if (path := options.get(kind)) is not None:
             write(path, rows)
             print_written(console, path)
     if html is not None:

@@ -112,22 +112,15 @@ class _Replay:
         if self.plot or self.kml:
             raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
         wires = _read_wires(self, self.latency)
+        options = _parse_estimator_options(self.estimator_option)
         with use_shared_bar(console, f"replay {log}"):
             suite = replay_file(
-                *(log, self.vehicle),
-                mapping=self.mapping,
-                wires=wires,
-                nominal=self.nominal,
-                until=self.until,
-                estimators=self.estimator,
-                options=_parse_estimator_options(self.estimator_option),
-                course_rate=self.course_rate,
-                course_noise_deg=self.course_noise,
-                delay=self.course_delay,
-                bias_deg=self.course_bias,
-                gyro_bias_degps=self.gyro_bias,
+                log, self.vehicle, mapping=self.mapping, wires=wires, nominal=self.nominal,
+                until=self.until, estimators=self.estimator, options=options,
+                course_rate=self.course_rate, course_noise_deg=self.course_noise,
+                delay=self.course_delay, bias_deg=self.course_bias, gyro_bias_degps=self.gyro_bias,
                 figures=_has_figures(self.html),
-            )
+            )  # fmt: skip
         write_output(console, [suite], vars(self))
 
 
@@ -170,8 +163,8 @@ class _Identify:
 
         console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            known = self.log, self.vehicle, self.mapping or ()
-            result, suite = identify_file(*known, wires, self.tyres, self.until, self.validate)
+            log = self.log, self.vehicle, self.mapping, wires
+            result, suite = identify_file(*log, self.tyres, self.until, self.validate)
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)
@@ -201,9 +194,9 @@ class _Inspect:
 
         console, wires = Console(), _read_wires(self, self.latency)
         with use_shared_bar(console, f"inspect {self.log}"):
-            known = self.log, self.vehicle, self.mapping or ()
-            suite = inspect_file(*known, wires, figures=_has_figures(self.html))
-        write_output(console, [suite], {"html": self.html, "json": None, "parquet": None})
+            log = self.log, self.vehicle, self.mapping, wires
+            suite = inspect_file(*log, figures=_has_figures(self.html))
+        write_output(console, [suite], vars(self))
         if suite.verdict.startswith("Do not"):
             raise Exit(1)
 

@@ -5,13 +5,12 @@ the filter `joint` allows for, or what an ordinary car of world v1 shows.
 """
 
 import copy
-import dataclasses
 import functools
 import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from ...envs.recordings.dialect import SENSORS, SLOW_QUANTITIES, TRUTH, find_sam
 from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
-from ...estimators.wires import SignalCalibration, apply_wires
+from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from . import quality
 from .motion import COURSE, MIN_SPEED, FixDifferences, LoggedMotion, estimate_slips
 from .quality import BLOCKER, FACTOR, MIN_TURNING, OK, WARNING, LogFinding
@@ -34,9 +33,9 @@ _LATE = 0.12  # s: receivers' stamps err by 0.05 s, rows and other tyres by as m
 _DRIFT = 0.1  # s from half to half, of which the same errors have no part
 _TIMES = np.arange(-0.5, 1.0, 0.01)  # s, at which a late course is looked for
 _STUCK, _MOVES = 1.0, 1.0  # s without change, in which others say m/s2, or m/s, of a change
-_RESOLUTION = {  # SI, noise that filters assume at least; even steps have sqrt(12) as much
-    "yaw_rate": 0.002, "accel_y": 0.1, "steer": 0.002, "course": _ALLOWED["course_noise"],
-    "speed_x": 0.3,
+_RESOLUTION = {  # SI, noise that filters assume at least, and the unit that people read
+    "yaw_rate": (0.002, "deg/s"), "accel_y": (0.1, "m/s2"), "steer": (0.002, "deg"),
+    "course": (_ALLOWED["course_noise"], "deg"), "speed_x": (0.3, "m/s"),
 }  # fmt: skip
 _SCALES = {  # ordinary: 1 % of a gyro and other tyres; 1.3 % and wear of a wheel; another roll
     "yaw_rate": 0.05, "speed_x": 0.04, "accel_y": 0.12,
@@ -47,11 +46,11 @@ _SCALES = {  # ordinary: 1 % of a gyro and other tyres; 1.3 % and wear of a whee
 class InspectedDrive:
     """A drive as checks see it; without logs where a needed channel is missing."""
 
-    values: Mapping[str, Array]  # columns in SI units as they stand in the file
+    values: dict[str, Array]  # columns in SI units as they stand in the file
     kinds: Mapping[str, str]  # kinds of samples that names of columns tell
     logs: Sequence[Log]  # calibrated parts
     car: Vehicle
-    wires: SignalCalibration = field(default_factory=SignalCalibration)  # of the parts
+    wires: SignalCalibration = AS_LOGGED  # of the parts
 
     @functools.cached_property
     def contradictions(self) -> list[LogFinding]:
@@ -64,24 +63,13 @@ class InspectedDrive:
             logs = [copy.deepcopy(log) for log in logs]
             for log in logs:
                 log.record.fast[:, [FAST.wheel_left, FAST.wheel_right]] /= ratio
-        findings = quality.find_contradictions(logs, self.car) if logs else []
+        findings = quality.find_contradictions(logs, self.car, self.wires) if logs else []
         late = self._find_lateness(logs) if any(map(_is_course, findings)) else 0.0
         if late:  # a late course does not follow the gyro, but later it does
             shifted = [apply_wires(log, SignalCalibration(latency={"gps": late})) for log in logs]
-            aligned = quality.find_contradictions(shifted, self.car)
+            aligned = quality.find_contradictions(shifted, self.car, self.wires)
             findings = findings if any(map(_is_course, aligned)) else aligned
-        return of_speed + list(map(self._compose_cure, findings))
-
-    def _compose_cure(self, finding: LogFinding) -> LogFinding:
-        """Put what is stated already into a cure of the steering: an option replaces it."""
-        if finding.channel != "steer" or finding.check not in ("sign", "ratio"):
-            return finding
-        cure = f"--steering-sign {-self.wires.sign}"
-        if finding.check == "ratio":
-            ratio = float(finding.cure.split()[1]) * self.wires.ratio
-            cure = f"--steering-ratio {ratio:.3g}"
-        text = finding.text.replace(finding.cure, cure)
-        return dataclasses.replace(finding, text=text, cure=cure)
+        return of_speed + findings
 
     def _find_lateness(self, logs: Sequence[Log]) -> float:
         """Latency of the course (s) by the gyro alone, 0 where none is better than the others."""
@@ -94,11 +82,10 @@ class InspectedDrive:
         """Moving parts with the model's sideslip for truth; none where columns contradict."""
         if any(finding.level == BLOCKER for finding in self.contradictions):
             return []
-        seconds = [LoggedMotion(log).is_moving.sum() * log.record.dt for log in self.logs]
-        parts = [log for log, x in zip(self.logs, seconds, strict=True) if x > 2.0]
-        slips = estimate_slips(parts, self.car, SignalCalibration()) if parts else []
+        parts = [x for x in self.logs if LoggedMotion(x).is_moving.sum() * x.record.dt > 2.0]
+        slips = estimate_slips(parts, self.car, AS_LOGGED) if parts else []
         pairs = zip(parts, slips, strict=True)
-        return [dataclasses.replace(log, truth={"beta": slip}) for log, slip in pairs]
+        return [replace(log, truth={"beta": slip}) for log, slip in pairs]
 
 
 def _judge(check: str, channel: str, is_wrong: bool, text: str, cure: str) -> LogFinding:
@@ -160,7 +147,7 @@ def _check_stamps(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_gaps(drive: InspectedDrive) -> Iterator[LogFinding]:
     time = drive.values["time"]
     speed = drive.values.get("speed_x", np.full(len(time), np.inf))
-    known_rows = np.where(np.isfinite(speed) | np.isinf(speed), np.arange(len(speed)), 0)
+    known_rows = np.where(~np.isnan(speed), np.arange(len(speed)), 0)
     speed = np.nan_to_num(speed[np.maximum.accumulate(known_rows)])  # that of the newest row
     clock, moving = time, np.broadcast_to(np.abs(speed) > _STANDING, time.shape)
     for name in ("time", *(name for name in drive.values if name != "time")):
@@ -217,9 +204,8 @@ def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
     if not drive.judged:
         return
     _, _, change, turned, slipped = quality.compute_course_steps(drive.judged, 1.0)
-    turning, accel, slipping = quality.smooth_columns(
-        drive.judged, "turning", "accel_y", "slipping"
-    )
+    names = ("turning", "accel_y", "slipping")
+    turning, accel, slipping = quality.smooth_columns(drive.judged, *names)
     roll = drive.car.roll_moment_arm  # N m a m/s2, by which the body leans into gravity
     leaning = 1.0 + GRAVITY * roll / (drive.car.roll_stiffness - GRAVITY * roll)
     scales = {
@@ -296,17 +282,15 @@ def _check_clocks(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 
 def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
-    for name, noise in _RESOLUTION.items():
+    for name, (noise, unit) in _RESOLUTION.items():
         column = drive.values.get(name, np.zeros(0))
         column = column[np.isfinite(column)] * (abs(drive.wires.gain) if name == "steer" else 1.0)
         if len(column):
-            step, is_angle = quality.estimate_resolution(column), name not in ("accel_y", "speed_x")
-            limit = math.sqrt(12.0) * noise
-            shown = (x * (_DEGREES if is_angle else 1.0) for x in (step, limit))
-            unit = {"yaw_rate": "deg/s", "accel_y": "m/s2", "speed_x": "m/s"}.get(name, "deg")
-            text = "steps of {:.2g} {unit}; {:.2g} would do".format(*shown, unit=unit)
-            cure = "log it finer, or unrounded"
-            yield _judge("resolution", name, step > limit, text, cure)
+            step = quality.estimate_resolution(column)
+            limit = math.sqrt(12.0) * noise  # steps whose rounding is noise of this size
+            scale = _DEGREES if unit.startswith("deg") else 1.0
+            text = f"steps of {scale * step:.2g} {unit}; {scale * limit:.2g} would do"
+            yield _judge("resolution", name, step > limit, text, "log it finer, or unrounded")
 
 
 def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:

@@ -1,6 +1,5 @@
 """`sideslip inspect`: whether a log is worth estimating from, on one page."""
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...envs.record import PACKET, Array, Log
-from ...envs.recordings.dialect import SLOW_QUANTITIES, find_sampling
+from ...envs.recordings.dialect import SLOW_QUANTITIES, Quantities, find_sampling
 from ...envs.recordings.log_file import NEEDED, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import COLUMNS, name_log, parse_mapping, read_columns
@@ -18,7 +17,7 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ...estimators.design.models import MEASUREMENTS
 from ...estimators.make import make_estimator
-from ...estimators.wires import SignalCalibration, apply_wires
+from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..report.tables import MAX_NIS, describe_innovations, format_verdict
@@ -34,8 +33,9 @@ if TYPE_CHECKING:
 FILTER = "joint"
 _DEGREES = 180.0 / math.pi
 _PLOTTED = ("speed_x", "yaw_rate", "accel_y", "steer", "course")
-_SHOWN_UNITS = {"rad": ("deg", _DEGREES), "radps": ("deg/s", _DEGREES), "mps": ("m/s", 1.0),
-                "mps2": ("m/s2", 1.0)}  # fmt: skip
+_READABLE = {"rad": ("deg", _DEGREES), "radps": ("deg/s", _DEGREES), "mps": ("m/s", 1.0),
+             "mps2": ("m/s2", 1.0)}  # fmt: skip
+_SHOWN_UNITS = {name: _READABLE.get(si, (si, 1.0)) for name, (si, *_) in COLUMNS.items()}
 _LABELS = {
     "bias": "gyro bias", "accel_bias": "accel_y bias", "steer_offset": "steering offset",
     "front_tyres": "front tyre stiffness", "rear_tyres": "rear tyre stiffness", "bank": "bank",
@@ -58,12 +58,9 @@ class Prediction(NamedTuple):
 
 
 def inspect_file(
-    source: "LogSource",
-    vehicle: VehicleSource,
-    mapping: Sequence[str] = (),
-    wires: SignalCalibration | None = None,
-    figures: bool = True,
-) -> Suite:
+    source: "LogSource", vehicle: VehicleSource, mapping: Sequence[str] | None = None,
+    wires: SignalCalibration = AS_LOGGED, figures: bool = True,
+) -> Suite:  # fmt: skip
     """Read a drive and judge whether it is worth estimating from.
 
     Args:
@@ -76,53 +73,45 @@ def inspect_file(
     if isinstance(source, str | Path) and is_nmea(source):
         text = "a receiver's log (NMEA) has no gyro and no steering; `sideslip replay` filters it"
         raise ValueError(f"{source}: {text}")
-    names, car = parse_mapping(mapping), make_vehicle(vehicle)
-    values, drive, remarks, findings = _read_drive(source, names, car, wires)
-    prediction = None
-    if drive is not None:
-        findings += [finding for check in CHECKS.values() for finding in check(drive)]
-        if drive.logs and not any(finding.level == BLOCKER for finding in findings):
-            try:
-                prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
-            except ValueError as error:
-                cure = "an even period of the course, or a shorter --latency"
-                findings.append(LogFinding("filter", BLOCKER, "", str(error), cure))
+    names, car, prediction = parse_mapping(mapping), make_vehicle(vehicle), None
+    drive, findings, remarks = _read_drive(source, names, car, wires)
+    if drive.logs and not any(finding.level == BLOCKER for finding in findings):
+        try:
+            prediction = _predict(max(drive.logs, key=lambda log: len(log.time)), car)
+        except ValueError as error:
+            cure = "an even period of the course, or a shorter --latency"
+            findings.append(LogFinding("filter", BLOCKER, "", str(error), cure))
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     suite = Suite("inspect", f"Is it worth estimating from? {name_log(source)}", " ".join(remarks))
     suite.verdict = _compose_verdict(findings, prediction, car)
-    suite.tables = [_make_channels(values), *_make_findings(findings)]
-    if figures and values:
-        drawn = _draw_figures(values, prediction)
+    suite.tables = [_make_channels(drive.values), *_make_findings(findings)]
+    if figures and drive.values:
+        drawn = _draw_figures(drive.values, prediction)
         suite.answers, suite.figures = drawn[:2], drawn[2:]
     return suite
 
 
 def _read_drive(
-    source: "LogSource", names: dict[str, str], car: Vehicle, wires: SignalCalibration | None = None
-) -> tuple[dict[str, Array], InspectedDrive | None, list[str], list[LogFinding]]:
-    """Columns, the drive as estimators get it, remarks; a file that is refused is a finding."""
-    wires, values, remarks = wires or SignalCalibration(), dict[str, Array](), list[str]()
+    source: "LogSource", names: dict[str, str], car: Vehicle, wires: SignalCalibration
+) -> tuple[InspectedDrive, list[LogFinding], list[str]]:
+    """The drive, what checks find, remarks; that a file is refused is the only finding then."""
+    drive, remarks = InspectedDrive({}, {}, [], car, wires), list[str]()
     try:
-        values, kinds, _ = read_columns(source, names, ("time",))
-        logs = list[Log]()
-        if set(NEEDED) <= values.keys():
+        drive.values, drive.kinds, _ = read_columns(source, names, ("time",))
+        if set(NEEDED) <= drive.values.keys():
             logs, remarks = read_parts(source, names)
-            logs = [apply_wires(log, wires) for log in logs]
-        drive = InspectedDrive(values, kinds, logs, car, wires)
-    except FileNotFoundError:
-        raise
+            drive.logs = [apply_wires(log, wires) for log in logs]
     except ValueError as error:
         text = str(error).removeprefix(f"{name_log(source)}: ")
-        return values, None, remarks, [LogFinding("reading", BLOCKER, "", text, "mend the file")]
-    return values, drive, remarks, []
+        return drive, [LogFinding("reading", BLOCKER, "", text, "mend the file")], remarks
+    return drive, [finding for check in CHECKS.values() for finding in check(drive)], remarks
 
 
 def _predict(log: Log, car: Vehicle) -> Prediction:
     facts = {"sensors": log.slow, "dt": log.record.dt, "present": log.record.present}
     filter_ = call_quietly(make_estimator, FILTER, vehicle=car, **facts)
     estimates = filter_.run(log)
-    place = estimates.names.index("beta")
-    deviation = estimates.std[:, place]
+    deviation = estimates.std[:, estimates.names.index("beta")]
     moving = LoggedMotion(log).is_moving & (log.time >= log.time[0] + SETTLED)
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
     used = np.isfinite(estimates.nis)
@@ -132,18 +121,17 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
     learnt = [label for label, i in known.items() if end[i] < _LEARNT * start[i]]
     values = np.mean([len(MEASUREMENTS[sensor].rows) for sensor in sensors] or math.nan)
     nis = float(np.mean(estimates.nis[used]) / values) if sensors else math.nan
-    beta = estimates.x[:, place]
-    return Prediction(log.time, beta, deviation, usual, nis, learnt, filter_.unobservable)
+    unseen = filter_.unobservable
+    return Prediction(log.time, estimates["beta"], deviation, usual, nis, learnt, unseen)
 
 
 def _compose_verdict(
     findings: Sequence[LogFinding], prediction: Prediction | None, car: Vehicle
 ) -> str:
     counts = Counter(finding.level for finding in findings)
-    blockers = [finding for finding in findings if finding.level == BLOCKER]
     tally = f"{counts[BLOCKER]} BLOCKER, {counts[WARNING]} WARNING, {counts[OK]} OK."
-    if blockers or prediction is None:
-        first = blockers[0] if blockers else findings[0]
+    if counts[BLOCKER] or prediction is None:
+        first = findings[0]  # those that block come first
         cure = f" ({first.cure})" if first.cure and first.cure not in first.text else ""
         what = f"{first.channel}: " if first.channel else ""
         stop = "Do not estimate from this log before it is mended."
@@ -165,14 +153,14 @@ def _compose_verdict(
     )
 
 
-def _make_channels(values: dict[str, Array]) -> ResultTable:
-    rows, time = [], values.get("time", np.zeros(0))
+def _make_channels(values: Quantities) -> ResultTable:
+    rows = []
     for name, column in values.items():
         known = np.isfinite(column)
         if name == "time" or not known.any():
             continue
-        unit, scale = _SHOWN_UNITS.get(first := next(iter(COLUMNS[name])), (first, 1.0))
-        x, steps = column[known] * scale, np.diff(time[known])
+        unit, scale = _SHOWN_UNITS[name]
+        x, steps = column[known] * scale, np.diff(values["time"][known])
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
         kind, period = find_sampling(column[known])
         rows.append([
@@ -190,22 +178,19 @@ def _make_channels(values: dict[str, Array]) -> ResultTable:
 
 def _make_findings(findings: Sequence[LogFinding]) -> list[ResultTable]:
     """Make the table of what is not OK, and one of all for the report."""
-    columns = ("level", "channel", "what, and what mends it")
-    cells = []
-    for finding in (finding for finding in findings if finding.level != OK):
-        stop = "" if finding.text.endswith("?") else "."
-        text = f"{finding.check}: {finding.text}{stop} -> {finding.cure}"
-        cells.append([finding.level, finding.channel, text])
+    columns, cells = ("level", "channel", "what, and what mends it"), []
+    for x in (finding for finding in findings if finding.level != OK):
+        text = x.text if x.text.endswith("?") else f"{x.text}."
+        cells.append([x.level, x.channel, f"{x.check}: {text} -> {x.cure}"])
     note = f"{len(findings) - len(cells)} findings are OK."
     heads = ("check", "level", "channel", "what", "what mends it")
-    rows = list(map(dataclasses.astuple, findings))
-    complete = ResultTable("All findings", heads, rows, keyed=False, detail=True)
+    complete = ResultTable("All findings", heads, findings, keyed=False, detail=True)
     shown = ResultTable("What is not OK", columns, cells, note, keyed=False, opened=True)
-    return [*([shown] if cells else []), complete]
+    return [shown, complete] if cells else [complete]
 
 
 def _draw_figures(
-    values: dict[str, Array], prediction: Prediction | None
+    values: Quantities, prediction: Prediction | None
 ) -> list[tuple[str, "Figure", str]]:
     """Each channel over time, and the sideslip angle with its deviation."""
     from ..report.figures import draw_time_series
@@ -218,7 +203,7 @@ def _draw_figures(
         shown.append(("The sideslip angle that this log gives", figure, "Longest part."))
     for name in _PLOTTED:
         if name in values and np.isfinite(values[name]).any():
-            unit, scale = _SHOWN_UNITS.get(first := next(iter(COLUMNS[name])), (first, 1.0))
+            unit, scale = _SHOWN_UNITS[name]
             dots = (name,) if name in SLOW_QUANTITIES else ()
             column = {name: scale * values[name]}
             figure = draw_time_series(values["time"], column, f"{name} / {unit}", dots=dots)

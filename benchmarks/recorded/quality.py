@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +12,14 @@ from scipy.stats import linregress
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import WARNING_PREFIX
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...estimators.wires import AS_LOGGED, SignalCalibration
 from .motion import LoggedMotion
 
 BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
 """Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
 
 
-@dataclass(frozen=True)
-class LogFinding:
+class LogFinding(NamedTuple):
     """What a check says of a channel."""
 
     check: str  # name of the check
@@ -290,8 +289,10 @@ def _describe_fixes(logs: Sequence[Log]) -> list[LogFinding]:
     return []
 
 
-def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[LogFinding]:
-    """Findings on the steering, by steady turns and all rows, by these and other tyres."""
+def _describe_steering(
+    logs: Sequence[Log], car: Vehicle, steady: bool, stated: SignalCalibration
+) -> list[LogFinding]:
+    """Findings on the steering, by steady turns and all rows; a cure replaces what is stated."""
     line, *lines = (fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     sentences = _describe_contradiction(line, "steering", "yaw rate")
     if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
@@ -300,12 +301,13 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
         return sentences
     ratio, sentences = 1.0 / abs(line.slope), []
     if line.slope < 0.0:
-        text = "steering and yaw rate differ in sign (--steering-sign -1 turns it)"
-        sentences.append(_make_finding("sign", "steering", text, "--steering-sign -1"))
+        cure = f"--steering-sign {-stated.sign}"
+        text = f"steering and yaw rate differ in sign ({cure} turns it)"
+        sentences.append(_make_finding("sign", "steering", text, cure))
     if not 0.5 < ratio < 2.0:
         guess = next(text for min_ratio, text in _GUESSES.items() if ratio >= min_ratio)
         text = f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess}"
-        cure = f"--steering-ratio {ratio:.3g}"
+        cure = f"--steering-ratio {ratio * stated.ratio:.3g}"
         sentences.append(_make_finding("ratio", "steering", f"{text} ({cure} divides it)", cure))
     return sentences
 
@@ -323,12 +325,15 @@ def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
     return _describe_contradiction(line, "the change of the course", "the integral of the gyro")
 
 
-def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
+def find_contradictions(
+    logs: Sequence[Log], car: Vehicle, stated: SignalCalibration = AS_LOGGED
+) -> list[LogFinding]:
     """Find what does not fit together in a drive: findings that are not OK.
 
     Args:
         logs: Parts of the log.
         car: The car that is assumed.
+        stated: Calibration of the steering that was applied to the logs.
     """
     sentences: list[LogFinding] = []
     if what := find_swapped(logs):
@@ -361,7 +366,8 @@ def find_contradictions(logs: Sequence[Log], car: Vehicle) -> list[LogFinding]:
     if not wrong:
         factor = FACTOR if slipping.any() else 3.0  # the faster the turns, the more they differ
         wrong = _describe_contradiction(accel, "accel_y", "speed x yaw rate", factor=factor)
-        wrong += _describe_steering(logs, car, steady=not wrong) + _describe_course(course, turned)
+        wrong += _describe_steering(logs, car, not wrong, stated)
+        wrong += _describe_course(course, turned)
     sentences += wrong
     if not slipping.any():
         return sentences

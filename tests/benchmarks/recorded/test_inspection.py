@@ -18,6 +18,7 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.slow import CAMERA
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators.make import make_estimator
+from sideslip.estimators.wires import AS_LOGGED
 from tests.benchmarks.conftest import Run
 
 from .faulty_logs import FAULTS, drive, shift_fixes, spoil
@@ -33,9 +34,7 @@ CASES = SHARED / "cases"
 
 def look(table: pd.DataFrame | Path, car: str | Path = "passenger-car") -> list[LogFinding]:
     """The findings on a table that are not OK."""
-    _, checked, _, findings = _read_drive(table, {}, make_vehicle(car))
-    if checked is not None:
-        findings += [finding for check in CHECKS.values() for finding in check(checked)]
+    _, findings, _ = _read_drive(table, {}, make_vehicle(car), AS_LOGGED)
     return [finding for finding in findings if finding.level != OK]
 
 
@@ -69,9 +68,7 @@ def test_a_check_that_finds_nothing_is_counted() -> None:
 
 
 def _read_clean() -> InspectedDrive:
-    checked = _read_drive(drive(CLEAN + 1)[0], {}, PASSENGER_CAR)[1]
-    assert checked is not None
-    return checked
+    return _read_drive(drive(CLEAN + 1)[0], {}, PASSENGER_CAR, AS_LOGGED)[0]
 
 
 def test_innovations_of_two_sensors_count_by_what_each_packet_measures() -> None:
