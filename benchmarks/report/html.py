@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from html import escape
 from importlib.resources import files
@@ -158,18 +158,16 @@ POINTS = 250  # samples of a cell in a figure with menus
 _FEW = 4  # figures of a suite; more are folded
 
 
-def write_report(
-    path: str | Path, suites: list[Suite], command: str, environment: Mapping[str, str]
-) -> None:
+def write_report(path: Path, suites: list[Suite], command: str, versions: dict[str, str]) -> None:
     """Write one self-contained HTML file: an answer, then every suite's verdict, pictures, tables.
 
     Args:
         path: File, written whole or not at all.
         suites: Results of one suite at least.
         command: Command line that made the suites.
-        environment: Versions by name.
+        versions: Versions by name.
     """
-    facts = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
+    facts = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **versions}
     drawn = any(suite.answers or suite.figures or suite.explorers for suite in suites)
     script = _read_asset("report.js") + "\n\n" + _read_asset("explorer.js")
     plotly = ""

@@ -26,6 +26,8 @@ from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from ..studies.estimation import EXPERIMENTS
 from .search import Range, SearchOptions, load_study, make_result_table, make_study_name, run_study
 
+Drives = Sequence[LoggedEpisode]
+Numbers = dict[str, float]  # value by option
 _PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
 _NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
 FIRST_SEED = 1000  # of training; the test seeds count from 0
@@ -175,11 +177,9 @@ def _simulate(
     return [drive for drives in done for drive in drives]
 
 
-def _compute_squares(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
-) -> Array:
+def _compute_squares(task: EstimatorTuning, drives: Drives, values: Numbers) -> Array:
     """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds)."""
-    options, turn = task.options | dict(values), 2.0 * math.pi
+    options, turn = task.options | values, 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
     for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
         clocks = [replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
@@ -196,9 +196,7 @@ def _compute_squares(
     return finite.reshape(len(task.scenarios), -1)
 
 
-def _compute_stable_squares(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
-) -> Array:
+def _compute_stable_squares(task: EstimatorTuning, drives: Drives, values: Numbers) -> Array:
     """Compute the squared errors, infinite where the estimator diverges."""
     try:
         return _compute_squares(task, drives, values)
@@ -206,17 +204,13 @@ def _compute_stable_squares(
         return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
 
 
-def _evaluate_trial(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: dict[str, float]
-) -> tuple[float, int]:
+def _evaluate_trial(task: EstimatorTuning, drives: Drives, values: Numbers) -> tuple[float, int]:
     """Evaluate some numbers: the geometric mean of the scenarios' RMSE, and the drives it is of."""
     errors = _compute_stable_squares(task, drives, values)
     return float(np.exp(np.mean(np.log(root_mean(errors))))), len(drives)
 
 
-def _search(
-    task: EstimatorTuning, drives: Sequence[LoggedEpisode], search: SearchOptions
-) -> dict[str, float]:
+def _search(task: EstimatorTuning, drives: Drives, search: SearchOptions) -> Numbers:
     """Search on training drives until the study has so many trials; the best numbers, 3 digits."""
     evaluate = partial(_evaluate_trial, task, drives)
     evaluate_batch = partial(run_cases, evaluate, jobs=search.workers)
@@ -231,7 +225,7 @@ def _search(
 
 def run(
     task: EstimatorTuning, search: SearchOptions, test_seeds: int = 20
-) -> tuple[Suite, dict[str, float]]:
+) -> tuple[Suite, Numbers]:
     """Search on the task's seeds, and judge on others; ValueError where no filter is stable.
 
     Args:
@@ -260,7 +254,7 @@ def run(
 
 
 def _make_comparisons(
-    task: EstimatorTuning, groups: Sequence[Sequence[LoggedEpisode]], numbers: dict[str, float]
+    task: EstimatorTuning, groups: Sequence[Drives], numbers: Numbers
 ) -> list[ResultTable]:
     """Make a table of errors before and after for each scenario, in training and test drives."""
     default = [_compute_stable_squares(task, drives, {}) for drives in groups]
@@ -286,7 +280,7 @@ def _format_spread(errors: Array) -> str:
 
 
 def make_entry(
-    task: EstimatorTuning, numbers: dict[str, float], command: str, note: str = ""
+    task: EstimatorTuning, numbers: Numbers, command: str, note: str = ""
 ) -> dict[str, object]:
     """Make the entry of a tunings file from the numbers that a command found.
 
