@@ -18,7 +18,7 @@ from rich.markup import escape
 
 from ...envs.validation import check_choice
 from ..harness.results import write_text
-from ..report.tables import format_verdict
+from ..report.study import format_verdict
 from .common import make_driver, make_setup, print_written, refuse_unused_options, show_episode
 from .names import check_env
 from .options import File, Text, Texts, register, take, take_argument

@@ -22,8 +22,7 @@ from ...envs.scenarios.world import GROUPS, World, make_world
 from ...envs.vehicle.parameters import VEHICLES
 from ..harness.results import Explorer, Panel, Suite
 from ..harness.stats import Estimate, geometric_mean
-from ..report.study import Request, Study
-from ..report.tables import describe_leader, format_verdict, summarise_names
+from ..report.study import Request, Study, describe_leader, format_verdict, summarise_names
 from . import entries
 from .calibration import measure_foresight, read_current
 from .entries import ControlCase, Entry

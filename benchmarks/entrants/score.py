@@ -23,8 +23,7 @@ from ..control.tables import make_failure_tables, make_main_table, make_task_tab
 from ..control.tasks import make_salt, make_task_seeds, make_tuning_seeds
 from ..harness.results import Suite
 from ..harness.stats import Estimate
-from ..report.study import Request
-from ..report.tables import format_percent
+from ..report.study import Request, format_percent
 from .challenge import (
     EPISODES,
     ComparisonRequest,

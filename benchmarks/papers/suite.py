@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, Column, Line, ResultTable, Suite
-from ..report.study import Request, Study
-from ..report.tables import format_verdict, summarise_names
+from ..report.study import Request, Study, format_verdict, summarise_names
 from . import dakf_stability, double_layer, dual_rate, tie_vision, tie_vision_theory, uneven_delay
 from .ledger import Claim, Example, MeasuredClaim, MeasuredPart, Simulation, SimulationResult
 

@@ -14,8 +14,7 @@ from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, geometric_mean, interval
-from ..report.study import Request, Study
-from ..report.tables import format_verdict, summarise_names
+from ..report.study import Request, Study, format_verdict, summarise_names
 from . import fmvss126, iso, outside
 from .drive import CARS, ENTRIES, CaseResults, ProcedureCase
 

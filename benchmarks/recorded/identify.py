@@ -18,7 +18,7 @@ from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_veh
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..report.tables import format_verdict
+from ..report.study import format_verdict
 from . import motion, quality
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, fit
 from .motion import Finding, LoggedMotion

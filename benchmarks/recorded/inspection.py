@@ -20,7 +20,7 @@ from ...estimators.make import make_estimator
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
-from ..report.tables import MAX_NIS, describe_innovations, format_verdict
+from ..report.study import MAX_NIS, describe_innovations, format_verdict
 from .checks import CHECKS, InspectedDrive
 from .motion import LoggedMotion
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution

@@ -28,7 +28,7 @@ from ...estimators.filters import FILTERS
 from ..harness.results import Column, ResultTable, Suite, write_text
 from ..harness.stats import Estimate, interval
 from ..report.film import make_track_kml
-from ..report.tables import format_verdict
+from ..report.study import format_verdict
 
 _GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored

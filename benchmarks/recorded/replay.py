@@ -26,7 +26,7 @@ from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_honesty
-from ..report.tables import describe_innovations, describe_leader, format_verdict
+from ..report.study import describe_innovations, describe_leader, format_verdict
 from .identify import identify_file
 from .motion import GYRO_ONLY, LoggedMotion
 from .quality import TRUTH, sort_remarks

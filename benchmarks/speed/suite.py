@@ -17,8 +17,7 @@ import numpy as np
 
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Bound
-from ..report.study import Request, Study
-from ..report.tables import format_verdict, summarise_names
+from ..report.study import Request, Study, format_verdict, summarise_names
 from . import env_steps, plant
 from .timing import FULL, QUICK, AbsentError, Taken, format_absences, format_three_digits
 

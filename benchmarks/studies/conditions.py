@@ -25,8 +25,7 @@ from ...estimators.wrappers.truth import calibrate
 from ..harness.drives import SETTLED, draw_steering, make_unchecked_filter, record_drive
 from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import compute_honesty, interval, mean_share, ratio_of_roots, root_mean
-from ..report.study import Request, Study
-from ..report.tables import format_verdict, summarise_names
+from ..report.study import Request, Study, format_verdict, summarise_names
 
 NAME, GYRO_ALONE = "joint", "bicycle-kf"
 BASE, BAD_INPUT = "base world v1", "steering in degrees"

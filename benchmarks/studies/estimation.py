@@ -19,8 +19,7 @@ from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
 from ..papers.ledger import PaperFilter, make_filters
-from ..report.study import Request, Study
-from ..report.tables import describe_leader, format_verdict
+from ..report.study import Request, Study, describe_leader, format_verdict
 
 _CHUNK = 5
 _COLUMNS = (

@@ -19,8 +19,7 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import compute_honesty
 from ..recorded.motion import LoggedMotion
-from ..report.study import Request, Study
-from ..report.tables import format_verdict
+from ..report.study import Request, Study, format_verdict
 
 _FILE = Path(__file__).with_suffix(".toml")
 _NAME = "joint"

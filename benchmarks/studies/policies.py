@@ -34,7 +34,7 @@ from ..control.tasks import (
 from ..harness.parallel import run_cases
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
-from ..report.tables import format_percent, format_verdict
+from ..report.study import format_percent, format_verdict
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask

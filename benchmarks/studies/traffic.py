@@ -19,8 +19,7 @@ from ..control.tasks import ORACLES, STATE, ControlTask
 from ..harness.drives import call_quietly
 from ..harness.results import Column, Line, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
-from ..report.study import Request, Study
-from ..report.tables import format_percent, format_verdict
+from ..report.study import Request, Study, format_percent, format_verdict
 
 ID = "sideslip/Highway-v0"
 _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")

@@ -16,8 +16,7 @@ from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.benchmarks.papers.ledger import make_filters
-from sideslip.benchmarks.report.study import Request
-from sideslip.benchmarks.report.tables import LETTERS, LINES
+from sideslip.benchmarks.report.study import LETTERS, LINES, Request
 from sideslip.benchmarks.studies import estimation, traffic
 from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
 

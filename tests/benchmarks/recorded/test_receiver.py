@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.recorded import receiver
-from sideslip.benchmarks.report.tables import LETTERS, LINES
+from sideslip.benchmarks.report.study import LETTERS, LINES
 from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
 from sideslip.estimators.filters import FILTERS

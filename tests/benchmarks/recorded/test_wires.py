@@ -14,7 +14,7 @@ from sideslip.benchmarks.cli.data import _parse_estimator_options
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.harness.stats import compute_honesty
 from sideslip.benchmarks.recorded.replay import replay_file
-from sideslip.benchmarks.report.tables import describe_innovations
+from sideslip.benchmarks.report.study import describe_innovations
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators.wires import SignalCalibration, apply_wires, read_wires, write_vehicle

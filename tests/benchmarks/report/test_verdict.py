@@ -15,7 +15,7 @@ from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
 from sideslip.benchmarks.recorded import replay as recorded
 from sideslip.benchmarks.recorded.replay import ReplayResult as Replayed
-from sideslip.benchmarks.report.tables import LETTERS, LINES, describe_leader, format_verdict
+from sideslip.benchmarks.report.study import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 from sideslip.benchmarks.speed.timing import Taken
