@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from inspect import Parameter, Signature
@@ -52,31 +53,28 @@ def take(
 
 
 take_argument = partial(take, declare=typer.Argument)
-_SHARED: dict[str, Callable[[], Any]] = {
-    "address": partial(take, "HOST:PORT of the cluster; default: this machine's.", ""),
-    "control_period": partial(take, "Control period in ticks of 1 ms; default: 10."),
-    "engine_name": partial(
-        take, "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
+_SHARED: dict[str, Any] = {
+    "address": take("HOST:PORT of the cluster; default: this machine's.", ""),
+    "control_period": take("Control period in ticks of 1 ms; default: 10."),
+    "engine_name": take(
+        "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
     ),
-    "html": partial(take, "Write a self-contained report.", ends=".html .htm"),
-    "jobs": partial(take, "Number of parallel processes.", None, "--jobs", "-j", min=1),
-    "json": partial(take, "Write the rows as JSON.", ends=".json"),
-    "mapping": partial(
-        take,
+    "html": take("Write a self-contained report.", ends=".html .htm"),
+    "jobs": take("Number of parallel processes.", None, "--jobs", "-j", min=1),
+    "json": take("Write the rows as JSON.", ends=".json"),
+    "mapping": take(
         "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r), dbc=FILE, or a TOML file; repeatable.",
         None,
         "--map",
     ),
-    "parquet": partial(take, "Write the rows as Parquet.", ends=".parquet"),
-    "seed": partial(take, "Seed of the sampler; another on each machine of a study.", 0),
-    "steering_offset": partial(take, "Offset that is added to the steering (deg at the wheels)."),
-    "steering_ratio": partial(take, "Logged steering angle over the wheels' angle (15.2)."),
-    "steering_sign": partial(take, "Sign of the logged steering: 1 or -1."),
-    "storage": partial(take, "RDB URL or SQLite file; default: sideslip-tune.db here."),
-    "trust": partial(
-        take, "Read policies' zips, which may run code of their makers.", False, "--trust"
-    ),
-    "vehicle": partial(take, "The car: a name or a TOML or JSON file.", kinds="vehicles"),
+    "parquet": take("Write the rows as Parquet.", ends=".parquet"),
+    "seed": take("Seed of the sampler; another on each machine of a study.", 0),
+    "steering_offset": take("Offset that is added to the steering (deg at the wheels)."),
+    "steering_ratio": take("Logged steering angle over the wheels' angle (15.2)."),
+    "steering_sign": take("Sign of the logged steering: 1 or -1."),
+    "storage": take("RDB URL or SQLite file; default: sideslip-tune.db here."),
+    "trust": take("Read policies' zips, which may run code of their makers.", False, "--trust"),
+    "vehicle": take("The car: a name or a TOML or JSON file.", kinds="vehicles"),
 }  # a command declares these fields without a value
 
 
@@ -94,7 +92,7 @@ def register(name: str, line: str | None = None, to: typer.Typer = app) -> Calla
 
     def register_class(kind: Kind) -> Kind:
         for shared in kind.__annotations__.keys() - vars(kind).keys():
-            setattr(kind, shared, _SHARED[shared]())
+            setattr(kind, shared, copy(_SHARED[shared]))  # into which the dataclass writes
         record: Any = dataclass(frozen=True)(kind)
 
         def call(**values: Any) -> None:

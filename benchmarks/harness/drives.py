@@ -2,8 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -22,8 +21,7 @@ T = TypeVar("T")
 SETTLED = 2.0  # s: errors of estimates count from here on
 
 
-@dataclass(frozen=True)
-class LoggedEpisode:
+class LoggedEpisode(NamedTuple):
     """Log of an episode, with the arguments of `make_estimator` that belong to it."""
 
     log: Log

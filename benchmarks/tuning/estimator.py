@@ -181,7 +181,7 @@ def _compute_squares(task: EstimatorTuning, drives: Drives, values: Numbers) -> 
     """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds)."""
     options, turn = task.options | values, 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
-    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
+    for i, (log, facts) in enumerate(drives):
         clocks = [replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
         key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
         if key not in filters:
