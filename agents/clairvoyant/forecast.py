@@ -5,7 +5,7 @@ The forecast has driver, wind and disturbances of every step, which the actions 
 
 import functools
 from collections import namedtuple
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,7 +17,6 @@ from ...envs.engine.layout import EpisodeArrays, P, StepVariant, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
 from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
 from ...envs.engine.window import compute_profile_angle, make_window
-from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from ...envs.numerics.functions import FOREVER, TICK
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
@@ -224,10 +223,20 @@ def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float,
 
 _Errors = tuple[Scalar, Scalar]
 N_INPUTS = 2  # in a sweep: fractions of moment and added steering; the latter is 0 if unused
-_rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
-_motor_torques, _sideslip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
-_apply_lag, _yaw_moment = to_casadi(apply_lag), to_casadi(compute_yaw_moment)
-_reference = to_casadi(compute_reference)
+SYMBOLS: dict[str, Callable[..., Any]] = {
+    "minimum": ca.fmin, "maximum": ca.fmax, "absolute": ca.fabs, "floor": ca.floor,
+    "sqrt": ca.sqrt, "select": ca.if_else, "to_float": lambda a: a * 1.0,
+    "any_lane": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
+    # its own functions agree with our polynomials to 1e-15 and have shorter derivatives
+    "sincos": lambda x: (ca.sin(x), ca.cos(x)),
+    "atan": ca.atan, "atan2": ca.atan2, "compute_sine": ca.sin,
+}  # fmt: skip
+"""The primitives for CasADi's SX and MX, by the names that the equations use; none for & and |."""
+_rk4, _load_at = as_python(rk4, SYMBOLS), as_python(compute_lagged_load, SYMBOLS)
+_motor_torques = as_python(compute_motor_torques, SYMBOLS)
+_sideslip = as_python(compute_sideslip_angle, SYMBOLS)
+_reference = as_python(compute_reference, SYMBOLS)
+_apply_lag, _yaw_moment = as_python(apply_lag, SYMBOLS), as_python(compute_yaw_moment, SYMBOLS)
 # compute_cost_rate as a plain sum of squares, smooth for the solver: its cap and its `absolute`,
 # whose slope is undefined at zero, are identities here
 _uncapped_cost_rate = as_python(

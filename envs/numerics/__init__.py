@@ -2,8 +2,8 @@
 
 `jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
 call what `primitives`, `packed` and `functions` have. `simd` has the lanes, `simd8` reads eight
-neighbours of a row, `torch_backend` and `casadi_backend` are the other kinds. `compiler` and
-`kernel_cache` keep machine code on disk.
+neighbours of a row, `torch_backend` torch's tensors. `compiler` and `kernel_cache` keep machine
+code on disk.
 """
 
 from collections.abc import Iterator

@@ -9,9 +9,9 @@ import pytest
 
 import sideslip
 from sideslip.envs.engine.layout import P, Z
+from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.packed import read
 from sideslip.envs.scenarios.driver import Wind, compute_wind
-from sideslip.envs.vehicle.actuators import allocate_torques
 from sideslip.estimators import EstimateObservation
 
 ca = pytest.importorskip("casadi")
@@ -19,6 +19,7 @@ pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
 from sideslip.agents.clairvoyant.forecast import (  # noqa: E402
+    SYMBOLS,
     PlanState,
     PreviewStep,
     _advance,
@@ -30,7 +31,6 @@ from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     compute_clairvoyant,
     record_actions,
 )
-from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__
 ID = "sideslip/YawFusion-v0"
@@ -220,7 +220,6 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match="call reset"):
         make_forecast(env.unwrapped)
 
-    joined = to_casadi(compute_wind)
+    joined = as_python(compute_wind, SYMBOLS)
     with pytest.raises(TypeError, match="&"):
         joined(ca.SX.sym("tick"), Wind(1.0, 0.0, 0.0, 1.0))
-    assert to_casadi(allocate_torques) is not allocate_torques

@@ -10,6 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
+from sideslip.agents.clairvoyant.forecast import SYMBOLS
 from sideslip.agents.controllers.mpc import _make_blocks, _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
     _DIFFERENCE,
@@ -22,7 +23,7 @@ from sideslip.agents.design.gauss_newton import (
 )
 from sideslip.agents.design.prediction import PlanBatch, simulate_plans
 from sideslip.agents.rollout import evaluate_episodes
-from sideslip.envs.numerics.casadi_backend import SYMBOLS, to_casadi
+from sideslip.envs.numerics.jit import as_python
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.agents.helpers import observe
 
@@ -75,7 +76,7 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
     plan = ca.SX.sym("plan", agent.width * len(blocks))
     residuals: dict[int, Any] = {}
     pokes = np.zeros(plan.numel())
-    to_casadi(simulate_plans)(found, PlanBatch(plan, pokes, {}, residuals, {}))
+    as_python(simulate_plans, SYMBOLS)(found, PlanBatch(plan, pokes, {}, residuals, {}))
     objective = ca.sumsqr(ca.vertcat(*residuals.values()))
     options = {"ipopt.print_level": 0, "print_time": False, "ipopt.max_iter": 200}
     solver = ca.nlpsol("plan", "ipopt", {"x": plan, "f": objective}, options)
