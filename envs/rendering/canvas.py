@@ -163,8 +163,7 @@ def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     Args:
         picture: Picture as a surface of pygame.
     """
-    flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
-    return flat.reshape(picture.get_height(), picture.get_width(), 3).copy()
+    return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
 
 
 def _find_dashes(vertices: Array, dash: float, gap: float) -> Array:

@@ -39,17 +39,15 @@ ORACLES = {
 
 # What the papers' figures call them.
 _ALIASES = {
-    "none": "without control",
-    "bicycle-kf": "gyro-only",
-    "single-rate-kf": "single-rate, conventional",
-    "multirate-kf": "multirate, innovation holding",
-    "multirate-residual-kf": "multirate-residual, pseudo-residuals, pseudo measurement",
-    "model-following": "with control, both",
-    "truth": "true, reference, bound, ideal",
-}
+    "without control": "none", "gyro-only": "bicycle-kf", "single-rate": "single-rate-kf",
+    "conventional": "single-rate-kf", "multirate": "multirate-kf",
+    "innovation holding": "multirate-kf", "multirate-residual": "multirate-residual-kf",
+    "pseudo-residuals": "multirate-residual-kf", "pseudo measurement": "multirate-residual-kf",
+    "with control": "model-following", "both": "model-following", "true": "truth",
+    "reference": "truth", "bound": "truth", "ideal": "truth",
+}  # fmt: skip
 _BASE_COLOURS = {**FILTERS, **CONTROLLERS, **ORACLES, "truth": INK, "measured": GREY}
-_BY_ALIAS = {alias: name for name, text in _ALIASES.items() for alias in text.split(", ")}
-COLOURS = _BASE_COLOURS | {alias: _BASE_COLOURS[name] for alias, name in _BY_ALIAS.items()}
+COLOURS = _BASE_COLOURS | {alias: _BASE_COLOURS[name] for alias, name in _ALIASES.items()}
 """Estimators, controllers and facts by name."""
 
 FACTS = ("truth", "true")

@@ -139,20 +139,14 @@ def make_car_scene(shot: RenderState) -> CarScene:
         has_lane = bool(_compute_lane_quality(motion, view))
         overlay = _CameraOverlay(float(p[P.car.l_pre]), angle, has_lane)
     return CarScene(
-        motion,
-        config.vehicle,
-        (float(drive.T_l), float(drive.T_r)),
-        float(_compute_torque_limit(motion.v_x, car)),
-        tuple(wheels),
-        0.5 * float(car.mu + car.mu_r),
-        float(_compute_wind(tick, params.wind)[0]),
-        overlay,
-        lanes,
-        np.stack([s, _compute_path_offset(params.path, s)], 1),
-        _sample_curvatures(params, z, motion, variant.road),
-        float(params.task.half_width),
-        int(z[Z.clock.failure]),
-    )
+        motion=motion, vehicle=config.vehicle, torques=(float(drive.T_l), float(drive.T_r)),
+        max_torque=float(_compute_torque_limit(motion.v_x, car)), wheels=tuple(wheels),
+        friction=0.5 * float(car.mu + car.mu_r), wind=float(_compute_wind(tick, params.wind)[0]),
+        field_of_view=overlay, lanes=lanes,
+        path=np.stack([s, _compute_path_offset(params.path, s)], 1),
+        curvatures=_sample_curvatures(params, z, motion, variant.road),
+        half_width=float(params.task.half_width), failure=int(z[Z.clock.failure]),
+    )  # fmt: skip
 
 
 def _find_lanes(path: tracks.TrackPath, config: EpisodeConfig) -> tuple[tracks.Section, ...]:
