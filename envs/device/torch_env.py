@@ -34,13 +34,11 @@ from .torch_step import StepOutcome, TorchReset, TorchState, TorchStep
 _Capacities = dict[int, PacketCapacity]  # by the sensor's place
 _FIELDS = [field.name for field in dataclasses.fields(Vehicle) if field.name != "name"]
 _RECORD = StepOutcome._fields.index("rows")  # from here on the rows are the last axis
-_MOTION, _DRIVE, _REFS, _LEAD, _ERRORS, _EFFORTS = (
-    slice(part[0], part[-1] + 1)
-    for part in (Z.motion, Z.drive, Z.refs, Z.nominal_motion, Z.errors, Z.past_efforts)
-)
-_PACKED = (
-    _MOTION, _DRIVE, Z.driver, _REFS, _LEAD, _ERRORS, _EFFORTS, Z.clock.tick, Z.clock.failure,
-)  # fmt: skip
+_PACKED = [
+    slice(part[0], part[-1] + 1) if isinstance(part, tuple) else part
+    for part in (Z.motion, Z.drive, Z.driver, Z.refs, Z.nominal_motion, Z.errors, Z.past_efforts,
+                 Z.clock.tick, Z.clock.failure)
+]  # fmt: skip
 """Places of the first fields of a `TorchState` in the packed state."""
 
 

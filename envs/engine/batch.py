@@ -14,7 +14,7 @@ from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REFUSED, REPORT, RUNNING
 from ..validation import Mask
 from .config import EnvConfig
-from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, EpisodeArrays, EpisodeStart, P, Z
+from .layout import FLAGS, PARAMS_WIDTH, EpisodeArrays, EpisodeStart, P, Z
 from .outputs import finish_slow_sensors, observe_fast
 from .reset import reset_vehicle
 from .step import (
@@ -25,7 +25,8 @@ from .step import (
     make_step_variant,
     step_vehicle,
 )
-from .window import make_window, overwrite_steering, precompute_lane_window
+from .views import make_episode_arrays
+from .window import overwrite_steering, precompute_lane_window
 
 IntArray = npt.NDArray[np.int64]
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
@@ -246,24 +247,16 @@ class NumbaEngine:
     """
 
     def __init__(self, config: EnvConfig, count: int) -> None:
-        N, n, k = count, int(config.control_period), len(config.layout)
-        self.arrays = BatchArrays(
-            params=np.zeros((N, PARAMS_WIDTH)), states=np.zeros((N, STATE_WIDTH)),
-            switches=np.zeros((N, len(FLAGS)), np.int64), obs=np.zeros((N, k), np.float32),
-            rows=np.zeros((N, n, FAST_WIDTH)),
-            packets=np.zeros((N, config.max_packets, PACKET_WIDTH)),
-            reports=np.zeros((N, len(REPORT))), ticks_done=np.zeros(N, np.int64),
-            delivered=np.zeros(N, np.int64), over=np.zeros(N, np.bool_),
-        )  # fmt: skip
+        one = make_episode_arrays(config)  # all have its bounds, and write its window in turn
+        numbers = [np.zeros((count, *array.shape), array.dtype) for array in one[:-2]]
+        ticks_done, delivered = np.zeros((2, count), np.int64)
+        self.arrays = BatchArrays._make([*numbers, ticks_done, delivered, np.zeros(count, bool)])
         self.final = RecordArrays(*(array.copy() for array in self.arrays.record))
-        block = EpisodeArrays(
-            np.zeros((PARAMS_WIDTH, LANES)), np.zeros((STATE_WIDTH, LANES)),
-            np.zeros(len(FLAGS), np.int64), np.zeros((k, LANES)),
-            np.zeros((n, FAST_WIDTH, LANES)), np.zeros((0, PACKET_WIDTH)),
-            np.zeros((_REPORT, LANES)), config.bounds, make_window(n, LANES),
-        )  # fmt: skip
+        names = "p", "z", "obs", "rows", "report", "window"
+        widened = {name: np.zeros((*getattr(one, name).shape, LANES)) for name in names}
+        block = one._replace(packets=np.zeros((0, PACKET_WIDTH)), **widened)
         members, shares = np.zeros(LANES, np.int64), np.zeros((len(SHARES), LANES))
-        self.lane_buffers = _LaneBuffers(np.arange(N), members, block, shares, make_window(n))
+        self.lane_buffers = _LaneBuffers(np.arange(count), members, block, shares, one.window)
 
     def reset(
         self, chosen: IntArray, starts: Sequence[EpisodeStart], index: IntArray,

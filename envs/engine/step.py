@@ -1,9 +1,7 @@
 """Env-step of one vehicle: n plant ticks, sensors, packets, cost and observation; compiled.
 
-Order of tick k: sensors sample the state at k; packets with arrival k are delivered, ordered by
-(captured tick, sensor). The control of tick k acts until k+1. A step from tick k returns the ticks
-k+1 to k+n; a reset returns tick 0 alone. `precompute_window` writes what does not depend on the
-car, `integrate_step` moves the car, `finish_step` does slow sensors, observation and report.
+Sensors sample the state at tick k, and the packets that arrive at k are delivered; the control of k
+acts until k+1. A step from tick k returns the ticks k+1 to k+n; a reset returns tick 0 alone.
 """
 
 from typing import NamedTuple
@@ -28,14 +26,7 @@ from ..task import (
 from ..vehicle.tyres import compute_tyre_load
 from .layout import FLAGS, EpisodeArrays, EpisodeStart, P, StepVariant, Z
 from .outputs import finish_step
-from .tick import (
-    Measurements,
-    StepParams,
-    StepState,
-    TickInputs,
-    apply_tyre_change,
-    integrate_tick,
-)
+from .tick import Measurements, StepParams, StepState, TickInputs, apply_tyre_change, integrate_tick
 from .window import TICK_COST, WINDOW, compute_tick_cost, precompute_window, read_draws
 
 SHARES = (0, 1)

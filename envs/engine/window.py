@@ -65,15 +65,13 @@ TICK_COST = _TickCost(*WINDOW.cost_inputs[:4])
 _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
-def make_window(n: int, *lanes: int) -> Array:
-    """Make a window of zeros, shape (WINDOW_HEIGHT, columns, *lanes).
+def make_window(n: int) -> Array:
+    """Make a window of zeros, shape (WINDOW_HEIGHT, columns).
 
     Args:
         n: Ticks of a step.
-        lanes: Number of lanes, for a block.
     """
-    columns = -(-n // LANES) * LANES  # whole lanes
-    return np.zeros((WINDOW_HEIGHT, columns, *lanes))
+    return np.zeros((WINDOW_HEIGHT, -(-n // LANES) * LANES))  # whole lanes
 
 
 @jit

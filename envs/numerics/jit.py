@@ -17,7 +17,7 @@ from .kernel_cache import LAYERS, find_kernel_folder, report_once
 from .primitives import Vector
 
 _STOCK = "SIDESLIP_STOCK_NUMBA"  # environment variable with which plain numba compiles
-_PREFIX = __name__.removesuffix("envs.numerics.jit")
+_PREFIX = __name__.removesuffix("envs.numerics.jit")  # of the names of all our modules
 _SUPPORTED = "0.68"  # numba's version whose insides `compiler` uses
 
 config: Any = numba.config
@@ -101,7 +101,6 @@ def copy_into(source: Vector, target: Vector) -> None:
         target[i] = source[i]
 
 
-_PACKAGE = __name__.rpartition(".envs")[0]
 _NUMERICS = __name__.rpartition(".")[0]  # whose functions a table may replace
 
 
@@ -137,7 +136,7 @@ def _rebuild(
     for name in source.__code__.co_names:
         callee: Any = names.get(name)
         is_function = isinstance(callee, FunctionType)
-        if is_jitted(callee) or (is_function and (callee.__module__ or "").startswith(_PACKAGE)):
+        if is_jitted(callee) or (is_function and (callee.__module__ or "").startswith(_PREFIX)):
             names[name] = _rebuild(callee, table, finish, rebuilt_functions)
     del names["__name__"]  # by which torch.compile would look the names up in the module itself
     return finished
