@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
@@ -16,11 +16,9 @@ from ...envs.scenarios.world import make_world
 from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import short_repr
-from ...estimators import vector
+from ...estimators import vector, wrappers
 from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
-from ...estimators.wrappers.estimate import EstimateObservation
-from ...estimators.wrappers.truth import TruthObservation
 from ..harness.drives import call_quietly
 from .tasks import NOMINAL, ORACLES, STEERING, TIERS, YAW, ControlTask, find_oracle
 
@@ -109,17 +107,16 @@ class Entry:
             chosen = {"options": case.options, **case.env_options}
             return baselines.make_oracle(case.driver, env_id, n, **chosen)
         env: Any
+        module: ModuleType = wrappers if n is None else vector
         if n is None:
             env = gym.make(env_id, **case.env_options)
-            wrappers: tuple[Any, Any] = EstimateObservation, TruthObservation
         else:
             env = gym.make_vec(env_id, num_envs=n, **case.env_options)
-            wrappers = vector.EstimateObservation, vector.TruthObservation
         if self.estimator == TRUTH:
-            env = wrappers[1](env, (), ("beta", "gamma"))
+            env = module.TruthObservation(env, (), ("beta", "gamma"))
         elif self.estimator:
             source = self.objects.get("estimator", self.filter_name)
-            env = call_quietly(wrappers[0], env, source, **case.estimate_options)
+            env = call_quietly(module.EstimateObservation, env, source, **case.estimate_options)
         agent = make_agent(self.objects.get("agent", self.agent), env, **case.agent_options)
         if self.is_users and n is not None:
             agent = check_agent(agent, (n, env.single_action_space.shape[0]))
