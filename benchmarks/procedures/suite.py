@@ -70,9 +70,8 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
     if not _HAS_OUTSIDE:
         return cases
     cases.append(ProcedureCase("check", outside.MODEL))
-    outside_seeds = seeds[: len(seeds) if quick else OUTSIDE_EPISODES]
     pairs = product(OUTSIDE_PLANTS, agents)
-    return cases + [ProcedureCase("outside", *pair, outside_seeds) for pair in pairs]
+    return cases + [ProcedureCase("outside", *pair, seeds[:OUTSIDE_EPISODES]) for pair in pairs]
 
 
 def _group_results(done: CaseResults) -> dict[str, CaseResults]:
