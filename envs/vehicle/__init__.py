@@ -10,7 +10,7 @@ Args:
     s: Distance along the road (m).
     load: `TyreLoad` of the inputs; of a step those at its start, middle and end.
     disturbance: `DisturbanceForces`.
-    variant: `PlantVariant` or `StepVariant` of the plant.
+    variant: `PlantVariant`, or what has its fields.
     small_angle: 1 for the small-angle plant, else 0.
     g_y: Lateral gravity that the car feels on a banked road (m/s2).
     h: Length of a step (s).
