@@ -1,13 +1,4 @@
-"""The car, its sensors and the Gymnasium environment around them.
-
-Args:
-    name: Name of a value, for messages.
-    value: Value to check or to format.
-    what: Kind of what is checked, for messages.
-    known: Known names.
-    minimum: Smallest number.
-    maximum: Largest number; None for no limit.
-"""
+"""The car, its sensors and the Gymnasium environment around them."""
 
 # A second copy under another name breaks pickles and poisons numba's cache.
 if __name__ != "sideslip.envs":

@@ -167,7 +167,11 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, object])
 
 
 def to_toml(value: object) -> str:
-    """Format a value as TOML writes it behind a key."""
+    """Format a value as TOML writes it behind a key.
+
+    Args:
+        value: Number, text, list or mapping.
+    """
     if isinstance(value, Mapping):
         pairs = (f"{_format_key(name)} = {to_toml(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"

@@ -1,4 +1,13 @@
-"""Checks of arguments, for one environment or rows of them, and the texts of their messages."""
+"""Checks of arguments, for one environment or rows of them, and the texts of their messages.
+
+Args:
+    name: Name of a value, for messages.
+    value: Value to check or to format.
+    what: Kind of what is checked, for messages.
+    known: Known names.
+    minimum: Smallest number.
+    maximum: Largest number; None for no limit.
+"""
 
 import dataclasses
 import difflib

@@ -4,10 +4,6 @@ Where to start reading: `filters` has the table of filters; `make` turns a row i
 `design.config` parses its options, `design.assemble` writes its record. `core.record` names every
 number of a filter, `core.filter` is what happens at every tick. `wrappers` and `vector` put filters
 around environments, `joint` one around a user's signals. `protocol` is for users' own.
-
-Args:
-    source: Record, or a log that has one.
-    snapshot: Result of `get_state`.
 """
 
 from .analysis.linear_system import DualRate

@@ -240,6 +240,10 @@ class LateEstimator(Estimator):
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot as `Estimator.set_state` does."""
+        """Restore a snapshot as `Estimator.set_state` does.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.delayed_filters[:] = filters, delayed_filters

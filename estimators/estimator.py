@@ -208,7 +208,11 @@ class Estimator:
         self.step(np.zeros((0, FAST_WIDTH)), np.asarray(packet)[None])
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a record, or that of a log; errors as in `prepare_record`."""
+        """Reset, then filter a whole record; errors as in `prepare_record`.
+
+        Args:
+            source: Record, or a log that has one.
+        """
         return self.run_with_health(source, math.inf)[0]
 
     def run_with_health(
@@ -236,7 +240,11 @@ class Estimator:
         return Estimates(time, X, S, self.names, nis), healthy
 
     def prepare_record(self, source: Log | Record) -> Record:
-        """Reset for a record and return it; ValueError where rows, tick or columns do not fit."""
+        """Reset for a record and return it; ValueError where rows, tick or columns do not fit.
+
+        Args:
+            source: Record, or a log that has one.
+        """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
             raise ValueError(f"{self.name}: the record is empty")
@@ -254,7 +262,11 @@ class Estimator:
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this estimator or of one built with the same arguments."""
+        """Restore a snapshot of this estimator or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.filters[:] = snapshot
 
     @property

@@ -146,9 +146,10 @@ class ForeignEstimator:
         return value
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a whole record tick by tick; NIS is NaN.
+        """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
-        ValueError says that the record is empty or has another tick.
+        Args:
+            source: Record, or a log that has one; ValueError if it is empty or has another tick.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
@@ -168,7 +169,11 @@ class ForeignEstimator:
         return copy.deepcopy(self.inner)
 
     def set_state(self, snapshot: EstimatorLike) -> None:
-        """Replace `inner` by a copy of a snapshot."""
+        """Replace `inner` by a copy of a snapshot.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.inner = copy.deepcopy(snapshot)
 
     def __repr__(self) -> str:

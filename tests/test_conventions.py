@@ -142,13 +142,13 @@ def list_entries(text: str | None) -> set[str]:
 def count_undocumented_arguments(trees: Trees) -> int:
     """Arguments of public functions, methods and constructors without an entry under `Args`.
 
-    An option of a command has its help text instead, and what all functions of a room share stands
-    under `Args` of its face.
+    An option of a command has its help text instead, and what the functions of a file or of a room
+    share stands under `Args` of the file or of the room's face.
     """
     count, options = 0, list_options(trees)
     for name, tree in trees.items():
         face = trees.get(f"{name.rpartition('/')[0]}/__init__.py", ast.parse(""))
-        shared = list_entries(ast.get_docstring(face))
+        shared = list_entries(ast.get_docstring(face)) | list_entries(ast.get_docstring(tree))
         public = [(node, "") for node in tree.body]
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
