@@ -1,4 +1,9 @@
-"""Results of suites: rows for machines, tables and explorers for people, and the files of rows."""
+"""Results of suites: rows for machines, tables and explorers for people, and the files of rows.
+
+Args:
+    path: File.
+    rows: Rows of a run's suites.
+"""
 
 import json
 import math
@@ -187,12 +192,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a JSON list of objects, one a line; NaN becomes null.
-
-    Args:
-        path: File.
-        rows: Rows of a run's suites.
-    """
+    """Write rows as a JSON list of objects, one a line; NaN becomes null."""
     plain = [asdict(row) for row in rows]
     for row in plain:
         row |= {x: None for x in ("value", "low", "high") if not math.isfinite(row[x])}
@@ -200,11 +200,7 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
-    """Read rows of `write_json`; ValueError with file, row and column where there are none.
-
-    Args:
-        path: File.
-    """
+    """Read rows of `write_json`; ValueError with file, row and column where there are none."""
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
         numbers = {name: math.nan if value is None else value for name, value in entry.items()}
@@ -213,11 +209,7 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
 
 def read_objects(path: str | Path) -> list[dict[str, Any]]:
-    """Read a JSON list of objects; ValueError for anything else.
-
-    Args:
-        path: File.
-    """
+    """Read a JSON list of objects; ValueError for anything else."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -228,12 +220,7 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
 
 def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a Parquet table (needs the extra `report`).
-
-    Args:
-        path: File.
-        rows: Rows of a run's suites.
-    """
+    """Write rows as a Parquet table (needs the extra `report`)."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

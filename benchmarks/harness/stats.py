@@ -2,6 +2,13 @@
 
 Intervals are Student's, on a logarithmic scale for positive numbers; those of fractions Wilson's.
 No interval of a mean holds for rare failures that did not occur: `share` bounds their rate.
+
+Args:
+    values: Numbers of the seeds, shape (n,).
+    strata: Numbers of each stratum, shape (n_i,); NaN for the mean of fewer than two.
+    hits: Whether each drive is a hit, shape (n,), a tie 0.5.
+    costs: Costs of the seeds, shape (n,); NaN without any.
+    others: Those of another on the same seeds, shape (n,).
 """
 
 import math
@@ -63,11 +70,7 @@ class Bound(NamedTuple):
         return f"{self.relation} {self.value:g}"
 
     def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which of the values meet it; NaN never does.
-
-        Args:
-            values: Numbers, of any shape.
-        """
+        """Tell which of the values meet it; NaN never does."""
         return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
 
 
@@ -86,9 +89,6 @@ def margin_of_error(*strata: Array) -> float:
 
     The variances add up with the degrees of freedom of Welch and Satterthwaite, fewer where the
     kurtosis is large (O'Neill 2014, Some useful moment results in sampling problems).
-
-    Args:
-        strata: Numbers of each mean, shape (n_i,); NaN for fewer than two.
     """
     variance = uncertainty = 0.0
     for values in strata:
@@ -147,11 +147,7 @@ def _make_subsets(values: Array, block: npt.NDArray[np.intp]) -> Array:
 
 
 def mean_share(values: Array) -> Estimate:
-    """Compute the mean of fractions; its interval is that of the odds, if they vary.
-
-    Args:
-        values: Fractions of the seeds, shape (n,).
-    """
+    """Compute the mean of fractions; its interval is that of the odds, if they vary."""
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
     odds = interval(values, lambda x, axis: ratio_of_means(x, 1.0 - x, axis))
@@ -172,11 +168,7 @@ ratio_of_roots = _make_ratio(root_mean)  # RMSE over that of a reference, from s
 
 
 def average(*strata: Array) -> Estimate:
-    """Average the means of strata, with interval; NaN without strata, and where a number is NaN.
-
-    Args:
-        strata: Numbers of each stratum, shape (n_i,).
-    """
+    """Average the means of strata, with interval; NaN without strata, and where a number is NaN."""
     filled = [stratum for stratum in strata if len(stratum)]
     if not filled:
         return Estimate(math.nan)
@@ -186,20 +178,12 @@ def average(*strata: Array) -> Estimate:
 
 
 def geometric_mean(*strata: Array) -> Estimate:
-    """Compute exp of the `average` of strata of logarithms, of equal weight.
-
-    Args:
-        strata: Logarithms of each stratum, shape (n_i,).
-    """
+    """Compute exp of the `average` of strata of logarithms, of equal weight."""
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """Compute the mean of hits with Wilson's interval; NaN without hits.
-
-    Args:
-        hits: Numbers that are 0 or 1, a tie 0.5, shape (n,).
-    """
+    """Compute the mean of hits with Wilson's interval; NaN without hits."""
     from scipy.special import ndtri
 
     values, z = np.asarray(hits, np.float64), float(-ndtri(_TAIL))
@@ -230,12 +214,7 @@ def compute_honesty(error: Array, deviation: Array) -> tuple[float, float, float
 
 
 def compute_win_rate(costs: Array, others: Array) -> Estimate:
-    """Compute the fraction of episodes that cost less than the other's.
-
-    Args:
-        costs: Costs, shape (n,).
-        others: Costs of the other on the same seeds, shape (n,).
-    """
+    """Compute the fraction of episodes that cost less than the other's."""
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
@@ -243,9 +222,6 @@ def compute_tail_mean(costs: Array) -> Estimate:
     """Compute the mean of the largest 5 % of positive numbers: the conditional value at risk.
 
     Its interval is the logarithm's, by influences on the tail's mean; none for a tail below 25.
-
-    Args:
-        costs: Costs, shape (n,); NaN without any.
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
@@ -260,12 +236,7 @@ def compute_tail_mean(costs: Array) -> Estimate:
 
 
 def is_share_larger(hits: npt.ArrayLike, others: npt.ArrayLike) -> bool:
-    """Check that a share exceeds another of the same drives: McNemar's exact one-sided test, 2.5 %.
-
-    Args:
-        hits: Whether each drive is a hit, shape (n,).
-        others: The same of the other share, shape (n,).
-    """
+    """Check that a share exceeds another's of the same drives: McNemar's one-sided test, 2.5 %."""
     from scipy.special import bdtrc
 
     one, other = np.asarray(hits, np.bool_), np.asarray(others, np.bool_)

@@ -93,11 +93,7 @@ class ProcedureEntry:
     policies: Mapping[str, str] = field(default_factory=dict)  # learned, with its estimator, by car
 
     def get_configuration(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
-        """Get the agent, the estimator and the options of its wrapper that drive a car.
-
-        Args:
-            car: One of `CARS`, or an outside model, which is taken for the passenger car.
-        """
+        """Get agent, estimator and its options for a car; outside models are passenger cars."""
         if not self.policies:
             return self.agent, self.estimator, self.estimate
         name = self.policies.get(car, self.policies["passenger-car"])
@@ -119,12 +115,7 @@ class ProcedureEntry:
         return env, make_agent(agent, env, **tuned)
 
     def drive(self, car: str, seed: int | None = None) -> DriveFunction:
-        """Make the drives of a car; references stay within what friction can hold.
-
-        Args:
-            car: One of `CARS`.
-            seed: Seed of what errs in car and sensors; None: nothing errs.
-        """
+        """Make the drives of a car; references stay within what friction can hold."""
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
         options |= {"world": "ideal"} if seed is None else {}
 

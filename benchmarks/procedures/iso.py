@@ -310,12 +310,7 @@ class Transient:
 
 
 def run_transient(drive: DriveFunction, car: TestCar) -> Transient:
-    """Drive the step and the sweep.
-
-    Args:
-        drive: Function that drives the car through a scenario.
-        car: Car under test, with speed and steering ratio.
-    """
+    """Drive the step and the sweep."""
     vehicle, speed = car.vehicle, car.speed
     per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m
     stepped = drive(_make_step(car, per * _STEP_AT))

@@ -133,26 +133,13 @@ def _sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count
 
 @jit
 def observe(row: EpisodeArrays, n: int, count: int, refs: Vector) -> None:
-    """Write the float32 observation, clipped at its bounds.
-
-    Args:
-        row: Arrays of the episode.
-        n: Number of fast rows.
-        count: Number of packets.
-        refs: (beta_ref, gamma_ref) (rad, rad/s).
-    """
+    """Write the float32 observation, clipped at its bounds."""
     _observe_slow(row, observe_fast(row, n, refs), count)
 
 
 @jit
 def observe_fast(row: EpisodeArrays, n: int, refs: Vector) -> int:
-    """Write the observation's fast entries, whose number it returns, and last the two references.
-
-    Args:
-        row: Arrays of the episode, or of a block.
-        n: Number of fast rows.
-        refs: (beta_ref, gamma_ref) (rad, rad/s).
-    """
+    """Write the observation's fast entries, whose number it returns, last the two references."""
     rows, bounds, switches, obs, k = row.rows, row.bounds, row.switches, row.obs, 0
     for column in range(N_SAMPLED):
         if switches[FLAGS.all_samples]:
@@ -209,13 +196,7 @@ def _observe_slow(row: EpisodeArrays, k: int, count: int) -> None:
 
 @jit
 def finish_step(row: EpisodeArrays, n: int, done: int) -> None:
-    """Do slow sensors, observation and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        n: Ticks of a control period.
-        done: Ticks integrated in the step.
-    """
+    """Do slow sensors, observation and report of one vehicle's step."""
     finish_slow_sensors(row, done, _observe_step(row, n, done))
 
 
@@ -286,11 +267,7 @@ def _finish_report(row: EpisodeArrays, k: int, count: int) -> None:
 
 @jit
 def finish_reset(row: EpisodeArrays) -> None:
-    """Do slow sensors, references, observation and report of tick 0.
-
-    Args:
-        row: Arrays of the episode, whose state and first fast row are written.
-    """
+    """Do slow sensors, references, observation and report of tick 0."""
     z, rows, switches, report = row.z, row.rows, row.switches, row.report
     motion, target = read(z, Z.motion), read(row.p, P.target)
     count = _sample_slow_sensors(row, motion, 0.0, 0)

@@ -149,14 +149,7 @@ def compute_first_row(
 
 @noinline
 def reset_vehicle(start: EpisodeStart, key_low: int, key_high: int, row: EpisodeArrays) -> None:
-    """Draw the episode from a key and deliver tick 0.
-
-    Args:
-        start: Packed start of the episode.
-        key_low: Lower 32 bits of the key.
-        key_high: Upper 32 bits.
-        row: Arrays of the episode, which are written.
-    """
+    """Draw the episode from a key and deliver tick 0."""
     p, z = row.p, row.z
     copy_into(start.params, p)
     copy_into(start.switches, row.switches)

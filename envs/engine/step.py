@@ -45,11 +45,7 @@ class StepEnd(NamedTuple):
 
 @jit
 def make_step_params(p: Vector) -> StepParams:
-    """Make the parameters that are constant within an env-step.
-
-    Args:
-        p: Packed parameters, shape (PARAMS_WIDTH,).
-    """
+    """Make the parameters that are constant within an env-step."""
     return StepParams(
         car=read(p, P.car), road=read(p, P.road), motor=read(p, P.motor),
         steering=read(p, P.steering), wind=read(p, P.wind), speed_profile=read(p, P.speed_profile),
@@ -62,12 +58,7 @@ def make_step_params(p: Vector) -> StepParams:
 
 @jit
 def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
-    """Make the variant of a vehicle's ticks.
-
-    Args:
-        p: Packed parameters, shape (PARAMS_WIDTH,).
-        switches: `Switches` of the episode.
-    """
+    """Make the variant of a vehicle's ticks."""
     flags = read(switches, FLAGS)
     n_lagging = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     has_driver = int(flags.steering == DRIVER)
@@ -78,11 +69,7 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
 
 
 def get_start_variant(start: EpisodeStart) -> StepVariant:
-    """Get the variant of an episode's ticks.
-
-    Args:
-        start: Packed start of the episode.
-    """
+    """Get the variant of an episode's ticks."""
     return StepVariant(*map(int, make_step_variant(start.params, start.switches)))
 
 
@@ -212,11 +199,7 @@ def write_final_state(
 
 @jit
 def clip_action(action: Vector) -> tuple[float, float]:
-    """Clip an action to +-1, as (yaw moment, added steering); NaN where it is not finite.
-
-    Args:
-        action: Fractions of full scale, shape (1,) or (2,).
-    """
+    """Clip an action to +-1, as (yaw moment, added steering); NaN where it is not finite."""
     # in plain Python a float32 would make float32 of all that follows
     yaw_share = float(action[0])
     steer_share = float(action[1]) if len(action) > 1 else 0.0
@@ -228,11 +211,7 @@ def clip_action(action: Vector) -> tuple[float, float]:
 
 @jit
 def check_action_range(action: Vector) -> int:
-    """Check an action's range: WILD where a number is finite and beyond WILD_LIMIT, else 0.
-
-    Args:
-        action: Fractions of full scale, shape (1,) or (2,).
-    """
+    """Check an action's range: WILD where a number is finite and beyond WILD_LIMIT, else 0."""
     for share in action:
         if (share > WILD_LIMIT or share < -WILD_LIMIT) and share - share == 0.0:
             return WILD
@@ -241,11 +220,7 @@ def check_action_range(action: Vector) -> int:
 
 @jit
 def reject_action(row: EpisodeArrays) -> int:
-    """Refuse an action that is not finite (REFUSED), or fail the episode by `fail_bad` (0 ticks).
-
-    Args:
-        row: Arrays of the episode.
-    """
+    """Refuse an action that is not finite (REFUSED), or fail the episode by `fail_bad` (0)."""
     z, report = row.z, row.report
     if row.switches[FLAGS.fail_bad] == 0:
         return REFUSED
@@ -258,13 +233,7 @@ def reject_action(row: EpisodeArrays) -> int:
 
 @noinline
 def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
-    """Step a vehicle by n ticks, fewer at the end; returns how many, or what `reject_action` does.
-
-    Args:
-        row: Arrays of the episode.
-        action: Fractions of full scale of the yaw moment and, if there are two, the added steering.
-        n: Ticks of a control period.
-    """
+    """Step a vehicle by n ticks, fewer at the end: how many, or what `reject_action` returns."""
     shares = clip_action(action)
     if shares[0] != shares[0]:
         return int(reject_action(row))
@@ -277,11 +246,6 @@ def step_vehicle(row: EpisodeArrays, action: Vector, n: int) -> int:
 
 @jit
 def step_episode(row: EpisodeArrays, action: Vector) -> int:
-    """Step by a control period as `step_vehicle`, WILD added for an action beyond its limit.
-
-    Args:
-        row: Arrays of the episode.
-        action: Fractions of full scale, shape (1,) or (2,).
-    """
+    """Step by a control period as `step_vehicle`, WILD added for an action beyond its limit."""
     done = int(step_vehicle(row, action, len(row.rows)))
     return done + check_action_range(action) if done > 0 else done

@@ -238,15 +238,7 @@ def _follow_nominal_path(
 def compute_inputs(
     params: StepParams, inputs: TickInputs, state: StepState, tick: Scalar, variant: StepVariant
 ) -> _PlantInputs:
-    """Compute the plant's inputs during a tick.
-
-    Args:
-        params: Parameters of the step.
-        inputs: Inputs of the tick.
-        state: State at the start.
-        tick: Tick at which it starts.
-        variant: Variant of the tick.
-    """
+    """Compute the plant's inputs during a tick."""
     motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
     drive, driver, car, draws = state.drive, state.driver, state.car, inputs.draws
     slewing = limit_rate(drive.slewing, inputs.added, task.slew)
@@ -347,15 +339,7 @@ def measure_tick(
 def integrate_tick(
     params: StepParams, inputs: TickInputs, state: StepState, tick: Scalar, variant: StepVariant
 ) -> tuple[StepState, Measurements]:
-    """Integrate one tick of the plant.
-
-    Args:
-        params: Parameters of the step.
-        inputs: Inputs of the tick.
-        state: State at the start.
-        tick: Tick at which it starts.
-        variant: Variant of the tick.
-    """
+    """Integrate one tick of the plant."""
     state, nominal_motion = _update_tyres(params, state, tick, variant), state.nominal_motion
     if variant.road == NOMINAL_PATH:
         params, nominal_motion = _follow_nominal_path(params, state, tick)

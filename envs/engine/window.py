@@ -66,22 +66,13 @@ _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
 def make_window(n: int) -> Array:
-    """Make a window of zeros, shape (WINDOW_HEIGHT, columns).
-
-    Args:
-        n: Ticks of a step.
-    """
+    """Make a window of zeros, shape (WINDOW_HEIGHT, columns)."""
     return np.zeros((WINDOW_HEIGHT, -(-n // LANES) * LANES))  # whole lanes
 
 
 @jit
 def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
-    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`.
-
-    Args:
-        p: Packed parameters.
-        tick: Tick of the angle.
-    """
+    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])
     return compute_steering(tick, p[P.steering_profile[0] :])
@@ -89,12 +80,7 @@ def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
 
 @jit
 def overwrite_steering(row: EpisodeArrays, n: int) -> None:
-    """Write the angles of a trace, or of a wandering driver, over those of the profile.
-
-    Args:
-        row: `EpisodeArrays` of one vehicle, whose window is written.
-        n: Number of ticks.
-    """
+    """Write the angles of a trace, or of a wandering driver, over those of the profile."""
     p, z, window = row.p, row.z, row.window
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
@@ -113,13 +99,7 @@ def overwrite_steering(row: EpisodeArrays, n: int) -> None:
 
 @jit
 def precompute_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
-    """Write noise and steering of one vehicle's next ticks.
-
-    Args:
-        row: `EpisodeArrays` of the vehicle, whose window is written.
-        n: Number of ticks.
-        variant: Variant of the ticks.
-    """
+    """Write noise and steering of one vehicle's next ticks."""
     first = int(row.z[Z.clock.tick]) + 1
     for j in range(0, n, count_lanes()):
         _write_ticks(row, j, iota(first + j), variant)
@@ -128,13 +108,7 @@ def precompute_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
 
 @jit
 def precompute_lane_window(row: EpisodeArrays, n: int, variant: StepVariant) -> None:
-    """Write noise and steering of a block's next ticks, but for `overwrite_steering`.
-
-    Args:
-        row: `EpisodeArrays` of the block, whose window is written.
-        n: Number of ticks.
-        variant: Variant of the ticks.
-    """
+    """Write noise and steering of a block's next ticks, but for `overwrite_steering`."""
     tick = load_element(row.z, Z.clock.tick)
     for j in range(n):
         _write_ticks(row, j, to_int(tick + (j + 1)), variant)

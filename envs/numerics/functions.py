@@ -4,6 +4,15 @@ Library functions differ in the last bit between platforms; these polynomials us
 correctly rounded square roots. A random number is a pure function of (key, tick, channel) by
 Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), whose 32-bit
 words are signed 64-bit integers under masks.
+
+Args:
+    x: Argument; an angle in rad.
+    angle: Angle (rad).
+    seconds: Time (s).
+    key_low: Lower 32 bits of a key.
+    key_high: Its upper 32 bits.
+    tick: The tick, or several.
+    block: Block of `Channels`.
 """
 
 from typing import NamedTuple
@@ -41,11 +50,7 @@ def _cos_kernel(r: Scalar) -> Scalar:
 
 @jit
 def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
-    """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad.
-
-    Args:
-        x: Angle (rad).
-    """
+    """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
     k = floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
     return _quadrant(k - 4.0 * floor(0.25 * k), _sin_kernel(r), _cos_kernel(r))
@@ -74,11 +79,7 @@ def _atan_kernel(t: Scalar) -> Scalar:
 
 @jit
 def atan(x: Scalar) -> Scalar:
-    """Compute arctan x (rad), error below 5e-16: reciprocal above 1, two half-angle steps, series.
-
-    Args:
-        x: Tangent of the angle.
-    """
+    """Compute arctan x (rad), error below 5e-16: reciprocal above 1, two half angles, series."""
     steep = absolute(x) > 1.0
     u = select(steep, -1.0, x) / select(steep, x, 1.0)
     t = u / (1.0 + sqrt(1.0 + u * u))
@@ -88,11 +89,7 @@ def atan(x: Scalar) -> Scalar:
 
 @jit
 def compute_arctan_gap(x: Scalar) -> Scalar:
-    """Compute 1 - arctan(x) / x, 0 to 1, for |x| < 1e30, error below 3e-11 (1 + |x|), one quotient.
-
-    Args:
-        x: Tangent of the angle.
-    """
+    """Compute 1 - arctan(x) / x, 0 to 1, |x| < 1e30, error below 3e-11 (1 + |x|), one quotient."""
     s, z = absolute(x), x * x
     q = z * z  # short chains: a plant's stage waits for them
     above = 5.586100468508 * z + 1.012690968234 + q * (0.9999999939284 * z + 5.579042025092)
@@ -105,11 +102,7 @@ def compute_arctan_gap(x: Scalar) -> Scalar:
 
 @jit
 def compute_sine(x: Scalar) -> Scalar:
-    """Compute sin x, error below 1e-13 + 2e-16 |x| for |x| < 1e6 rad, in half of `sincos`' time.
-
-    Args:
-        x: Angle (rad).
-    """
+    """Compute sin x, error below 1e-13 + 2e-16 |x| for |x| < 1e6 rad, in half of `sincos`' time."""
     k = floor(x * (0.5 * _TWO_OVER_PI) + 0.5)
     r = (x - k * (2.0 * _PI_2_HIGH)) - k * (2.0 * _PI_2_LOW)
     z = r * r
@@ -143,32 +136,20 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
 
 @jit
 def wrap(angle: Scalar) -> Scalar:
-    """Wrap an angle (rad) into [-pi, pi).
-
-    Args:
-        angle: Angle (rad).
-    """
+    """Wrap an angle (rad) into [-pi, pi)."""
     return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
 
 
 @jit
 def smoothstep(x: Scalar) -> Scalar:
-    """Compute the C1 step: 0 below 0, 1 above 1, a cubic between.
-
-    Args:
-        x: Argument.
-    """
+    """Compute the C1 step: 0 below 0, 1 above 1, a cubic between."""
     t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
     return t * t * (3.0 - 2.0 * t)
 
 
 @jit
 def exp(x: Scalar) -> Scalar:
-    """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th.
-
-    Args:
-        x: Exponent.
-    """
+    """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th."""
     z = x * (1.0 / 64.0)
     p = (1.0 / 362880.0 * z + 1.0 / 40320.0) * z + 1.0 / 5040.0
     p = (p * z + 1.0 / 720.0) * z + 1.0 / 120.0
@@ -199,11 +180,7 @@ NEVER = -1.0
 
 @jit
 def round_to_ticks(seconds: Scalar) -> Scalar:
-    """Round a time in seconds to whole ticks.
-
-    Args:
-        seconds: The time (s).
-    """
+    """Round a time in seconds to whole ticks."""
     return floor(seconds / TICK + 0.5)
 
 
@@ -211,11 +188,7 @@ _round_to_ticks = as_python(round_to_ticks)
 
 
 def count_ticks(seconds: float) -> float:
-    """Round a time in seconds to whole ticks, without the compiler.
-
-    Args:
-        seconds: The time (s).
-    """
+    """Round a time in seconds to whole ticks, without the compiler."""
     return float(_round_to_ticks(seconds))
 
 
@@ -290,14 +263,7 @@ def _draw_normal_pair(first: int, second: int) -> tuple[Scalar, Scalar]:
 
 @jit
 def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> _Four:
-    """Draw four independent standard normal numbers of a block at a tick.
-
-    Args:
-        key_low: Lower 32 bits of the key.
-        key_high: Upper 32 bits.
-        tick: The tick, or several.
-        block: Block of `Channels`.
-    """
+    """Draw four independent standard normal numbers of a block at a tick."""
     a, b, c, d = _philox(key_low, key_high, tick, block)
     n0, n1 = _draw_normal_pair(a, b)
     n2, n3 = _draw_normal_pair(c, d)

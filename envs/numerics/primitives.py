@@ -2,6 +2,11 @@
 
 Each kind of number has a table of them by name. The functions here serve Python floats; compiled,
 single numbers and lanes take the same instructions.
+
+Args:
+    a: Number.
+    b: Another number.
+    condition: Whether something holds, in each lane.
 """
 
 import math
@@ -19,115 +24,63 @@ Matrix: TypeAlias = Any
 
 
 def minimum(a: Scalar, b: Scalar) -> Scalar:
-    """Select the smaller of two numbers.
-
-    Args:
-        a: One number.
-        b: The other one, which is the result where one of them is NaN.
-    """
+    """Select the smaller of two numbers, b where one of them is NaN."""
     return a if a < b else b
 
 
 def maximum(a: Scalar, b: Scalar) -> Scalar:
-    """Select the larger of two numbers.
-
-    Args:
-        a: One number.
-        b: The other one, which is the result where one of them is NaN.
-    """
+    """Select the larger of two numbers, b where one of them is NaN."""
     return a if a > b else b
 
 
 def absolute(a: Scalar) -> Scalar:
-    """Compute |a|.
-
-    Args:
-        a: A float.
-    """
+    """Compute |a|."""
     return math.fabs(a)
 
 
 def floor(a: Scalar) -> Scalar:
-    """Round down to the largest whole number at or below, as a float.
-
-    Args:
-        a: A float.
-    """
+    """Round down to the largest whole number at or below, as a float."""
     return math.floor(a) * 1.0
 
 
 def sqrt(a: Scalar) -> Scalar:
-    """Compute the square root, correctly rounded.
-
-    Args:
-        a: A float.
-    """
+    """Compute the square root, correctly rounded."""
     return math.sqrt(a)
 
 
 def select(condition: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    """Select one of two numbers, both of which are evaluated.
-
-    Args:
-        condition: Whether it is the first one.
-        a: The number where the condition holds.
-        b: The number elsewhere.
-    """
+    """Select a where the condition holds, else b; both are evaluated."""
     return a if condition else b
 
 
 def to_float(a: Scalar) -> Scalar:
-    """Convert an integer to a float.
-
-    Args:
-        a: The integer; a float stays.
-    """
+    """Convert an integer to a float; a float stays."""
     return a * 1.0
 
 
 def frexp(a: Scalar) -> Scalar:
-    """Split a float into m 2^e with 0.5 <= m < 1: (m, e), both floats.
-
-    Args:
-        a: Positive float.
-    """
+    """Split a positive float into m 2^e with 0.5 <= m < 1: (m, e), both floats."""
     m, e = math.frexp(a)
     return m, e * 1.0
 
 
 def to_int(a: Scalar) -> Scalar:
-    """Convert a float that is a whole number to an integer.
-
-    Args:
-        a: Float to convert.
-    """
+    """Convert a float that is a whole number to an integer."""
     return int(a)
 
 
 def to_word(a: Scalar) -> Scalar:
-    """Convert a float to a 32-bit word: its value, or its bits where floats have 32 bits.
-
-    Args:
-        a: The float that stands for the word.
-    """
+    """Convert a float to a 32-bit word: its value, or its bits where floats have 32 bits."""
     return int(a)
 
 
 def from_word(a: Scalar) -> Scalar:
-    """Convert a 32-bit word to a float.
-
-    Args:
-        a: Word to convert.
-    """
+    """Convert a 32-bit word to a float."""
     return a * 1.0
 
 
 def any_lane(condition: Scalar) -> Scalar:
-    """Check whether a condition holds for any of the cars in the lanes.
-
-    Args:
-        condition: Truth value of each lane.
-    """
+    """Check whether a condition holds for any of the cars in the lanes."""
     return condition
 
 
