@@ -3,6 +3,11 @@
 Motion and cost are summed tick by tick: what is minimised is the episode's cost J itself, but for
 its cap, of the linear car at a held speed, with driver's command and references held. Gains are
 designed on a grid of speeds and cornering stiffnesses, and interpolated in compiled code.
+
+Args:
+    vehicle: Vehicle of the design.
+    speed: Speed (m/s).
+    design_spec: Parameters of the design.
 """
 
 import itertools
@@ -110,13 +115,7 @@ class DesignModel:
 
 
 def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
-    """Make the model of a vehicle at a speed, in steps of `design_spec.period` ticks.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        design_spec: Parameters of the design.
-    """
+    """Make the model of a vehicle at a speed, in steps of `design_spec.period` ticks."""
     G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
     W = TICK * np.diag(design_spec.cost_weights)
@@ -158,11 +157,6 @@ def make_tick_model(
 
     The cost judges the outputs: e_beta and e_gamma at the tick's end, and the tick's means of the
     delivered fraction of the yaw moment and of the added steering (the applied less the driver's).
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        design_spec: Parameters of the design.
     """
     lags = [make_lag(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _discretise_plane(vehicle, speed, design_spec)

@@ -2,6 +2,11 @@
 
 `contests.json` holds those that demand enough of a car without control (`calibration.py`). Test
 seeds follow a salt, a hash of the entries' sources and the world: nobody can have tuned on them.
+
+Args:
+    salt: Hexadecimal digits, else ValueError.
+    n: Number of seeds.
+    more: Texts that make salt or seeds others.
 """
 
 import hashlib
@@ -203,11 +208,7 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash, in hexadecimal, of entries' files, weights, world version and texts.
-
-    Args:
-        more: Texts that belong to it.
-    """
+    """Make the salt: a hash of the files of entries, their weights, the world's version and texts."""
     digest = hashlib.sha256(str(WORLD_VERSION).encode())
     for folder, endings in _ENTRY_SOURCES.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
@@ -218,13 +219,7 @@ def make_salt(*more: str) -> str:
 
 
 def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
-    """Make the first test seeds of a salt, below 2^32; more seeds keep the first.
-
-    Args:
-        salt: Hexadecimal digits; ValueError for another text.
-        n: Number of seeds.
-        more: Text that makes them others.
-    """
+    """Make the first test seeds of a salt, below 2^32; more seeds keep the first."""
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
     words = [int(salt[i : i + 8], 16) for i in range(0, len(salt), 8)]
@@ -237,18 +232,10 @@ def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
     """Make the function from a task to its first n test seeds.
 
     They differ: tasks that share their cars would not be independent strata of an interval.
-
-    Args:
-        salt: Hexadecimal digits.
-        n: Number of seeds.
     """
     return lambda task: make_salted_seeds(salt, n, task.seed_text)
 
 
 def make_tuning_seeds(n: int) -> list[int]:
-    """Make the first seeds on which tasks are chosen and controllers tuned: no test's.
-
-    Args:
-        n: Number of seeds.
-    """
+    """Make the first seeds on which tasks are chosen and controllers tuned: no test's."""
     return list(range(_TUNING, _TUNING + n))

@@ -127,11 +127,7 @@ class SineDwellResult:
 
 
 def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
-    """Measure A (rad at the steering wheel), the mean of turns to the left and to the right.
-
-    Raises:
-        ValueError: If the car never passes 0.375 g.
-    """
+    """Measure A (rad at the steering wheel), mean of both sides; ValueError short of 0.375 g."""
     turns = [drive(_make_slow_steer(car, side)) for side in (1.0, -1.0)]
     return float(np.mean([_fit_reference_angle(turn, car.ratio) for turn in turns]))
 

@@ -138,12 +138,7 @@ class Windows:
 
     @classmethod
     def from_logs(cls, logs: Sequence[Log], car: Vehicle) -> "Windows":
-        """Make windows of drives of one dt, without rows in which the gyro is at its limit.
-
-        Args:
-            logs: Recorded drives, at least one.
-            car: Stated car.
-        """
+        """Make windows of drives of one dt, without rows in which the gyro is at its limit."""
         dt, first, pieces, starts = logs[0].record.dt, 0, [], []
         every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
         before, after = (round(seconds / (every * dt)) for seconds in (_MARGIN, _REACH))

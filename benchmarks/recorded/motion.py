@@ -55,13 +55,7 @@ class LoggedMotion(NamedTuple):
 
 
 def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
-    """Estimate the sideslip angle (rad) of drives, shape (rows,) each, by the gyro alone.
-
-    Args:
-        logs: Recorded drives, at least one.
-        car: Car that is assumed.
-        wires: Calibration of the steering.
-    """
+    """Estimate the sideslip angle (rad) of drives, shape (rows,) each, by the gyro alone."""
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
     steered = wires._replace(latency={}, at={})

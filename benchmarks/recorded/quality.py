@@ -204,11 +204,7 @@ def find_saturated(log: Log, name: str = "gyro") -> npt.NDArray[np.bool_]:
 
 
 def find_swapped(logs: Sequence[Log]) -> str:
-    """Find what columns seem to be swapped and why, "" for none that can be seen.
-
-    Args:
-        logs: Parts of the log.
-    """
+    """Find what columns seem to be swapped and why, "" for none that can be seen."""
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
     speed, turning, accel_y, accel_x, steer = smooth_columns(logs, *names)

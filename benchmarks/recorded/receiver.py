@@ -216,11 +216,7 @@ def replay_nmea(log: str | Path) -> ReceiverReplay:
 
 
 def make_receiver_suite(replay: ReceiverReplay) -> Suite:
-    """Make a suite of the verdict, the counts and the numbers of each law.
-
-    Args:
-        replay: Results of a log.
-    """
+    """Make a suite of the verdict, the counts and the numbers of each law."""
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
     step = np.diff(track.t)
@@ -304,23 +300,13 @@ def _add_table(
 
 
 def write_kml(path: Path, replay: ReceiverReplay) -> None:
-    """Write the fixes as a track for a map.
-
-    Args:
-        path: Path of the KML file.
-        replay: Results of a log.
-    """
+    """Write the fixes as a track for a map."""
     track = replay.track
     write_text(path, make_track_kml(replay.name, "fixes", track.east, track.north, track.origin))
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:
-    """Draw the track and the errors of the next fix by HDOP as a picture (extra `report`).
-
-    Args:
-        path: Path of the picture, whose ending chooses the format.
-        replay: Results of a log.
-    """
+    """Draw the track and the errors of the next fix by HDOP as a picture (extra `report`)."""
     with require_extra("report", "pictures need matplotlib"):
         from matplotlib.colors import LogNorm
         from matplotlib.figure import Figure

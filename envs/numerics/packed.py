@@ -5,6 +5,12 @@
 A single car's numbers lie in a vector or matrix; those of several cars in SIMD lanes have one axis
 more, the last, and the same functions read and write lanes there. Lanes that are written to a
 C-contiguous matrix of single numbers go along its row.
+
+Args:
+    array: Vector, matrix or an array of lanes, with one axis more.
+    where: Offsets of numbers, a NamedTuple or a tuple.
+    index: Place on the array's axes, those behind `where`'s in `read` and `write`.
+    first: First of the `lane_width(array)` columns.
 """
 
 from collections.abc import Sequence
@@ -49,13 +55,7 @@ def make_offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
 
 
 def read(array: Vector, where: T, *index: int) -> T:
-    """Read neighbours along the first axis of a packed array, in a tuple like `where`.
-
-    Args:
-        array: Packed array.
-        where: Their offsets, a NamedTuple or tuple.
-        index: Their place on the other axes.
-    """
+    """Read neighbours along the first axis of a packed array, in a tuple like `where`."""
     first, numbers = where[0], len(where)  # type: ignore[index,arg-type]
     values = array[(slice(first, first + numbers), *index)].tolist()
     make: Any = getattr(where, "_make", tuple)
@@ -76,12 +76,7 @@ def write(array: Vector, values: tuple[Scalar, ...], where: tuple[int, ...], *in
 
 
 def load_element(array: Vector, *index: int) -> Scalar:
-    """Load a number of an array.
-
-    Args:
-        array: Vector, or an array with further axes.
-        index: Index of the element, by axis.
-    """
+    """Load a number of an array."""
     return array[index].item()
 
 
@@ -97,22 +92,12 @@ def store_element(array: Vector, value: Scalar, *index: int) -> None:
 
 
 def lane_width(array: Matrix) -> int:
-    """Count the columns of a matrix that `load_lanes` reads at once; 1 where they are lanes.
-
-    Args:
-        array: The matrix, or one of lanes.
-    """
+    """Count the columns of a matrix that `load_lanes` reads at once; 1 where they are lanes."""
     return 1
 
 
 def load_lanes(array: Matrix, where: T, first: int) -> T:
-    """Read neighbouring columns of a matrix into lanes, in a tuple like `where`.
-
-    Args:
-        array: The matrix, or one of lanes.
-        where: Rows to read, a NamedTuple of offsets.
-        first: First of the `lane_width(array)` columns.
-    """
+    """Read neighbouring columns of a matrix into lanes, in a tuple like `where`."""
     return read(array, where, first)
 
 
@@ -122,11 +107,7 @@ def count_lanes() -> int:
 
 
 def iota(first: int) -> Scalar:
-    """Make lanes of `count_lanes()` consecutive whole numbers.
-
-    Args:
-        first: The first of them.
-    """
+    """Make lanes of `count_lanes()` consecutive whole numbers."""
     return first
 
 

@@ -5,6 +5,14 @@
 In an array (rows, columns) a load moves eight columns. An array (rows, columns, LANES) holds a
 matrix of each of eight filters: there it moves one element of all, `vector_width` is 1, and of a
 symmetric matrix only the upper triangle counts. The Python bodies serve the first kind alone.
+
+Args:
+    array: Matrix or vector, or one of lanes.
+    matrix: Symmetric matrix.
+    index: Index of the first of eight numbers.
+    rows: Number of rows.
+    k: Index of a row.
+    j: Index of the first of eight columns.
 """
 
 import math
@@ -24,35 +32,18 @@ _LINE_BYTES = 64  # of a cache line: eight numbers
 
 
 def load8(array: Matrix, *index: int) -> Scalar:
-    """Load eight neighbours of a matrix's row or of a vector.
-
-    Args:
-        array: The matrix or vector.
-        index: Index of the first of them.
-    """
+    """Load eight neighbours of a matrix's row or of a vector."""
     *row, first = index
     return array[(*row, slice(first, first + 8))].copy()
 
 
 def load8_symmetric(matrix: Matrix, k: int, j: int) -> Scalar:
-    """Load eight neighbours of a row of a symmetric matrix.
-
-    Args:
-        matrix: Symmetric matrix.
-        k: Index of the row.
-        j: Index of the first column.
-    """
+    """Load eight neighbours of a row of a symmetric matrix."""
     return load8(matrix, k, j)
 
 
 def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
-    """Count the rows to process in eight columns: all, or of lanes those above the diagonal.
-
-    Args:
-        matrix: Symmetric matrix.
-        rows: Number of its rows.
-        j: First of the columns.
-    """
+    """Count the rows to process in eight columns: all, or of lanes those above the diagonal."""
     return rows
 
 
@@ -104,11 +95,7 @@ def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> Matrix
 
 
 def vector_width(array: Matrix) -> int:
-    """Count the columns of a matrix that `load8` reads at once; 1 where they are lanes.
-
-    Args:
-        array: The matrix, or one of lanes.
-    """
+    """Count the columns of a matrix that `load8` reads at once; 1 where they are lanes."""
     return 8
 
 

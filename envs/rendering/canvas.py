@@ -1,6 +1,17 @@
 """A canvas with smooth edges, and the window that shows pictures: one a process.
 
 Shapes are drawn at twice their size and shrunk, text is not. Drawing needs no display.
+
+Args:
+    picture: Picture as a surface of pygame.
+    box: Left, top, width and height (px); None: the whole picture.
+    points: Points or corners (px), shape (n, 2).
+    start: Foot of an arrow (px), shape (2,).
+    end: Its tip (px), shape (2,).
+    centre: Centre (px), shape (2,).
+    radius: Radius (px), to the middle of the line.
+    colour: Colour of what is drawn.
+    width: Width of a line (px); 0 fills a circle.
 """
 
 import functools
@@ -42,31 +53,16 @@ class Canvas:
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
     def set_clip(self, box: Box | None) -> None:
-        """Limit the drawing of shapes to a box; text is never clipped.
-
-        Args:
-            box: The box; None: the whole picture.
-        """
+        """Limit the drawing of shapes to a box; text is never clipped."""
         self._large.set_clip(None if box is None else _scale_box(box))
 
     def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
-        """Draw a filled box with round corners.
-
-        Args:
-            box: Left, top, width and height (px).
-            colour: Its colour.
-            radius: Radius of the corners (px).
-        """
+        """Draw a filled box with round corners."""
         corner = round(_OVERSAMPLING * radius)
         pygame.draw.rect(self._large, colour, _scale_box(box), border_radius=corner)
 
     def draw_polygon(self, points: Points, colour: str) -> None:
-        """Draw a filled polygon.
-
-        Args:
-            points: Corners (px), shape (n, 2).
-            colour: Its colour.
-        """
+        """Draw a filled polygon."""
         scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
@@ -94,27 +90,13 @@ class Canvas:
             pygame.draw.circle(self._large, colour, point, thick / 2)
 
     def draw_disc(self, centre: Points, radius: float, colour: str, width: float = 0.0) -> None:
-        """Draw a circle.
-
-        Args:
-            centre: Its centre (px), shape (2,).
-            radius: Its radius (px), to the middle of the line.
-            colour: Its colour.
-            width: Width of the line (px); 0 fills the circle.
-        """
+        """Draw a circle."""
         thick = max(round(_OVERSAMPLING * width), 1) if width else 0
         place, outer = _scale_points(np.atleast_2d(centre))[0], _OVERSAMPLING * radius + thick / 2
         pygame.draw.circle(self._large, colour, place, outer, thick)
 
     def draw_arrow(self, start: Points, end: Points, colour: str, width: float = 2.0) -> None:
-        """Draw a line with a head at its end; the head shrinks with a short one.
-
-        Args:
-            start: Its foot (px), shape (2,).
-            end: Its tip (px), shape (2,).
-            colour: Its colour.
-            width: Width of the line (px).
-        """
+        """Draw a line with a head at its end; the head shrinks with a short one."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
@@ -158,11 +140,7 @@ class Canvas:
 
 
 def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
-    """Read the red, green and blue of a picture, shape (height, width, 3).
-
-    Args:
-        picture: Picture as a surface of pygame.
-    """
+    """Read the red, green and blue of a picture, shape (height, width, 3)."""
     return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
 
 
