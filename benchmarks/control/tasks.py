@@ -208,7 +208,7 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash of the files of entries, their weights, the world's version and texts."""
+    """Make the salt: a hash of entries' files, their weights, the world's version and texts."""
     digest = hashlib.sha256(str(WORLD_VERSION).encode())
     for folder, endings in _ENTRY_SOURCES.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
