@@ -18,8 +18,19 @@ from ...envs.io import read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.tables import print_suite
-from .common import print_written, refuse_unused_options, write_output
-from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
+from .common import (
+    File,
+    Text,
+    Texts,
+    check_file,
+    parse_options,
+    print_written,
+    refuse_unused_options,
+    register,
+    take,
+    take_argument,
+    write_output,
+)
 
 if TYPE_CHECKING:
     from ...envs.sensors.camera.images import Image, Pinhole

@@ -19,9 +19,20 @@ from rich.markup import escape
 from ...envs.validation import check_choice
 from ..harness.results import write_text
 from ..report.study import format_verdict
-from .common import make_driver, make_setup, print_written, refuse_unused_options, show_episode
+from .common import (
+    File,
+    Text,
+    Texts,
+    make_driver,
+    make_setup,
+    print_written,
+    refuse_unused_options,
+    register,
+    show_episode,
+    take,
+    take_argument,
+)
 from .names import check_env
-from .options import File, Text, Texts, register, take, take_argument
 
 console = Console(soft_wrap=True, highlight=False)
 

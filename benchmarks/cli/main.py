@@ -14,8 +14,8 @@ from ..harness.parallel import report_user_errors, use_engine
 from ..report.html import check_page, write_page
 from ..suites import SALTED, SUITES, Request, run_suites
 from . import common, data, live, policies  # noqa: F401  # they register their commands
+from .common import File, Text, Texts, app, register, take, take_argument
 from .names import KINDS
-from .options import File, Text, Texts, app, register, take, take_argument
 from .search import tune_app
 
 if TYPE_CHECKING:

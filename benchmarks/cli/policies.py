@@ -19,9 +19,19 @@ from ..harness.parallel import Bar, use_shared_bar
 from ..harness.results import check_writable
 from ..harness.stats import Estimate
 from . import common
-from .common import get_command_line, print_written
+from .common import (
+    File,
+    Text,
+    Texts,
+    check_file,
+    get_command_line,
+    parse_options,
+    print_written,
+    register,
+    take,
+    take_argument,
+)
 from .names import check_env
-from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
     from ...agents.learned.network import Network

@@ -12,8 +12,19 @@ from ...envs.validation import check_choice
 from ..harness.parallel import use_engine
 from ..harness.results import check_writable
 from ..report.tables import print_suite
-from .common import get_command_line, handle_interrupt, print_written
-from .options import File, Text, Texts, check_file, parse_options, register, take, take_argument
+from .common import (
+    File,
+    Text,
+    Texts,
+    check_file,
+    get_command_line,
+    handle_interrupt,
+    parse_options,
+    print_written,
+    register,
+    take,
+    take_argument,
+)
 
 tune_app = Typer(no_args_is_help=True)
 

@@ -15,7 +15,7 @@ from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import CURVE, POLICY
 from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.cli import policies as train_command
-from sideslip.benchmarks.cli.options import parse_options
+from sideslip.benchmarks.cli.common import parse_options
 from sideslip.benchmarks.cli.policies import _make_command
 from sideslip.benchmarks.studies import policies as enjoy
 from sideslip.benchmarks.studies.policies import _list_tasks
