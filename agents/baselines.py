@@ -111,7 +111,7 @@ def _make_error_options(scenario: Scenario, world: World) -> dict[str, float]:
     turning = _ACCELERATION / speed  # rad/s, of a manoeuvre
     lag = get_rms("map_lag") * turning  # rad, error of the road's direction
     course = plain["course"], _WAVE * get_rms("course_error"), get_rms("gps_stamp") * _ACCELERATION
-    known = SCENARIOS.get(scenario.name, scenario)  # of a variant too: nobody is told of it
+    known = SCENARIOS.get(scenario.name, scenario)  # nobody is told of a change
     spreads = [compute_range_rms(known, name, 1.0) for name in STIFFNESSES]
     force_share = math.hypot(*spreads) * _WAVE * _ACCELERATION / GRAVITY
     options = {f"{name}_sd": get_rms(name) for name in ("camera_yaw", "steer_offset")} | {

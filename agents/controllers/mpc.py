@@ -135,7 +135,8 @@ class Mpc(Lqr):
         for x, memory, row_action, max_moment in rows:
             make_design_state(x, self.share, z)
             if self.remembered:
-                z[-2:], memory[-2] = memory[-2:], z[2]
+                z[-2:] = memory[-2:]  # moments of the steps before
+                memory[-2] = z[2]
             speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
             self.status.append(self._solve(speed, z, memory, row_action, float(max_moment)))
             if self.remembered:

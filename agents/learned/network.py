@@ -190,7 +190,7 @@ def _apply_dense(z: Vector, numbers: Vector, offset: int, out: Vector) -> int:
 @jit_nrt
 def _step_cell(z: Vector, h: Vector, gates: int, numbers: Vector, offset: int) -> int:
     """Step torch's GRU (3 gates) or LSTM (4); h: its state, updated; return the place behind."""
-    n = len(h) // (gates - 2)
+    n = len(h) // (gates - 2)  # an LSTM has two numbers a unit
     from_input, from_state = np.empty(gates * n), np.empty(gates * n)
     offset = _compute_gates(z, h[:n], numbers, offset, from_input, from_state)
     for i in range(n):

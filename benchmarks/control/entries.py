@@ -50,7 +50,7 @@ _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d
 
 @dataclass(frozen=True)
 class Entry:
-    """An agent on an estimator, in any task; no key where options alone tell two entries apart."""
+    """An agent on an estimator, in any task; those that differ in options alone are equal."""
 
     agent: str  # name of `make_agent`, or a baseline
     estimator: str = ""  # name in `SETUPS` or of `make_estimator`, "truth"; "": none, or its own

@@ -75,7 +75,7 @@ HONESTY = (
     Column("coverage", "in 95 %", 100.0, ".0f", interval=False),
     Column("log_score", "log score", form=".2f", interval=False),
 )
-"""What `compute_honesty` computes."""
+"""Whether a filter's deviations are honest, by `stats.compute_honesty`."""
 
 
 @dataclass

@@ -183,8 +183,8 @@ def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Han
 LOWEST, HIGHEST = 0.2, 2.0  # Hz
 _SEGMENT = 10.0  # s, of the averaged periodograms
 OUTPUTS = ("gamma", "a_y")
-_STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
-_SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
+_STEP_ACCELERATION = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
+_SWEEP_ACCELERATION = 0.1 * GRAVITY  # of the sweep, where it is slow
 
 
 @dataclass(frozen=True)
@@ -313,8 +313,8 @@ def run_transient(drive: DriveFunction, car: TestCar) -> Transient:
     """Drive the step and the sweep."""
     vehicle, speed = car.vehicle, car.speed
     per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m
-    stepped = drive(_make_step(car, per * _STEP_AT))
-    sweep = _run_sweep(drive, car, per * _SWEEP_AT)
+    stepped = drive(_make_step(car, per * _STEP_ACCELERATION))
+    sweep = _run_sweep(drive, car, per * _SWEEP_ACCELERATION)
     linear_step = _compute_linear_step(vehicle, speed, stepped)
     linear = _compute_linear_response(vehicle, speed, sweep[OUTPUTS[0]].frequency)
     return Transient(_compute_responses(stepped), linear_step, sweep, linear)

@@ -30,6 +30,7 @@ STEERING_KINDS = (
     "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
     "sine-with-dwell", "ramp", "sweep", "held-step", "driver", "trace", "wander",
 )  # fmt: skip
+# places in a profile: a sine has amplitude, rad/s, phase, from, to, a step angle, from, rise
 SINES, STEPS = 4, 3
 _RAMP_START = 5 * SINES + 3 * STEPS
 _SWEEP_START = _RAMP_START + 3

@@ -74,7 +74,7 @@ class Link(NamedTuple):
     duplicate: Scalar
     outage_start: Scalar
     outage_end: Scalar
-    stamp: Scalar  # what a packet's stamp is after its capture; drawn
+    stamp: Scalar  # ticks by which a packet claims to be captured later; drawn
 
     @property
     def max_in_flight(self) -> int:

@@ -14,6 +14,7 @@ Args:
     row: Row of C, shape (n,).
     captured: Captured tick of a sample.
     target: What a sample measures: its first clone, or DIRECT, DROPPED, PREDICTED, WEIGHED.
+    k: Row of the present table of gains.
     residual: Measurement minus its prediction.
     fast_row: Fast row, shape (FAST_WIDTH,).
     packet: Packet, shape (PACKET_WIDTH,).

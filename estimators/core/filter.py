@@ -101,7 +101,7 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
             since_phase = maximum(first - f.phase[s], 0)
             f.next[s] = f.phase[s] + (since_phase + f.period[s] - 1) // f.period[s] * f.period[s]
     _fill(f.counts, 0)
-    f.lost = -1
+    f.evicted = -1
     for i in range(len(f.recent)):
         f.recent[i, PACKET.captured] = -1  # an empty place
     for i in range(len(f.own_decay)):

@@ -3,7 +3,8 @@
 pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22), double-layer-gps (28)-(29),
 dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error, by a constant gain K
 (columns: fast rows, slow rows) or a fraction of the last sample's gain. dual-rate: fractions of the
-last innovation from a table.
+last innovation from a table. In a table of gains the rows K^T between samples begin at
+`locate_frame_row(f, s, f.pattern)`; behind them stand as many of C^+ transposed.
 """
 
 from ...envs.numerics.jit import inline, jit
@@ -41,10 +42,10 @@ def locate_frame_row(f: FilterRecord, s: int, frame: int) -> Scalar:
 
 
 @jit
-def add_gain(f: FilterRecord, gains: GainTables, row: int, residual: float) -> None:
-    """Correct x by a row of the table of gains."""
+def add_gain(f: FilterRecord, gains: GainTables, k: int, residual: float) -> None:
+    """Correct x by row k of the table of gains."""
     for j in range(f.total):
-        store_element(f.x, load_element(f.x, j) + load_element(gains, f.cell, row, j) * residual, j)
+        store_element(f.x, load_element(f.x, j) + load_element(gains, f.cell, k, j) * residual, j)
 
 
 @jit

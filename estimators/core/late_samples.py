@@ -1,6 +1,7 @@
 """Late samples: what each rule does at a capture, with each step, at the arrival, and to the past.
 
-Besides this file only `packets` knows a rule: it filters the past anew for "buffer".
+In `core` only `packets` knows a rule besides: it filters the past anew for "buffer". What a rule
+stores, and which options go with it, `design.assemble` checks and allocates.
 """
 
 from ...envs.numerics.jit import inline, jit
@@ -25,7 +26,8 @@ stored: the residual against the prediction at the capture is used as if it were
 (15)-(16). constant: the same, for an assumed delay. larsen: the covariance takes it at its capture,
 the states when it arrives (Larsen 1998), exact for one under way and none lost. buffer: the window
 is filtered anew (`packets`), exact. literal, lag: late states follow by one step or a lag."""
-CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)  # of the field `delay_rule`
+# codes of the field `delay_rule`, places in RULES; the last two are IGNORE with late states
+CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 
 # what a sample measures, where it is no clone (its place, positive)
 DIRECT = -1  # the states as they are

@@ -140,11 +140,11 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int) -> bool:
     for i in range(len(f.recent)):
         if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
             place = i
-    lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    if f.tick - first >= WINDOW or first <= lost:
+    evicted = maximum(f.evicted, int(f.recent[place, PACKET.captured]))
+    if f.tick - first >= WINDOW or first <= evicted:
         f.counts[COUNTERS.refused] += 1
         return False
-    f.lost = lost
+    f.evicted = evicted
     copy_into(f.sample, f.recent[place])
     copy_into(f.r[s], f.recent_r[place])
     if captured == f.tick:  # is_new is True then
@@ -158,7 +158,7 @@ def _apply_sample(f: FilterRecord, gains: GainTables, s: int) -> bool:
     if f.delay_rule == BUFFER:
         return _rewind_update(f, gains, s)
     target = find_target(f, s, int(f.sample[PACKET.captured]))
-    is_usable = target != DROPPED  # True where update_filter's is_gated reads it
+    is_usable = target != DROPPED  # is_gated below: a literal would compile it anew
     return is_usable and update_filter(f, gains, s, target, is_usable)
 
 

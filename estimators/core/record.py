@@ -160,7 +160,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # tick, phase of a single-rate filter's steps
-    # the rule for late samples: codes of these and of intersample rules stand in `innovation`
+    # the rule for late samples: codes stand in `late_samples`, and in `intersample`
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
@@ -251,7 +251,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),
     ("recent", _FLOAT, (N_RECENT, PACKET_WIDTH)),
     ("recent_r", _FLOAT, (N_RECENT, N_ROWS)),  # r when each of them came
-    ("lost", _INT),  # captured tick of the newest packet that had to go
+    ("evicted", _INT),  # captured tick of the newest packet that had to go
     ("replay", _INT, (N_RECENT,)),  # scratch: those that are used again
 ]
 

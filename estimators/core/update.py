@@ -126,8 +126,8 @@ def compute_excess(f: FilterRecord) -> Scalar:
 @jit
 def is_healthy(f: FilterRecord) -> Scalar:
     """Return whether a filter is neither lost nor reverses; it is True where noise is fixed."""
-    is_known = f.speed > 0.0 - MIN_SPEED or f.r_share == 0.0
-    return is_known and compute_excess(f) < 1.0
+    is_forward = f.speed > 0.0 - MIN_SPEED or f.r_share == 0.0
+    return is_forward and compute_excess(f) < 1.0
 
 
 FIRST_VARIANCE = 100.0  # of a fast sensor over the configured one until its first block is over

@@ -60,7 +60,7 @@ _FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
 )
 # of a lane: ticks are those of now, of the last row, of the next packet to take and capture;
 # model_speed, 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds
-# is of no use; apart, 1: the tick is computed by the record; wild, 1: its residual is none
+# is of no use; apart, 1: its tick is computed alone; wild, 1: its residual is not finite
 _SCALARS = (
     *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
     *("now", "last", "due", "next", "here", "apart", "wild"),
@@ -229,6 +229,7 @@ class BatchEstimator:
 
     def take(self, mask: _Mask | None, record: StepRecord, observed: Observed) -> None:
         """Process rows and packets of some filters and write their outputs."""
+        # rows done: -1 before the first; a filter that the mask leaves out has done all
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, record.rows)
         bank = FilterBank(self.filters, self._pool, self._places)
         while _compile_observe_batch()(bank, done, self._lanes, record, observed) > 0:
@@ -312,7 +313,7 @@ def build_batch(
     source: str | EstimatorFactory, specs: Sequence[EstimatorSpec], dt: float,
     options: Mapping[str, Any],
 ) -> BatchEstimator:  # fmt: skip
-    """Build an estimator for each spec, compiled together where all are ours and none is late."""
+    """Build an estimator for each spec, compiled together where all are ours without `latency`."""
     build_one = functools.partial(make_estimator, source, dt=dt, **options)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
         first = build_one(**specs[0]._asdict())
