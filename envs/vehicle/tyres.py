@@ -80,7 +80,7 @@ def _compute_squared_capacity(limit: Scalar, drive: Scalar) -> Scalar:
 
 
 @jit
-def _depends_on_motion(variant: Variant) -> bool:
+def _has_moving_limits(variant: Variant) -> bool:
     """Whether the tyres' limits depend on loads that the motion shifts, or on F_z itself."""
     is_limited = variant.law == MAGIC_FORMULA or (variant.law != LINEAR and variant.roll == 1)
     return bool(variant.small_angle == 0 and is_limited)
@@ -120,7 +120,7 @@ def compute_tyre_load(inputs: Any, car: Car, variant: Variant) -> TyreLoad:
         load_r = minimum(1.0 + shift / (weight * car.l_f), _MAX_LOAD)
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
-    if not small_angle and not _depends_on_motion(variant):
+    if not small_angle and not _has_moving_limits(variant):
         F_l = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
         F_r = minimum(maximum(F_r, 0.0 - rear_r), rear_r)
         left = sqrt(_compute_squared_capacity(rear_l, F_l))
@@ -293,7 +293,7 @@ def compute_tyres(
     """Compute four `Tyre` (front, then rear; left first), drive force (N) and yaw moment (N m)."""
     if variant.law == MAGIC_FORMULA and not variant.small_angle:
         return _compute_magic_tyres(motion, load, car, g_y, variant)
-    if _depends_on_motion(variant):
+    if _has_moving_limits(variant):
         return _compute_shifted_tyres(motion, load, car, g_y)
     if variant.law == MAGIC_FORMULA:
         t_f, t_r = _compute_relaxed_slips(motion, load, car, variant.small_angle)
