@@ -1,4 +1,13 @@
-"""Files that are written whole or not at all, and documents in TOML or JSON."""
+"""Files that are written whole or not at all, and documents in TOML or JSON.
+
+Args:
+    path: Path of the file; its ending chooses a document's format.
+    source: Path of a file, or any value.
+    what: Kind of content, for messages.
+    values: Numbers, texts, lists and mappings of these by name.
+    kind: Dataclass whose fields name and type the values.
+    where: Place of the values, for messages.
+"""
 
 import contextlib
 import io
@@ -29,9 +38,6 @@ def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
 
     Links are followed, an older file's mode and owner stay; a pipe, a device or an open file such
     as /dev/stdout is written directly.
-
-    Args:
-        path: Path of the file.
 
     Yields:
         The file to write.
@@ -86,11 +92,7 @@ def write_atomic(path: Path | str, content: bytes) -> None:
 
 
 def is_document(source: object) -> bool:
-    """Check whether a value is a path: any `Path`, or a text with an ending.
-
-    Args:
-        source: Any value.
-    """
+    """Check whether a value is a path: any `Path`, or a text with an ending."""
     return isinstance(source, os.PathLike) or (isinstance(source, str) and "." in source[-8:])
 
 
@@ -99,10 +101,6 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
 
     Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
     to the file, and a file that is no TOML or JSON or holds no mapping.
-
-    Args:
-        source: Path of the file.
-        what: Kind of content, for messages.
     """
     path = Path(source)
     values = _parse_file(path, what)
@@ -152,12 +150,7 @@ def _find_base(path: Path, values: Mapping[str, object]) -> Path | None:
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, object]) -> None:
-    """Write a TOML or JSON file that `read_document` reads back; ValueError for another ending.
-
-    Args:
-        path: Path of the file, whose ending chooses the format.
-        values: Numbers, texts, lists and mappings of these by name.
-    """
+    """Write a TOML or JSON file that `read_document` reads back; ValueError for another ending."""
     kind = Path(path).suffix.lower()
     if kind not in _SUFFIXES:
         raise ValueError(f"{path}: expected a file that ends in {' or '.join(_SUFFIXES)}")
@@ -211,13 +204,7 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
 
 
 def check_types(kind: "type[DataclassInstance]", values: Mapping[str, object], where: str) -> None:
-    """Check that values have the types of a dataclass's fields; ValueError with place and field.
-
-    Args:
-        kind: Dataclass whose fields have the types.
-        values: Values by the names of fields.
-        where: Place of the values, for messages.
-    """
+    """Check that values have the types of a dataclass's fields; ValueError with place and field."""
     types: dict[str, Any] = {spec.name: spec.type for spec in fields(kind)}
     for name, value in values.items():
         expected = get_origin(types[name]) or types[name]

@@ -2,6 +2,13 @@
 
 The file holds weights as safetensors, whose metadata hold the card as JSON; reading it runs no
 code. The card says what the policy was trained on, how, and what it costs against others.
+
+Args:
+    name: Shipped name or path.
+    path: Path, or shipped name to read; FileNotFoundError without its file.
+    env_id: Id of a registered env.
+    estimator: Name of an estimator, "" for none.
+    estimator_options: Arguments of `EstimateObservation`.
 """
 
 import hashlib
@@ -121,13 +128,7 @@ class Card:
 
 
 def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
-    """Check that a foreign file names no code to import; ValueError where it does.
-
-    Args:
-        env_id: Id of a registered env.
-        estimator: Name of an estimator, or "".
-        estimator_options: Arguments of `EstimateObservation`, without an estimator.
-    """
+    """Check that a foreign file names no code to import; ValueError where it does."""
     if "estimator" in estimator_options:
         raise ValueError("estimator_options holds an estimator, which is none of its options")
     if ":" in env_id:
@@ -161,11 +162,7 @@ def list_shipped() -> list[str]:
 
 
 def is_policy(name: str) -> bool:
-    """Return whether a name is a shipped policy's, or a path with a policy's ending.
-
-    Args:
-        name: Name or path.
-    """
+    """Return whether a name is a shipped policy's, or a path with a policy's ending."""
     return name.endswith(SUFFIX) or name in list_shipped()
 
 
@@ -174,11 +171,7 @@ def _make_path(name: str | Path) -> Path:
 
 
 def hash_policy(name: str) -> str:
-    """Compute the SHA-256 of a policy's file in hexadecimal digits, "" for no policy's name.
-
-    Args:
-        name: Shipped name or path.
-    """
+    """Compute the SHA-256 of a policy's file in hexadecimal digits, "" for no policy's name."""
     path = _make_path(name)
     exists = is_policy(name) and path.is_file()
     return hashlib.sha256(path.read_bytes()).hexdigest() if exists else ""
@@ -206,11 +199,7 @@ def _check_width(card: Card, network: Network) -> None:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy's file or a shipped one; ValueError for an unknown format or unfit tensors.
-
-    Args:
-        path: Path or shipped name; FileNotFoundError without its file.
-    """
+    """Load a policy's file or a shipped one; ValueError for an unknown format or unfit tensors."""
     file = _make_path(path)
     if file.is_dir():
         raise FileNotFoundError(f"policy {path} is a folder")

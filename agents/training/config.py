@@ -1,6 +1,12 @@
 """The algorithms of `sideslip train`, their settings, and the task of a training.
 
 The settings in `hyperparams/`, in rl-baselines3-zoo's format, were chosen on YawVision-v0, seed 0.
+
+Args:
+    policy: Policy to train further.
+    algo: Name of the algorithm, in `ALGORITHMS`.
+    num_envs: Number of rows.
+    seconds: Control period (s).
 """
 
 import inspect
@@ -200,28 +206,16 @@ class TrainingTask:
         return self.estimator_options | {"estimator": self.estimator} if self.estimator else None
 
     def options(self, num_envs: int) -> dict[str, Any]:
-        """Make the options of a vector env, whose rows take turns with the scenarios.
-
-        Args:
-            num_envs: Number of rows.
-        """
+        """Make the options of a vector env, whose rows take turns with the scenarios."""
         turns = list(itertools.islice(itertools.cycle(self.scenarios), num_envs))
         return self.env_options | ({"scenario": turns} if turns else {})
 
     def vector_env(self, num_envs: int) -> CarVectorEnv:
-        """Make a vector env of the task with its estimator.
-
-        Args:
-            num_envs: Number of rows.
-        """
+        """Make a vector env of the task with its estimator."""
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, self.options(num_envs))
 
     def make_model_options(self, seconds: float) -> Settings:
-        """Make the arguments of the algorithm's class, in JSON types.
-
-        Args:
-            seconds: Control period (s).
-        """
+        """Make the arguments of the algorithm's class, in JSON types."""
         options = {k: value for k, value in self.settings.items() if k not in _TRAINING_SETTINGS}
         if "gamma" in options:  # which discounts as much in a second as in the file
             options["gamma"] = options["gamma"] ** (seconds / PERIOD)
@@ -298,12 +292,7 @@ def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
 
 
 def get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
-    """Get the `policy_kwargs` for a policy's network; ValueError where the algorithm has no such.
-
-    Args:
-        policy: Policy.
-        algo: Name of the algorithm.
-    """
+    """Get the `policy_kwargs` for a policy's network; ValueError where the algorithm has none."""
     network, on_tensors = policy.network, get_algorithm(algo).on_tensors
     kinds = [cell.kind for cell in network.cells]
     if algo != "ppo" and not on_tensors:

@@ -2,6 +2,12 @@
 
 A zip holds pickles, and unpickling runs the code in them. So nothing is read without `trust`, and
 `export_zip` writes a file that is read without it.
+
+Args:
+    path: Path of the zip.
+    file: Path of the zip.
+    trust: Whether code in the zip, or in the pickle, may run; PermissionError if not.
+    normalise: Pickle of VecNormalize; None: NAME.pkl or vecnormalize.pkl beside the zip, if any.
 """
 
 import json
@@ -212,12 +218,7 @@ def export_zip(
 
 
 def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | None:
-    """Find the pickle of a zip's VecNormalize; None without one.
-
-    Args:
-        path: Path of the zip.
-        normalise: Path of the pickle; None: one beside the zip, if there is one.
-    """
+    """Find the pickle of a zip's VecNormalize; None without one."""
     if normalise is not None:
         return Path(normalise)
     in_zoo = path.with_suffix("") / _NORMALISER  # where rl-baselines3-zoo puts it
@@ -226,12 +227,7 @@ def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | N
 
 
 def check_trusted(file: Path, trust: bool) -> None:
-    """Check that a file is a zip of stable-baselines3; PermissionError where it is not trusted.
-
-    Args:
-        file: Path of the zip.
-        trust: Whether code in the zip may run.
-    """
+    """Check that a file is a zip of stable-baselines3; PermissionError where it is not trusted."""
     check_zip(file)
     if not trust:
         raise PermissionError(
@@ -242,11 +238,7 @@ def check_trusted(file: Path, trust: bool) -> None:
 
 
 def check_zip(file: Path) -> None:
-    """Check a zip of stable-baselines3 by its members; FileNotFoundError or ValueError otherwise.
-
-    Args:
-        file: Path of the zip.
-    """
+    """Check a zip of stable-baselines3 by its members; FileNotFoundError or ValueError else."""
     if not file.is_file():
         raise FileNotFoundError(f"{file}: {'a folder' if file.is_dir() else 'no such file'}")
     try:
@@ -299,13 +291,7 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> BaseP
 def load_normaliser(
     path: Path, trust: bool, normalise: str | Path | None = None
 ) -> VecNormalize | None:
-    """Load a zip's VecNormalize from its pickle, which can run code; None without one.
-
-    Args:
-        path: Path of the zip.
-        trust: Whether the pickle may be read; PermissionError if not.
-        normalise: As for `find_normaliser`; FileNotFoundError without it, ValueError if unfit.
-    """
+    """Load a zip's VecNormalize from its pickle, which can run code; ValueError if unfit."""
     file = find_normaliser(path, normalise)
     if file is None:
         return None

@@ -18,6 +18,17 @@ Args:
     residual: Measurement minus its prediction.
     fast_row: Fast row, shape (FAST_WIDTH,).
     packet: Packet, shape (PACKET_WIDTH,).
+    first: Tick of the first fast row.
+    last: Tick of the filter's previous step.
+    n: Number of states.
+    v: Vector of states, shape (n,) or longer.
+    variance: Variance of a residual; of a state what is added to it.
+    state: Index of a state.
     speed: Speed (m/s).
+    V: Speed of the model (m/s).
+    model_speed: Speed of the model (m/s).
+    turning: Yaw rate (rad/s).
+    turn: Angle (rad) by which a heading turns.
+    steer: Steering angle (rad).
     u: Inputs of a step, shape (N_INPUTS,).
 """

@@ -22,13 +22,7 @@ from .record import N_CORE, N_TOTAL, FilterRecord
 
 @jit
 def dot(row: Vector, v: Vector, n: int) -> Scalar:
-    """Compute the product of a row of C and a vector of states.
-
-    Args:
-        row: Row of C, shape (at least n,).
-        v: Vector, shape (at least n,).
-        n: Number of entries of each.
-    """
+    """Compute the product of a row of C and a vector of states."""
     total = 0.0
     for k in range(n):
         total += row[k] * v[k]
@@ -92,12 +86,7 @@ def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
 
 @jit
 def apply_transition(f: FilterRecord, v: Vector) -> None:
-    """Predict v <- F v with F = diag(own_decay) + G.
-
-    Args:
-        f: Memory of the filter, or a block of lanes.
-        v: Vector of states, shape (n,) or longer.
-    """
+    """Predict v <- F v with F = diag(own_decay) + G."""
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
         total = load8(f.own_decay, j) * load8(v, j)
@@ -159,11 +148,6 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
     P <- P - K s K^T with the residual's variance s, to which Joseph's form comes down for the
     optimal gain of a scalar. With products of two entries of P C^T it is symmetric to the last bit.
-
-    Args:
-        f: Memory of the filter.
-        variance: Variance of the residual, C P C^T + r.
-        residual: Measurement minus its prediction.
     """
     N, x, P, PC, gain, step = f.total, f.x, f.P, f.PC, f.gain, vector_width(f.P)
     inverse = 1.0 / variance

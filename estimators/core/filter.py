@@ -296,12 +296,7 @@ def advance(
 
 @jit
 def reset_filters(layers: FilterRecords, first: int) -> None:
-    """Reset all layers of an estimator.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-        first: Tick of the first fast row.
-    """
+    """Reset all layers of an estimator."""
     for i in range(len(layers)):
         _reset_filter(layers[i], first)
 

@@ -83,12 +83,7 @@ def _correct_larsen_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
 
 @jit
 def store_due_captures(f: FilterRecord, last: int) -> None:
-    """Store what the sensors that captured at this tick measured, and advance their clocks.
-
-    Args:
-        f: Memory of the filter.
-        last: Tick of the filter's previous step.
-    """
+    """Store what the sensors that captured at this tick measured, and advance their clocks."""
     for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
             frame = (f.next[s] - f.phase[s]) // f.period[s]
@@ -181,13 +176,7 @@ def predict_sample(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
 
 @jit
 def turn_heading(f: FilterRecord, s: int, turn: float) -> None:
-    """Turn the heading, now and in what is stored of it.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor that measures it in its first row.
-        turn: Angle (rad).
-    """
+    """Turn the heading, the first row of sensor s, now and in what is stored of it."""
     f.x[PSI] += turn
     f.expected[0] += turn
     if f.first_clone[s] > 0:
@@ -201,13 +190,7 @@ def turn_heading(f: FilterRecord, s: int, turn: float) -> None:
 
 @jit
 def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
-    """Add a variance to a state's, now and in what is stored of it.
-
-    Args:
-        f: Memory of the filter.
-        state: Index of the state.
-        variance: Variance (the state's unit squared).
-    """
+    """Add a variance to a state's, now and in what is stored of it."""
     v = f.PC
     for i in range(f.total):
         v[i] = 0.0

@@ -151,12 +151,7 @@ def _compute_axle_force(
 
 @jit
 def linearise(f: FilterRecord, steer: Scalar) -> None:
-    """Expand both axles' forces at the present state, and set the process noise that follows it.
-
-    Args:
-        f: Memory of the filter.
-        steer: Measured steering angle of the front wheels (rad).
-    """
+    """Expand both axles' forces at the present state, and set the process noise that follows it."""
     x, V = f.x, maximum(f.model_speed, MIN_SPEED)
     if f.steer_offset_state > 0 and _is_steering_felt(V):
         steer = steer - x[f.steer_offset_state]
@@ -288,27 +283,14 @@ def discretise(f: FilterRecord) -> None:
 
 @jit
 def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
-    """Compute the variance of a slow sensor's row at a speed.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        V: Speed of the model (m/s).
-    """
+    """Compute the variance of a slow sensor's row at a speed."""
     scaled = f.noise_over_speed[s, i]
     return scaled / (V * V) if scaled > 0.0 else f.r[s, i]
 
 
 @noinline
 def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
-    """Build the model at a speed, and the noise that grows with 1/V.
-
-    Args:
-        f: Memory of the filter.
-        speed: Speed (m/s).
-        turning: Yaw rate (rad/s).
-    """
+    """Build the model at a speed, and the noise that grows with 1/V."""
     V = maximum(speed, MIN_SPEED)
     if f.kind == LATERAL and f.model_speed > 0.0:
         f.beta_scale *= f.model_speed / V

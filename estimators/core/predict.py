@@ -42,12 +42,7 @@ def compute_signal(fast_row: Vector, column: Vector, factor: Vector) -> Scalar:
 
 @jit
 def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
-    """Return whether a speed is further from the model's than `SPEED_TOLERANCE`.
-
-    Args:
-        speed: Speed (m/s).
-        model_speed: Speed of the model (m/s).
-    """
+    """Return whether a speed is further from the model's than `SPEED_TOLERANCE`."""
     return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
 
 
