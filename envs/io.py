@@ -38,9 +38,6 @@ def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
 
     Links are followed, an older file's mode and owner stay; a pipe, a device or an open file such
     as /dev/stdout is written directly.
-
-    Yields:
-        The file to write.
     """
     try:
         old = os.stat(path)
