@@ -1,4 +1,8 @@
-"""Facts of an environment, single or vector, that controllers are designed from."""
+"""Facts of an environment, single or vector, that controllers are designed from.
+
+Args:
+    env: Env, vector env or `VecEnv` of this package, wrapped or bare; TypeError for another.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -131,9 +135,6 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
     Every wrapper must be known to keep observations and actions, or have `transparent = True` on
     itself or its class. A subclass that overrides how it steps, observes or acts sets it anew.
     Raises ValueError for another wrapper, or rows with different nominal cars or limits.
-
-    Args:
-        env: Env of this package, wrapped or bare; TypeError for another.
     """
     try:
         return env.facts if isinstance(env, EnvView) else _collect_facts(env)
@@ -165,11 +166,7 @@ def _collect_facts(env: Any) -> EnvFacts:
 
 
 def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
-    """List the configurations of an env, one for all rows or one for each sub-environment.
-
-    Args:
-        env: Env, vector env or `VecEnv`.
-    """
+    """List the configurations of an env, one for all rows or one for each sub-environment."""
     base: Any = env.unwrapped
     if hasattr(base, "row_configs"):
         return list(base.row_configs)

@@ -3,6 +3,10 @@
 r = log((J_nominal + J_0) / (J + J_0)) where both finish, J_0 as `ControlTask.cost_floor`; a drive
 that the entry alone loses counts -2, one that nominal alone loses 2, one that both lose 0. The mean
 r is the score; entries that surely lose more cars than nominal stand below all others.
+
+Args:
+    loss: r of a drive that nominal alone loses.
+    floor_factor: Factor on J_0.
 """
 
 import math
@@ -79,12 +83,7 @@ class PairedDrives:
         return np.asarray(self.finished.all(axis=0))
 
     def compute_scores(self, loss: float = LOSS, floor_factor: float = 1.0) -> Array:
-        """Compute r of each drive, shape (n,).
-
-        Args:
-            loss: r of a drive that nominal alone loses.
-            floor_factor: Factor on J_0.
-        """
+        """Compute r of each drive, shape (n,)."""
         costs, nominal = self.costs + floor_factor * self.floor
         losses = loss * (self.finished[0].astype(np.float64) - self.finished[1])
         return np.asarray(np.where(self.both, np.log(nominal / costs), losses))
@@ -122,12 +121,7 @@ class Standing:
         return {task: pair.compute_scores() for task, pair in self.pairs.items()}
 
     def compute_score(self, loss: float, floor_factor: float) -> float:
-        """Compute the score by other constants, NaN where nothing was driven.
-
-        Args:
-            loss: r of a drive that nominal alone loses.
-            floor_factor: Factor on J_0.
-        """
+        """Compute the score by other constants, NaN where nothing was driven."""
         means = [pair.compute_scores(loss, floor_factor).mean() for pair in self.pairs.values()]
         return float(np.mean(means)) if means else math.nan
 
