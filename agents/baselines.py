@@ -179,7 +179,7 @@ def make_oracle(
     if name not in STATE_ORACLES:
         env = _add_filter(env, base, name in PARAMETER_ORACLES, chosen["filter"])
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
-    is_predictive = name.endswith("nmpc")
+    is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
     if not is_predictive:  # the prediction has the steering's rate limit
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:

@@ -231,7 +231,7 @@ SYMBOLS: dict[str, Callable[..., Any]] = {
     "sincos": lambda x: (ca.sin(x), ca.cos(x)),
     "atan": ca.atan, "atan2": ca.atan2, "compute_sine": ca.sin,
 }  # fmt: skip
-"""The primitives for CasADi's SX and MX, by the names that the equations use; none for & and |."""
+"""The primitives for CasADi's SX and MX, by name; & and | raise TypeError on symbols."""
 _rk4, _load_at = as_python(rk4, SYMBOLS), as_python(compute_lagged_load, SYMBOLS)
 _motor_torques = as_python(compute_motor_torques, SYMBOLS)
 _sideslip = as_python(compute_sideslip_angle, SYMBOLS)

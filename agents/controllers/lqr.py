@@ -326,8 +326,8 @@ Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
 # low-passed psi in rad), and whether the episode has started (1).
 LaneMemory = namedtuple("LaneMemory", "integral rate heading started")
 
-LANE_IN, AT, LAST = LaneInputs(*range(10)), Lane(*range(9)), LaneMemory(*range(4))
-MOVED = Lane._fields[: AT.driver]
+LANE_IN, AT, LANE_LAST = LaneInputs(*range(10)), Lane(*range(9)), LaneMemory(*range(4))
+LANE_MOVED = Lane._fields[: AT.driver]
 HASTE = 3.0  # weight of the steering's haste in the cost, which `_make_lane_model` explains
 _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
@@ -368,7 +368,7 @@ def _make_lane_model(
     cost_matrix = cost_outputs.T @ W @ cost_outputs
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
     Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
-    moved = len(MOVED)
+    moved = len(LANE_MOVED)
     return DesignModel(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], Lane._fields, moved)
 
 
@@ -381,26 +381,26 @@ def _lane_keeping_law(x: Matrix, state: Matrix, action: Matrix, design: tuple[An
     for row in range(len(x)):
         v = maximum(0.5 * (x[row, LANE_IN.wheel_left] + x[row, LANE_IN.wheel_right]), axes[0][0])
         gamma, psi = x[row, LANE_IN.gamma_hat], x[row, LANE_IN.psi_hat]
-        if state[row, LAST.started] == 0.0:
-            state[row, LAST.rate], state[row, LAST.heading] = gamma / v, psi
-            state[row, LAST.started] = 1.0
-        turned = psi - state[row, LAST.heading]
-        kappa = state[row, LAST.rate] - turned / (v * filter_time)  # psi' = gamma - V kappa
-        state[row, LAST.rate] += (gamma / v - state[row, LAST.rate]) * dt / filter_time
-        state[row, LAST.heading] += turned * dt / filter_time
+        if state[row, LANE_LAST.started] == 0.0:
+            state[row, LANE_LAST.rate], state[row, LANE_LAST.heading] = gamma / v, psi
+            state[row, LANE_LAST.started] = 1.0
+        turned = psi - state[row, LANE_LAST.heading]
+        kappa = state[row, LANE_LAST.rate] - turned / (v * filter_time)  # psi' = gamma - V kappa
+        state[row, LANE_LAST.rate] += (gamma / v - state[row, LANE_LAST.rate]) * dt / filter_time
+        state[row, LANE_LAST.heading] += turned * dt / filter_time
         y_l = x[row, LANE_IN.y_l_hat]
         y = y_l - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
         z[AT.beta], z[AT.gamma], z[AT.psi], z[AT.y] = x[row, LANE_IN.beta_hat], gamma, psi, y
         z[AT.N_z] = share_per_torque * (x[row, LANE_IN.torque_right] - x[row, LANE_IN.torque_left])
         z[AT.delta_f], z[AT.driver] = x[row, LANE_IN.steer], x[row, LANE_IN.steer_command]
-        z[AT.integral], z[AT.kappa] = state[row, LAST.integral], kappa
+        z[AT.integral], z[AT.kappa] = state[row, LANE_LAST.integral], kappa
         interpolate_gains(table, axes, v, 0.0, 0.0, K)
         for i in range(m):  # the yaw moment, if it is used, and the steering
             for j in range(n):
                 action[row, 2 - m + i] -= K[i, j] * z[j]
         action[row, 1] /= authority
         if abs(action[row, 0]) <= 1.0 and abs(action[row, 1]) <= 1.0:  # else it would wind up
-            state[row, LAST.integral] += y * dt
+            state[row, LANE_LAST.integral] += y * dt
 
 
 class LaneKeeping(Controller):

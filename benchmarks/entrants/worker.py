@@ -247,7 +247,7 @@ class IsolatedDrive:
     """`run_user_chunk`, but agent and estimator of a user in a child of their own."""
 
     limit: float = LIMIT  # wall time (s)
-    allowed: frozenset[str] | None = None  # files that a child may open, of `ChildSettings`
+    allowed: frozenset[str] | None = None  # files that a child may open
 
     def __call__(self, chunk: Chunk) -> DriveResult:
         """Run a chunk whose entry has names and files."""

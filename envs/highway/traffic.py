@@ -329,7 +329,7 @@ class Traffic:
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """Step the road by `PERIOD` ticks, at whose end our car has a motion."""
+        """Step the road by `PERIOD` ticks; the motion is that at their end."""
         self.ego.set_motion(motion)
         self.road.act()
         self.road.step(1e-3 * PERIOD)

@@ -242,7 +242,8 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
     import pandas as pd
 
     column, label = table.frame.iloc[:, place], str(table.frame.columns[place])
-    if column.dtype.kind in "Mmb":  # times, durations, truth values
+    # times, durations, truth values, also as categories
+    if column.dtype.kind in "Mm" or pd.api.types.is_bool_dtype(column.dtype):
         raise ValueError(f"column {label!r} holds {column.dtype}; expected numbers")
     try:
         numbers = pd.to_numeric(column, errors="coerce")

@@ -20,5 +20,4 @@ Args:
     T_l: Torque of the left motor (N m).
     T_r: Torque of the right motor (N m).
     vehicle: Vehicle of a model.
-    speed: Longitudinal speed of a model (m/s), positive.
 """

@@ -226,7 +226,7 @@ def derivative(
 
 @inline
 def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar:
-    """Compute the sideslip angle (rad): atan2(v_y, v_x) above 0.5 m/s, else 0."""
+    """Compute the sideslip angle (rad): atan2(v_y, v_x), small v_y / v_x; 0 below 0.5 m/s."""
     if small_angle:
         return select(v_x > MIN_SPEED, v_y / maximum(v_x, MIN_SPEED), 0.0)
     is_moving = v_x * v_x + v_y * v_y > MIN_SPEED * MIN_SPEED

@@ -144,7 +144,12 @@ def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[A
 
 
 def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """Make the linear bicycle of beta, gamma from delta_f and N_z to gamma: tie-vision (1)-(2)."""
+    """Make the linear bicycle of beta, gamma from delta_f and N_z to gamma: tie-vision (1)-(2).
+
+    Args:
+        vehicle: Vehicle of the model.
+        speed: Longitudinal speed (m/s), positive.
+    """
     A, B = _make_lateral(vehicle, speed, 2)
     C = np.array([[0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",))
@@ -155,6 +160,10 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
     Inputs are delta_f, N_z and kappa, the road's curvature: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
+
+    Args:
+        vehicle: Vehicle of the model.
+        speed: Longitudinal speed (m/s), positive.
     """
     A, B = _make_lateral(vehicle, speed, 4, 3)
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -166,6 +175,10 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     """Make the model of beta, gamma and psi with a course output, dakf-stability (1)-(3).
 
     Inputs are delta_f and N_z, outputs gamma and the course psi + beta.
+
+    Args:
+        vehicle: Vehicle of the model.
+        speed: Longitudinal speed (m/s), positive.
     """
     A, B = _make_lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])

@@ -372,7 +372,7 @@ def _compute_magic_tyres(
 
 
 def fit_fiala(vehicle: Vehicle) -> Vehicle:
-    """Fit Fiala's law to a car's Magic Formula, for filters and planners that have no other.
+    """Fit Fiala's law to a car of the Magic Formula, for filters and planners without it.
 
     Least squares of the forces at the standing load, over slips from zero to the peak's with equal
     weights. As fractions of mu F_z, over C t / (mu F_z), both axles have one curve: so one pair of

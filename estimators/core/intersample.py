@@ -84,7 +84,7 @@ def correct_error(f: FilterRecord, i: int, residual: float) -> None:
 
 
 @jit
-def _correct_by_table(f: FilterRecord, gains: GainTables, s: int) -> None:
+def _correct_x_and_e(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals."""
     x, e, N, m = f.x, f.e, f.total, f.fasts
     first_row = locate_frame_row(f, s, f.pattern)
@@ -101,7 +101,7 @@ def _correct_by_table(f: FilterRecord, gains: GainTables, s: int) -> None:
 def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct as if a part of the last sample came now, after the fast measurements."""
     if f.intersample_rule == PSEUDO and f.periodic == 1:
-        _correct_by_table(f, gains, s)
+        _correct_x_and_e(f, gains, s)
     elif f.intersample_rule == PSEUDO:  # the even fraction of the last sample's gain
         for i in range(f.fasts, f.fasts + f.rows[s]):
             for j in range(f.total):

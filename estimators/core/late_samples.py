@@ -1,7 +1,7 @@
 """Late samples: what each rule does at a capture, with each step, at the arrival, and to the past.
 
-In `core` only `packets` knows a rule besides: it filters the past anew for "buffer". What a rule
-stores, and which options go with it, `design.assemble` checks and allocates.
+In this room `packets` besides filters the past anew for "buffer", and `update` takes what was
+WEIGHED. `design.assemble` allocates what a rule stores; `vector.batch` lists those that lanes have.
 """
 
 from ...envs.numerics.jit import inline, jit
@@ -136,7 +136,7 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
 
 @jit
 def find_target(f: FilterRecord, s: int, captured: int) -> int:
-    """Find what an arrived sample measures: its first clone, or DIRECT, DROPPED (counted), ..."""
+    """Find what an arrived sample measures: its first clone, or a code; it counts as taken"""
     if is_duplicate(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]

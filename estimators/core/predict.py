@@ -113,7 +113,7 @@ def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
 
 @jit
 def propagate(f: FilterRecord, u: Vector) -> None:
-    """Predict x <- F x + H u + drift and, without tables of gains, P."""
+    """Predict x <- F x + H u + drift and, without tables, P; of a block of lanes, too."""
     step = vector_width(f.P)
     apply_transition(f, f.x)
     for j in range(0, f.dense, step):
@@ -166,7 +166,7 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
 
 @jit
 def compute_residual(f: FilterRecord, i: int) -> Scalar:
-    """Compute the residual of a fast measurement."""
+    """Compute the residual of a fast measurement; of a block of lanes, too."""
     residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):
         residual = residual - load_element(f.C_fast, i, k) * load_element(f.x, k)

@@ -163,7 +163,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     # the rule for late samples: codes stand in `late_samples`, and in `intersample`
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
-    ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
+    ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; 0: it has none
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains

@@ -150,7 +150,10 @@ def _find_variance(f: FilterRecord, i: int, residual: float, projected: Scalar) 
 
 @inline
 def _correct_by_table(f: FilterRecord, gains: GainTables) -> None:
-    """Correct x by fast measurements and the table; jointly: all residuals are taken before."""
+    """Correct x by fast measurements and the table; jointly: all residuals are taken before.
+
+    Those of pseudo-residuals are applied by `correct_between`.
+    """
     for i in range(f.fasts):
         residual = compute_residual(f, i)
         f.eps[i] = residual if is_finite(residual) else 0.0

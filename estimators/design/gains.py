@@ -52,7 +52,7 @@ def kalman_gain(P: Array, C: Array, R: Array) -> Array:
 
 
 def joseph_form(P: Array, K: Array, C: Array, R: Array) -> Array:
-    """Compute the covariance (n, n) after a correction: (I - K C) P (I - K C)^T + K R K^T.
+    """Compute P after a correction by any gain: (I - K C) P (I - K C)^T + K R K^T, P before it.
 
     A sum of two squares stays symmetric and positive semidefinite under rounding.
     """

@@ -3,7 +3,7 @@
 Args:
     env: Vector environment of N rows.
     rows: Numbers of some rows.
-    mask: Rows at work, bool, shape (N,); None for all.
+    mask: Rows at work, bool, shape (N,).
     specs: Vehicle, sensors and speed of each one's estimator.
     dt: Tick (s).
     source: Name or factory of the estimators.

@@ -3,7 +3,7 @@
 A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
 `core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
 Its model stays there and is loaded anew where its speed changed; its state in every call. A user's
-own estimators are an object a row. The records that all read are an env's, or copied together.
+own estimators are an object a row. What all of them read are the records of the vector env.
 """
 
 import copy
@@ -22,7 +22,7 @@ from ...envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry
 from ..core.filter import Observed, OutputTable, StepRecord
 from ..core.intersample import NONE
-from ..core.late_samples import BUFFER, LARSEN
+from ..core.late_samples import CLONE, CONSTANT, IGNORE, STORED
 from ..core.model import KINEMATIC, VELOCITY_ROLL
 from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
 from ..estimator import Estimator
@@ -93,7 +93,7 @@ def _read_shape(layers: FilterRecords) -> _Shape:
     is_steady = f.tyres == 0 and f.kind not in (KINEMATIC, VELOCITY_ROLL)
     is_plain = f.stride == f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
     has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
-    is_small = f.delay_rule not in (BUFFER, LARSEN) and f.total <= _MAX_STATES
+    is_small = f.delay_rule in (CLONE, IGNORE, STORED, CONSTANT) and f.total <= _MAX_STATES
     if len(layers) == 1 and is_steady and is_plain and has_fixed_noise and is_small:
         return tuple(f[name].tobytes() for name in _SHAPE)
     return None
@@ -353,7 +353,8 @@ class BatchedRecords:
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
         env = self._env
-        cars = {i: replace_body(env.nominal[i], env.scenario[i]) for i in rows}
+        scenarios = getattr(env, "scenario", [None] * len(env.nominal))
+        cars = {i: replace_body(env.nominal[i], scenarios[i]) for i in rows}
         return [EstimatorSpec(cars[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, mask: _Mask) -> None:

@@ -226,8 +226,8 @@ class EstimateObservation(VectorObservation):
             truths = self._read_rows("car_truth", rows)
             self._calibration[rows] = [item.calibration for item in truths]
             pairs = zip(specs, truths, strict=True)
-            return [spec._replace(vehicle=item.fiala) for spec, item in pairs]
-        return specs if car is None else [spec._replace(vehicle=car) for spec in specs]
+            return [spec.replace_vehicle(item.fiala) for spec, item in pairs]
+        return specs if car is None else [spec.replace_vehicle(car) for spec in specs]
 
     def _update_cars(self, rows: Sequence[int]) -> None:
         """Fit the estimators of some rows to the cars of their present episodes."""

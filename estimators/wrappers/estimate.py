@@ -14,7 +14,6 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import as_python, compile_call
 from ...envs.numerics.primitives import ARRAYS
-from ...envs.scenarios.scenario import Scenario
 from ...envs.sensors.link import SlowSensor
 from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
@@ -68,6 +67,15 @@ class EstimatorSpec(NamedTuple):
     sensors: Mapping[str, SlowSensor]  # slow ones by name
     speed: float | None = None  # m/s where it is held
 
+    def replace_vehicle(self, car: Vehicle) -> Self:
+        """Replace the vehicle; its body is rigid where that of the present one is.
+
+        Args:
+            car: The other vehicle.
+        """
+        is_rigid = self.vehicle.roll_arm == _RIGID
+        return self._replace(vehicle=car.replace(roll_arm=_RIGID) if is_rigid else car)
+
     @property
     def design(self) -> Hashable:
         """A key that is equal for specs that differ in the phases of their clocks alone."""
@@ -75,15 +83,14 @@ class EstimatorSpec(NamedTuple):
         return self.vehicle, tuple(sorted(clocks)), self.speed
 
 
-def replace_body(nominal: Vehicle, scenario: Scenario | None) -> Vehicle:
+def replace_body(nominal: Vehicle, scenario: object) -> Vehicle:
     """Replace a vehicle's body by a rigid one where the scenario's does not roll.
 
     Args:
         nominal: The vehicle of designers.
-        scenario: Scenario of the episode, or None for an env without one.
+        scenario: `Scenario` of the episode, or whatever an env has instead.
     """
-    rolls = scenario is None or scenario.roll
-    return nominal if rolls else nominal.replace(roll_arm=_RIGID)
+    return nominal if getattr(scenario, "roll", True) else nominal.replace(roll_arm=_RIGID)
 
 
 def make_spec(base: Any) -> EstimatorSpec:
@@ -288,7 +295,8 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         replace: Whether the observation is these alone.
         vehicle: Vehicle as the estimator believes it to be, a preset or a mapping; None for the
             env's nominal. "truth" is the true car of each episode, as it is at the reset, and
-            readings are calibrated as in `TruthObservation`; its tyres have Fiala's law.
+            readings are calibrated as in `TruthObservation`; its tyres have Fiala's law. Where the
+            scenario's body does not roll, it is rigid.
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
@@ -322,7 +330,7 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
             car, self._calibration = truth.fiala, truth.calibration
             if previous is not None:
                 car = choose_vehicle(self.estimator, previous.vehicle, truth.fiala)
-        spec = spec if car is None else spec._replace(vehicle=car)
+        spec = spec if car is None else spec.replace_vehicle(car)
         if previous is None or spec.design != previous.design:
             self.estimator, self._estimator_spec = self._build_estimator(spec), spec
         if arguments.is_told_truth:
@@ -347,13 +355,22 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[_Floats, Infos]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
+
+        Args:
+            seed: Seed of the env, or None.
+            options: Options of the env's reset, or None.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, Infos]:
-        """Step the env; the estimator takes its record before the observation is made."""
+        """Step the env; the estimator takes its record before the observation is made.
+
+        Args:
+            action: Action of the env.
+        """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
@@ -364,7 +381,11 @@ class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstru
         return {"env": inner, "steps": steps, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of such an env; ValueError if its number of step limits is another."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`; ValueError for one of an env with other step limits.
+        """
         limits, steps = self._find_step_limits(), snapshot.get("steps", [])
         if len(limits) != len(steps):
             has = f"the snapshot has {len(steps)} step limits"

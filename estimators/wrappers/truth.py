@@ -138,7 +138,12 @@ def choose_vehicle(
 
 
 def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
-    """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays."""
+    """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays.
+
+    Args:
+        estimator: The estimator.
+        vehicle: Vehicle with the stiffnesses (N/rad).
+    """
     if isinstance(estimator, Estimator):
         for f in estimator.filters:
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
@@ -194,7 +199,12 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[_Floats, dict[str, Any]]:
-        """Reset the env and read its car."""
+        """Reset the env and read its car.
+
+        Args:
+            seed: Seed of the env, or None.
+            options: Options of the env's reset, or None.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
         self._values, self._calibration = self._entries.read(base.car_truth)
@@ -216,7 +226,11 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
         return {"env": self.env.get_wrapper_attr("get_state")()} | truth
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()

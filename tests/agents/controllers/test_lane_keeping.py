@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.lqr import HASTE, MOVED, LaneKeeping, _make_lane_model
+from sideslip.agents.controllers.lqr import HASTE, LANE_MOVED, LaneKeeping, _make_lane_model
 from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
@@ -46,7 +46,7 @@ def drive(env: Any, agent: Any, seed: int) -> tuple[np.ndarray, int]:
 
 @pytest.mark.parametrize("inputs", [slice(0, 2), slice(1, 2)], ids=["both", "steering"])
 def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> None:
-    d = len(MOVED)
+    d = len(LANE_MOVED)
     for speed in SPEEDS[::6]:
         model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, inputs)
         G, B, K = model.G[:d, :d], model.H[:d], model.solve()[0][:, :d]
@@ -66,7 +66,7 @@ def test_a_curvature_time_below_the_period_does_not_diverge() -> None:
 
 def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
     """The integral leaves no offset; the car turns with the road."""
-    d, speed, kappa = len(MOVED), 7.0, 0.02
+    d, speed, kappa = len(LANE_MOVED), 7.0, 0.02
     model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, slice(0, 2))
     closed = model.G - model.H @ model.solve()[0]
     rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d + 1] * kappa)

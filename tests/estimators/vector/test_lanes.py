@@ -12,8 +12,9 @@ from sideslip.envs import COMS
 from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.core.late_samples import RULES
 from sideslip.estimators.core.record import FILTER
-from sideslip.estimators.vector.batch import BLOCK
+from sideslip.estimators.vector.batch import BLOCK, _read_shape
 from sideslip.estimators.vector.lanes import MIN_LANES
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, GPS
@@ -164,3 +165,10 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     for kind, names in ((BLOCK, ("x", "P", "GT", "row")), (FILTER, ("x", "P"))):
         assert kind.fields is not None
         assert all(kind.fields[name][1] % 64 == 0 for name in names)
+
+
+def test_a_rule_that_lanes_do_not_have_is_computed_alone() -> None:
+    filters = make_estimator("exact-kf", sensors={"camera": CAMERA}).filters
+    assert _read_shape(filters) is not None
+    filters[0].delay_rule = len(RULES)
+    assert _read_shape(filters) is None
