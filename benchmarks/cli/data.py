@@ -174,8 +174,8 @@ class _Identify:
 
         console, wires = Console(), _read_wires(self)
         with use_shared_bar(console, f"identify {self.log}"):
-            log = self.log, self.vehicle, self.mapping, wires
-            result, suite = identify_file(*log, self.tyres, self.until, self.validate)
+            arguments = self.log, self.vehicle, self.mapping, wires
+            result, suite = identify_file(*arguments, self.tyres, self.until, self.validate)
         print_suite(console, suite)
         if result.reason:
             raise Exit(1)

@@ -2,7 +2,8 @@
 
 All pairs of both drive the scored tasks of four tiers on salted seeds. `_Gains` are r of an entry's
 drives, shape (n,), by task (see `score`). The cost of an entry over another's is exp(-r) in verdict
-and figures, so that a loss that the other does not have counts e^2 times.
+and figures, so that a loss that the other does not have counts e^2 times. As a command the file
+lists reversals: pairs of entries whose order turns in a world of other errors.
 """
 
 import itertools
@@ -321,7 +322,7 @@ _CostRatios = dict[tuple[str, str], Estimate]
 
 
 def _compare_entries(results: Results) -> _CostRatios:
-    """Compute the cost of each entry over each other's, by their labels."""
+    """Compute exp(-r) of each entry beside each other's, averaged, by their labels."""
     ranking = _Ranking({item.label: item.scores for item in rank_entries(results, None)})
     rivals = ranking.ranked.items()
     return {(one, other): ratio for one, ratios in rivals for other, ratio in ratios.items()}
@@ -329,7 +330,8 @@ def _compare_entries(results: Results) -> _CostRatios:
 
 def _list_reversals(base: _CostRatios, other: _CostRatios) -> list[tuple[str, str]]:
     """List entries surely ordered, the better first, and surely the other way round elsewhere."""
-    return [names for names, ratio in base.items() if ratio.high < 1.0 < other[names].low]
+    common = {names: ratio for names, ratio in base.items() if names in other}
+    return [names for names, ratio in common.items() if ratio.high < 1.0 < other[names].low]
 
 
 def _main(

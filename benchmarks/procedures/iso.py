@@ -138,7 +138,8 @@ LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slop
 class Handling:
     """ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y, (n,) each, and its slope.
 
-    That is minus K: delta_f = l / R + K a_y. The linear model's is l G of dakf-stability (24).
+    The slope is minus the understeer gradient K: delta_f = l / R + K a_y. The linear model's is
+    l G of dakf-stability (24).
     """
 
     a_y: Array  # m/s2

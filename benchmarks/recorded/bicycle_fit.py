@@ -81,7 +81,7 @@ def _simulate_windows(
     """Fill out (3, windows, rows): yaw rate, lateral specific force, sideslip angle of the GPS."""
     inertia = (car.I * np.exp(theta[2]),)
     tyres = car.C_f * np.exp(theta[0]), car.C_r * np.exp(theta[1])
-    car = CarParams(*(car[:1] + inertia + car[2:4] + tyres + car[6:]))
+    car = CarParams(*(car[:1] + inertia + car[2:4] + tyres + car[6:]))  # I is field 1, C_f 4, C_r 5
     road = dynamics.RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     push = dynamics.DisturbanceForces(0.0, 0.0, 0.0)
     variant = PlantVariant(0, law, int(law != LINEAR))
@@ -186,8 +186,8 @@ class Windows:
         """
         rows = sum(round(seconds / self.dt) for seconds in (_BURN, _WINDOW, _MARGIN))
         out = np.empty((3, len(self.starts), rows))
-        stiff = self.car.replace(transfer_height=0.0, relaxation=0.0)  # as the fit assumes
-        car, law = CarParams(*map(float, make_car(stiff))), TYRE_LAWS.index(self.tyres)
+        static = self.car.replace(transfer_height=0.0, relaxation=0.0)  # no load moves, no lag
+        car, law = CarParams(*map(float, make_car(static))), TYRE_LAWS.index(self.tyres)
         _simulate_windows(self.rows, self.starts, np.array(theta), car, law, self.dt, out)
         return out
 

@@ -54,7 +54,7 @@ class IdentificationResult:
 
 
 def identify(
-    logs: Sequence[Log], car: Vehicle, stated: SignalCalibration = AS_LOGGED,
+    logs: Sequence[Log], car: Vehicle, wires: SignalCalibration = AS_LOGGED,
     tyres: str | None = None,
 ) -> IdentificationResult:  # fmt: skip
     """Fit the car to the parts of a log, and the noise of its sensors.
@@ -62,7 +62,7 @@ def identify(
     Args:
         logs: Parts of the log; ValueError for swapped columns.
         car: Stated car, where the search starts.
-        stated: Stated calibration, where the search starts.
+        wires: Stated calibration of the signals, where the search starts.
         tyres: "linear", as stiff as the log's accelerations have them, without roll, or "fiala", as
             stiff as at small slips, with the stated friction and roll; None: what errs less on
             held-out stretches; another: ValueError.
@@ -72,25 +72,25 @@ def identify(
     if what := quality.find_swapped(logs):
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
-    logs = [apply_wires(log, SignalCalibration(at=stated.at)) for log in logs]
-    if "gps" in stated.at:
+    logs = [apply_wires(log, SignalCalibration(at=wires.at)) for log in logs]
+    if "gps" in wires.at:
         car = car.replace(antenna_ahead=0.0)  # the course is the centre of gravity's now
-    result = IdentificationResult(car, stated)
+    result = IdentificationResult(car, wires)
     w = Windows.from_logs(logs, car)
     line = quality.fit_steering(logs, car, steady=False)
     gain, related = (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
     if reason := _find_reason(w, related):
         result.reason = reason
-        for _, label, value, unit in _list_parameters(car, stated):
+        for _, label, value, unit in _list_parameters(car, wires):
             result.findings.append(Finding(label, value, unit=unit, remark=reason))
     else:
-        near = 1.0 / _MAX_RATIO_FACTOR < gain / stated.gain < _MAX_RATIO_FACTOR
-        start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
+        near = 1.0 / _MAX_RATIO_FACTOR < gain / wires.gain < _MAX_RATIO_FACTOR
+        start = Theta(gain=wires.gain if near else gain, offset=wires.offset)
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
     slips = motion.estimate_slips(logs, result.car, result.wires)
-    both = (motion.estimate_slips(logs, car, stated), slips)
+    both = (motion.estimate_slips(logs, car, wires), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
     findings, noise, latency = motion.make_sensor_findings(logs, slips)
     result.findings += findings

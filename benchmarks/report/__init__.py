@@ -1,1 +1,1 @@
-"""One HTML file and its figures, colours and films."""
+"""What every suite is made of (`study`), and its report: one HTML file, figures, films."""

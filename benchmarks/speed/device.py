@@ -162,6 +162,8 @@ def _main(
     """Measure env-steps per second, resets included; on ptx count the CUDA kernel's code."""
     check_writable(out)
     if device == "ptx":
+        if dtype or count or engine or compiled:
+            raise ValueError("--device ptx counts code: no --dtype, --count, --engine, --compile")
         _print_text(_make_kernel_table(env), out)
         return
     copied, lines = 0.0, [_HEADS]

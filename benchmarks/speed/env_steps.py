@@ -54,7 +54,7 @@ def _make_episode(
     actions, over = list[object](), False
     while not over and len(actions) < (max_steps or EPISODE):
         action = idle if policy is None else policy(obs)
-        actions.append(action if np.ndim(action) else int(action))  # as a user's single one
+        actions.append(action if np.ndim(action) else int(action))  # Discrete takes an int
         obs, _, terminated, truncated, _ = env.step(actions[-1])
         over = bool(np.all(terminated | truncated))
 

@@ -49,10 +49,10 @@ def _simulate_swerve(case: tuple[str, Sequence[int]]) -> list[list[float]]:
 
 
 def _keep_lane(case: tuple[str, Sequence[int]]) -> list[Array]:
-    """Drive with a reader on some seeds: RMS of five numbers in the second half, shape (5,)."""
+    """Drive with a reader on a seed: RMS of five numbers in the second half, shape (5,)."""
     from ...envs.highway.env import STATES, KeepingEnv, NativeObservation
 
-    reader, (seed,) = case
+    reader, (seed,) = case  # chunks are of one
     base: Any = KeepingEnv()
     env: Any
     if reader in (_RETURNED, _NEWEST):

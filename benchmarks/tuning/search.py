@@ -56,7 +56,7 @@ class SearchOptions:
 
     @property
     def workers(self) -> int:
-        """Number of processes, the same for every batch, as another one would end the last's."""
+        """Number of processes, the same for every batch; joblib ends them where it changes."""
         return min(self.jobs or joblib.cpu_count(), _BATCH)
 
 

@@ -126,7 +126,7 @@ def test_a_reversal_is_sure_in_both_worlds() -> None:
 
     def compare(**levels: float) -> dict[tuple[str, str], Estimate]:
         results = {(TASK, Entry(NOMINAL)): driven(np.full(40, 8.0))}
-        for (name, level), factor in zip(levels.items(), noise, strict=True):
+        for (name, level), factor in zip(levels.items(), noise[: len(levels)], strict=True):
             results[TASK, Entry(name)] = driven(level * factor)
         return _compare_entries(results)
 
@@ -136,3 +136,4 @@ def test_a_reversal_is_sure_in_both_worlds() -> None:
     reversed_pairs = _list_reversals(compare(a=2.0, b=1.0, c=1.0), base)
     assert sorted(reversed_pairs) == [("b", "a"), ("c", "a")]
     assert not _list_reversals(base, compare(a=1.0, b=2.01, c=2.0))
+    assert not _list_reversals(base, compare(a=2.0))  # the others cannot drive there

@@ -101,3 +101,8 @@ def test_the_assembler_says_what_a_thread_holds_or_ends_the_count(
     else:
         held = {"registers": "42", "stack, bytes": "16", "spilled, bytes": "4"}
         assert _assemble_kernel(TEXT) == held
+
+
+def test_counting_code_takes_no_option_of_steps() -> None:
+    with pytest.raises(ValueError, match="--device ptx counts code"):
+        device_speed._main(device="ptx", dtype=["float16"])

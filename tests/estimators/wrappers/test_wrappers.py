@@ -189,15 +189,15 @@ def test_a_filter_with_an_accelerometer_knows_whether_the_body_rolls() -> None:
 def test_no_car_that_a_filter_is_told_rolls_where_none_does(vehicle: str | None) -> None:
     env: Any = gym.make("sideslip/YawGps-v0", scenario="dakf-fig6")
     told = env.unwrapped.nominal if vehicle == "nominal" else vehicle
-    alone = EstimateObservation(env, "joint", vehicle=told)
+    alone: Any = EstimateObservation(env, "joint", vehicle=told)
     fleet = gym.make_vec("sideslip/YawGps-v0", 2, scenario="dakf-fig6")
-    together = vector.EstimateObservation(fleet, "joint", vehicle=told)
+    together: Any = vector.EstimateObservation(fleet, "joint", vehicle=told)
     alone.reset(seed=0)
     together.reset(seed=0)
     arms = {
         float(f.roll_arm) for f in (alone.estimator.filters[0], together.estimator[0].filters[0])
     }
-    rolling = make_estimator(
+    rolling: Any = make_estimator(
         "joint", vehicle=env.unwrapped.nominal, sensors=env.unwrapped.slow_sensors
     )
     assert len(arms) == 1 and arms.pop() < 0.01 * rolling.filters[0].roll_arm
