@@ -176,12 +176,7 @@ def _update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
 
 
 def read_current(path: Path | None, tasks: Sequence[ControlTask]) -> Records:
-    """Read the records of tasks; ValueError where the uncontrolled car no longer costs what it did.
-
-    Args:
-        path: File; None: the package's, if there is one.
-        tasks: Tasks.
-    """
+    """Read records of tasks; ValueError where the uncontrolled car no longer costs what it did."""
     if path is None and not FILE.is_file():
         return {}
     path, none = path or FILE, Entry("none")

@@ -245,12 +245,7 @@ EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
 
 
 def select_quick_tasks(tasks: Sequence[ControlTask], count: int = 2) -> list[ControlTask]:
-    """Select some tasks of each tier, from its first to its last.
-
-    Args:
-        tasks: Tasks of all tiers, a tier's together.
-        count: Number of tasks of a tier.
-    """
+    """Select some tasks of each tier, from its first to its last."""
     selected = []
     for tier in dict.fromkeys(task.tier for task in tasks):
         tier_tasks = [task for task in tasks if task.tier == tier]

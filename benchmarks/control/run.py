@@ -135,11 +135,7 @@ class _MetricAccumulator:
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
-    """Drive one episode a seed; why an entry cannot be built or driven is the `error`.
-
-    Args:
-        chunk: Seeds of an entry.
-    """
+    """Drive one episode a seed; why an entry cannot be built or driven is the `error`."""
     try:
         env, agent = chunk.entry.make(chunk.task, len(chunk.seeds))
         steps = iterate_steps(env, agent, list(chunk.seeds))
@@ -181,11 +177,7 @@ def _time_calls(owner: Any, name: str) -> list[float]:
 
 
 def measure_decision_time(case: ControlCase) -> float:
-    """Measure the wall time (us) of a decision of one car: predict, and the estimator's part.
-
-    Args:
-        case: Task and who drives it.
-    """
+    """Measure the wall time (us) of a decision of one car: predict, and the estimator's part."""
     env, agent = case.entry.make(case.task, 1)
     bare: Any = gym.make_vec(case.task.env_id, num_envs=1, **case.env_options)
     bare.reset(seed=0)

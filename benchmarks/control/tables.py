@@ -91,11 +91,7 @@ _MOTION_NOTE = (
 
 
 def make_tables(matrix: Matrix) -> list[ResultTable]:
-    """Make all tables of the suite, those for the report alone behind the others.
-
-    Args:
-        matrix: Measurements.
-    """
+    """Make all tables of the suite, those for the report alone behind the others."""
     main, detail = [], []
     for tier, ranked in matrix.by_tier.items():
         title = f"Tier {tier}: {TITLES[tier]}"
@@ -132,13 +128,7 @@ def make_main_table(
 def make_task_table(
     title: str, ranked: Sequence[Standing], tasks: Sequence[ControlTask]
 ) -> ResultTable:
-    """Make the table of the scores, every entry in every task.
-
-    Args:
-        title: Title of the table.
-        ranked: Standings, the best first.
-        tasks: Tasks, a column each.
-    """
+    """Make the table of the scores, every entry in every task."""
     columns = (_LABEL, *(Column(task.name, form="{:.2f} ({:.0f})") for task in tasks))
     lines: list[Line] = [
         {"label": item.label} | {task.name: _make_cell(item, task) for task in tasks}
@@ -249,11 +239,7 @@ def compute_gaps(pair: PairedDrives, task: ControlTask) -> tuple[float, float]:
 
 
 def make_failure_tables(results: Results) -> list[ResultTable]:
-    """Make the table of the failures that are not the car's, such as a NaN; none without any.
-
-    Args:
-        results: Episodes.
-    """
+    """Make the table of the failures that are not the car's, such as a NaN; none without any."""
     lines = []
     for (task, entry), result in results.items():
         codes = result["failure"]

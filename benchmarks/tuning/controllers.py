@@ -124,13 +124,7 @@ class ControllerTuning:
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
-    """Make the search of a controller's options; ValueError without tasks or seeds.
-
-    Args:
-        name: Name of the controller.
-        kind: Class of tasks.
-        seeds: Tuning seeds.
-    """
+    """Make the search of a controller's options; ValueError without tasks or seeds."""
     check_choice("controller", name, SPACES)
     check_choice("class", kind, KINDS)
     numbers = tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
@@ -187,12 +181,7 @@ def _evaluate_trials(
 
 
 def tune(task: ControllerTuning, search: SearchOptions) -> dict[str, Any]:
-    """Search for the best options by TPE, or go on; ValueError where a task cannot be driven.
-
-    Args:
-        task: Search.
-        search: Options of the search, but for its sampler.
-    """
+    """Search for the best options by TPE, or go on; ValueError where a task cannot be driven."""
     options = task._make_options(task.start)
     for control_task in task.tasks:  # what cannot be driven at all; kernels are compiled once
         if error := _run_entry(control_task, task.name, options, task.seeds[:1]).error:
@@ -231,26 +220,14 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
 
 
 def write_log(path: Path, log: dict[str, Any]) -> None:
-    """Write a log as JSON, a trial a line.
-
-    Args:
-        path: File.
-        log: Log of `tune`.
-    """
+    """Write a log as JSON, a trial a line."""
     lines = ",\n  ".join(json.dumps(trial) for trial in log["trials"])
     head = json.dumps({key: value for key, value in log.items() if key != "trials"}, indent=1)
     write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
 
 
 def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
-    """Replace or add a controller's options in a file of `read_tuned`.
-
-    Args:
-        path: File.
-        kind: Class of tasks.
-        name: Name of the controller.
-        options: Options of filter and controller.
-    """
+    """Replace or add a controller's options in a file of `read_tuned`."""
     target = Path(path)
     read_tuned.cache_clear()
     classes = read_tuned(target) if target.exists() else {}
@@ -268,12 +245,7 @@ def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> Non
 
 
 def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
-    """Make a suite with the numbers that a study found.
-
-    Args:
-        task: Search.
-        log: Log of `tune`.
-    """
+    """Make a suite with the numbers that a study found."""
     best, start = log["best"], log["start"]
     before = "it cannot be driven" if start is None else f"{-start:.3f}"
     text = (

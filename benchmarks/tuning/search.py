@@ -120,13 +120,7 @@ def run_study(
 
 
 def load_study(name: str, ranges: Mapping[str, Range], search: SearchOptions) -> Study:
-    """Create or load a study; ValueError for a storage that fails, or holds something else.
-
-    Args:
-        name: Name of the study.
-        ranges: Range of each number by name.
-        search: Options of the search.
-    """
+    """Create or load a study; ValueError for a storage that fails, or holds something else."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # else each trial has a line
     storage = search.storage
     url = storage if "://" in storage else f"sqlite:///{storage}"
@@ -175,12 +169,7 @@ def _convert_storage_errors(storage: str, *others: type[Exception]) -> Iterator[
 
 
 def make_result_table(numbers: Mapping[str, float], ranges: Mapping[str, Range]) -> ResultTable:
-    """Make a table of the numbers that were found, marked at the end of their ranges.
-
-    Args:
-        numbers: Value by name.
-        ranges: Range by name.
-    """
+    """Make a table of the numbers that were found, marked at the end of their ranges."""
     cells = []
     for name, (low, high) in ranges.items():
         value = numbers[name]
