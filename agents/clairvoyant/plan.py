@@ -3,6 +3,12 @@
 Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within the
 limits, and runs of the env with the pass's gains. A result costs what the env computes. It is a
 local optimum, sought from several starts. Source: Tassa, Mansard, Todorov, ICRA 2014.
+
+Args:
+    env: Single env.
+    seed: Seed of the episode.
+    starts: Actions after the lead-in, shape (K, width), by method; None: zeros alone.
+    agent: Agent, as for `iterate_steps`.
 """
 
 import math
@@ -278,13 +284,7 @@ class ClairvoyantResult:
 def compute_clairvoyant(
     env: gym.Env[Actions, Actions], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
 ) -> ClairvoyantResult:
-    """Compute the best of the plans from other methods' runs, and of those runs themselves.
-
-    Args:
-        env: Single env.
-        seed: Seed of the episode.
-        starts: Actions after the lead-in, shape (K, width), by method; None: zeros alone.
-    """
+    """Compute the best of the plans from other methods' runs, and of those runs themselves."""
     start_time, base, env = time.process_time(), _get_base(env), _ManoeuvreEnv(env)
     env.reset(seed=seed)
     shape = (_count_periods(base), *(base.action_space.shape or ()))
@@ -305,13 +305,7 @@ def compute_clairvoyant(
 
 
 def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Actions:
-    """Record actions after the lead-in (of full scale), shape (K, width), zeros after a failure.
-
-    Args:
-        env: Single env.
-        agent: Agent, as for `iterate_steps`.
-        seed: Seed of the episode.
-    """
+    """Record actions after the lead-in (of full scale), shape (K, width), zeros after a failure."""
     base, (_, *steps) = _get_base(env), iterate_steps(env, agent, seed)
     actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
     for k, step in enumerate(steps[_count_lead_steps(base) :]):

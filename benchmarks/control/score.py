@@ -217,7 +217,7 @@ def _measure_pairs(pairs: Sequence[PairedDrives]) -> dict[str, Estimate]:
 
 
 def rank_entries(results: Results, tier: str | None) -> list[Standing]:
-    """Rank a tier's entries, the best first; last who surely loses more cars or leaves out tasks."""
+    """Rank a tier's entries, the best first; last who surely loses more or leaves out tasks."""
     by_entry: dict[Entry, dict[ControlTask, DriveResult]] = {}
     for (task, entry), result in results.items():
         if tier in (None, task.tier):

@@ -1,6 +1,9 @@
 """A user's agent or estimators in a process of their own, as their driver asks, watches, ends it.
 
 The process never holds the env, its seeds or a result.
+
+Args:
+    chunk: Seeds of an entry that has names and files.
 """
 
 import json
@@ -232,11 +235,7 @@ class _RemoteRow:
 
 
 def run_user_chunk(chunk: Chunk) -> DriveResult:
-    """Run a chunk; an entry whose every episode ends by an action that is none was not driven.
-
-    Args:
-        chunk: Seeds of an entry.
-    """
+    """Run a chunk; an entry whose every episode ends by an action that is none was not driven."""
     result, wrong = run_chunk(chunk), "every action is NaN, or infinite, before an episode is over"
     failed = not result.error and result.mark_failures("bad-action").all()
     return _make_failed_result(chunk, wrong) if failed else result
@@ -254,11 +253,7 @@ class IsolatedDrive:
         return self._run(chunk)[0]
 
     def rehearse(self, chunk: Chunk) -> set[str]:
-        """Run a chunk; return the files that its entries open.
-
-        Args:
-            chunk: Chunk whose entry has names and files.
-        """
+        """Run a chunk; return the files that its entries open."""
         return self._run(chunk)[1]
 
     def _run(self, chunk: Chunk) -> tuple[DriveResult, set[str]]:

@@ -3,6 +3,9 @@
 Whoever can write a kernel's file can run anything. So a folder or file is used only where its path
 is absolute, it belongs to the user or root and nobody else can write it; otherwise kernels are
 compiled in memory, with one warning.
+
+Args:
+    layer: Name in `LAYERS`.
 """
 
 import contextlib
@@ -58,9 +61,6 @@ def hash_sources(layer: str = LAYERS[-1]) -> str:
 
     numba watches only the file of the function itself; an edit in a callee's module would go
     unnoticed. Calls point one way, so an edit in `benchmarks` leaves the kernels of `envs` alone.
-
-    Args:
-        layer: Name in `LAYERS`.
     """
     digest = hashlib.sha256()
     for folder in LAYERS[: LAYERS.index(layer) + 1]:
@@ -85,11 +85,7 @@ def hash_experiment() -> str:
 
 @functools.cache
 def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
-    """Find or make a layer's kernel folder (it may be read-only), else None; prune older versions.
-
-    Args:
-        layer: Name in `LAYERS`.
-    """
+    """Find or make a layer's kernel folder (it may be read-only), else None; prune older versions."""
     try:
         folder = _find_cache_folder() / hash_sources(layer)
         _make_folder(folder)

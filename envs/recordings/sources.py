@@ -1,4 +1,8 @@
-"""Sources of a receiver's bytes: a file, a serial port, a TCP peer."""
+"""Sources of a receiver's bytes: a file, a serial port, a TCP peer.
+
+Args:
+    path: Path of the file.
+"""
 
 import re
 import socket
@@ -84,11 +88,7 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
 
 
 def is_nmea(path: str | Path) -> bool:
-    """Check whether a file is NMEA, by its ending or a sentence near its beginning, valid or not.
-
-    Args:
-        path: Path of the file.
-    """
+    """Check whether a file is NMEA, by its ending or a sentence near its beginning, valid or not."""
     source = Path(path)
     if (is_named := source.suffix.lower() == ".nmea") or not source.is_file():
         return is_named
@@ -101,9 +101,6 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
 
     Raises FileNotFoundError without it, ValueError for a folder and where no sentence is valid or
     no epoch has a fix.
-
-    Args:
-        path: Path of the file.
     """
     from .nmea import Decoder, correct_dates
 

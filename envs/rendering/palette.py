@@ -2,6 +2,9 @@
 
 The colours are spread as far as possible in OKLab, for eyes without red or green cones too, those
 of names that meet in figures the furthest. All stand out from white and from the dark page.
+
+Args:
+    name: Label of a curve or of a car.
 """
 
 import zlib
@@ -65,20 +68,13 @@ def find_base(name: str) -> str | None:
     ('exact-kf', 'bound', None)
     >>> find_base("two-dof on multirate-kf"), find_base("lqr on dakf")
     ('two-dof', 'dakf')
-
-    Args:
-        name: Label of a curve or of a car.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
     return name if name in COLOURS else next((n for n in _LONGEST_FIRST if n in name), None)
 
 
 def find_colour(name: str) -> str:
-    """Find the colour of a label; an unknown one always gets the same.
-
-    Args:
-        name: Label of a curve or of a car.
-    """
+    """Find the colour of a label; an unknown one always gets the same."""
     other = OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
     return COLOURS.get(find_base(name) or "", other)
 
