@@ -85,7 +85,7 @@ def hash_experiment() -> str:
 
 @functools.cache
 def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
-    """Find or make a layer's kernel folder (it may be read-only), else None; prune older versions."""
+    """Find or make a layer's kernel folder (perhaps read-only), else None; prune older versions."""
     try:
         folder = _find_cache_folder() / hash_sources(layer)
         _make_folder(folder)

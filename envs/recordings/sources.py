@@ -88,7 +88,7 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
 
 
 def is_nmea(path: str | Path) -> bool:
-    """Check whether a file is NMEA, by its ending or a sentence near its beginning, valid or not."""
+    """Check whether a file is NMEA, by its ending or a sentence near its start, valid or not."""
     source = Path(path)
     if (is_named := source.suffix.lower() == ".nmea") or not source.is_file():
         return is_named
