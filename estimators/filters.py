@@ -20,7 +20,7 @@ class FilterDefinition:
     uses_all: bool = False  # whether it uses all of them that are there, not the first alone
     model: str = "bicycle"  # or a name of `models.MODELS`
     fast: tuple[str, ...] = ("gyro",)  # measured in every row
-    intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
+    family: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate": between samples
     gains: str = "periodic"  # or "covariance", "placed"
     disturbances: str = "none"  # or "walk", "walk-all", "forces"
     delay: str = "clone"  # a name of `late_samples.RULES`
@@ -53,17 +53,17 @@ unit of each stand in `design.options`."""
 FILTERS: dict[str, FilterDefinition] = {
     "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),
     "single-rate-kf": FilterDefinition(
-        slow=SLOW_NAMES, intersample="single-rate", source="tie-vision (12)-(15)"
+        slow=SLOW_NAMES, family="single-rate", source="tie-vision (12)-(15)"
     ),
     "multirate-kf": FilterDefinition(slow=SLOW_NAMES, source="tie-vision (12)-(13), (16)"),
     "multirate-residual-kf": FilterDefinition(
-        slow=SLOW_NAMES, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
+        slow=SLOW_NAMES, family="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
     ),
     "uneven-delay-kf": FilterDefinition(
-        slow=_CAMERA, intersample="pseudo-residual", delay="stored", source="uneven-delay (11)-(22)"
+        slow=_CAMERA, family="pseudo-residual", delay="stored", source="uneven-delay (11)-(22)"
     ),
     "constant-delay-kf": FilterDefinition(
-        slow=_CAMERA, intersample="pseudo-residual", delay="constant",
+        slow=_CAMERA, family="pseudo-residual", delay="constant",
         source="uneven-delay 5, the rival in Fig. 5",
     ),
     "vision-only-kf": FilterDefinition(
@@ -76,7 +76,7 @@ FILTERS: dict[str, FilterDefinition] = {
         slow=_GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
     ),
     "double-layer": FilterDefinition(
-        slow=_GPS, intersample="pseudo-residual", gains="covariance", disturbances="walk",
+        slow=_GPS, family="pseudo-residual", gains="covariance", disturbances="walk",
         second="velocity-roll", hdop_table=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
@@ -93,7 +93,7 @@ FILTERS: dict[str, FilterDefinition] = {
         source="double-layer-gps 6.3 and (4)-(5), Chen 2008",
     ),
     "dual-rate": FilterDefinition(
-        slow=_GPS, fast=(), intersample="dual-rate", disturbances="walk-all", delay="ignore",
+        slow=_GPS, fast=(), family="dual-rate", disturbances="walk-all", delay="ignore",
         source="dual-rate (4)-(35), (37)-(38)",
     ),
     "lob": FilterDefinition(

@@ -299,7 +299,7 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
     if config.delay == "constant":
         f.assumed = count_ticks(config.assumed_delay, dt, f"{config.name}: assumed_delay")
         sensor = SlowSensor(sensor.period, (config.assumed_delay,), sensor.phase)
-    if config.row.intersample == "dual-rate":  # its rules have no delay
+    if config.row.family == "dual-rate":  # its rules have no delay
         sensor = SlowSensor(sensor.period, (0.0,), sensor.phase)
     label, stride, pace = f"{config.name}: the {name}", int(f.stride), int(f.pace)
     slots = max(1, int(f.frames[f.first_slow]))  # places of stored captures, which take turns
@@ -321,7 +321,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     """Write the codes that choose what compiled code does; ValueError for a contradiction."""
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
-    shared = config.row.intersample == "dual-rate"
+    shared = config.row.family == "dual-rate"
     f.intersample_rule = PSEUDO if pseudo else DUAL_RATE if shared else NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)

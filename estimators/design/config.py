@@ -226,18 +226,18 @@ def _select_defaults(
 
 def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> _Values:
     """Parse how gains are computed, and what happens to late samples and between samples."""
-    is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
-    chosen: _Values = {"intersample": row.intersample, "poles": row.poles}
+    is_dual_rate, is_placed = row.family == "dual-rate", row.gains == "placed"
+    chosen: _Values = {"intersample": row.family, "poles": row.poles}
     if is_dual_rate or row.second:
-        words = DUAL_RATE_RULES if is_dual_rate else (row.intersample, "predict")
-        default = "pseudo" if is_dual_rate else row.intersample
+        words = DUAL_RATE_RULES if is_dual_rate else (row.family, "predict")
+        default = "pseudo" if is_dual_rate else row.family
         chosen["intersample"] = reader.read_choice("intersample", default, words)
     known_gains = DUAL_RATE_GAINS if is_dual_rate else ("", "periodic", "covariance")
     gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
     rule = chosen["intersample"]
     if gains == "from-29" and rule != "pseudo":
         raise reader.make_error("intersample", "is 'pseudo' for gains='from-29'", rule)
-    if row.intersample == "single-rate":
+    if row.family == "single-rate":
         chosen["between"] = reader.read_choice("between", "hold", ("hold", "predict"))
         if chosen["between"] == "hold" and len(used) > 1:
             raise reader.make_error("slow", "is one sensor for between='hold'", used)
