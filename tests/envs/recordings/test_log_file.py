@@ -291,6 +291,12 @@ def test_a_bad_table_gets_one_clear_error(
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
+def test_truth_values_as_categories_are_refused_too() -> None:
+    table: Any = drive().assign(steer_rad=pd.Categorical([True, False] * 25))
+    with pytest.raises(ValueError, match="'steer_rad' holds category; expected numbers"):
+        read_log(table)
+
+
 def test_nothing_and_a_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.csv: there is no such file"):
         read_log(tmp_path / "nowhere.csv")

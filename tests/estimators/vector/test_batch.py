@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from sideslip.envs import COMS, Log, SlowSensor
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.vector.batch import BatchEstimator
+from sideslip.estimators.vector.batch import BatchedRecords, BatchEstimator
 from sideslip.estimators.wrappers.estimate import EstimatorSpec
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
 from tests.estimators.vector.fleets import covariances, make_batch, states, step
@@ -118,3 +119,15 @@ def test_snapshots_and_copies_continue_bit_for_bit() -> None:
         feed(each, logs, 10, 200)
         np.testing.assert_array_equal(states(each), once[0])
         np.testing.assert_array_equal(covariances(each), once[1])
+
+
+def test_an_env_without_a_scenario_tells_its_car_as_it_is() -> None:
+    facts: dict[str, Any] = {
+        "nominal": [COMS] * 2,
+        "slow_sensors": [{}] * 2,
+        "held_speed": [5.0] * 2,
+    }
+    fleet = SimpleNamespace(layout=(), dt=0.001, **facts)
+    assert [spec.vehicle for spec in BatchedRecords(fleet).make_specs([0, 1])] == [COMS] * 2
+    named = BatchedRecords(SimpleNamespace(**vars(fleet), scenario=["rainy", "dry"]))
+    assert named.make_specs([1])[0].vehicle == COMS
