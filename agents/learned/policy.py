@@ -6,9 +6,6 @@ code. The card says what the policy was trained on, how, and what it costs again
 Args:
     name: Shipped name or path.
     path: Path, or shipped name to read; FileNotFoundError without its file.
-    env_id: Id of a registered env.
-    estimator: Name of an estimator, "" for none.
-    estimator_options: Arguments of `EstimateObservation`.
 """
 
 import hashlib
@@ -128,7 +125,13 @@ class Card:
 
 
 def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
-    """Check that a foreign file names no code to import; ValueError where it does."""
+    """Check that a foreign file names no code to import; ValueError where it does.
+
+    Args:
+        env_id: Id of a registered env.
+        estimator: Name of an estimator, or "".
+        estimator_options: Arguments of `EstimateObservation`, without an estimator.
+    """
     if "estimator" in estimator_options:
         raise ValueError("estimator_options holds an estimator, which is none of its options")
     if ":" in env_id:

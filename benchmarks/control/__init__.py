@@ -1,7 +1,6 @@
 """The matrix of estimators and controllers: tasks, entries, runs, scores, tables, calibration.
 
 Args:
-    task: Task that is driven.
     tasks: Tasks, those of a tier together.
     count: Number of tasks of a tier, or of seeds of a task.
     chunk: Seeds of an entry in a task.

@@ -18,8 +18,6 @@ Args:
     inputs: Inputs of the tick.
     state: State at the tick's start.
     tick: Tick since the start of the episode.
-    motion: `Motion` of the car, of a tick at its end.
-    car: `CarParams`.
     refs: (beta_ref, gamma_ref) (rad, rad/s).
     key_low: Lower 32 bits of the episode's key.
     key_high: Its upper 32 bits.
