@@ -88,7 +88,7 @@ class _LatencySearch:
 
     def _compare(self, delayed_filters: FilterRecords, gains: Array) -> FilterRecords:
         rows = np.concatenate(self._rows)
-        stretch = cache(partial(self._filter_stretch, rows=rows, gains=gains))  # by lag
+        stretch = cache(partial(self._run_stretch, rows=rows, gains=gains))  # by lag
         lag, curvature, margin = self._minimise_nis(lambda lag: stretch(lag)[0])
         min_nis, count, memory = stretch(lag)
         scale = max(min_nis / max(count, 1), 1.0)
@@ -121,9 +121,7 @@ class _LatencySearch:
         distant_nis = min(sum_nis(lag) for lag in grid if abs(lag - best) >= coarse)
         return best, curvature, distant_nis - sum_nis(best)
 
-    def _filter_stretch(
-        self, lag: int, rows: Array, gains: Array
-    ) -> tuple[float, int, FilterRecords]:
+    def _run_stretch(self, lag: int, rows: Array, gains: Array) -> tuple[float, int, FilterRecords]:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
         fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]

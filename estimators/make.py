@@ -1,7 +1,6 @@
 """Estimators by name; factories, of agents too: built in, registered, or in a user's own file."""
 
 import ast
-import functools
 import hashlib
 import importlib
 import importlib.util
@@ -10,6 +9,7 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, overload
@@ -289,9 +289,7 @@ make_estimator.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
     parameters=[*_NAMED, *PARAMETERS, _OTHERS]
 )
 
-ESTIMATORS = Registry(
-    "estimator", {name: functools.partial(make_estimator, name) for name in FILTERS}
-)
+ESTIMATORS = Registry("estimator", {name: partial(make_estimator, name) for name in FILTERS})
 """Every estimator that has a name: the package's own and those that were registered."""
 
 

@@ -283,9 +283,7 @@ def _compute_mean_command(end: Scalar, start: Scalar, slew: Scalar, ticks: int) 
     return end - moved * ca.fmax(ca.fabs(moved) / slew - 1.0, 0.0) / (2.0 * ticks)
 
 
-def _compute_moments(
-    fixed: PlanParams, command: Scalar, moment: Scalar, ticks: Sequence[int]
-) -> list[Scalar]:
+def _list_moments(fixed: PlanParams, command: Scalar, moment: Scalar, ticks: range) -> list[Scalar]:
     """Compute the mean yaw moment over ticks (of full scale) from command and moment at tick 0."""
     lag = fixed.motor_tick
     rests = [lag.mean * lag.end**tick if lag.end else 0.0 for tick in ticks]
@@ -326,8 +324,8 @@ def _advance(
     span = min(q, RATE_TICKS)
     sides = (x.command_l, x.command_r), (T_l, T_r), (x.T_l, x.T_r)
     held, command, moment = (_yaw_moment(left, right, car) for left, right in sides)
-    moments = _compute_moments(fixed, held, moment, range(-span, 0))
-    moments += _compute_moments(fixed, command, moment, range(q))
+    moments = _list_moments(fixed, held, moment, range(-span, 0))
+    moments += _list_moments(fixed, command, moment, range(q))
     effort, steering_tick = 0.0, fixed.steering_tick
     for tick in range(q):
         added = _apply_lag(mean_added, x.added, steering_tick.mean * steering_tick.end**tick)

@@ -172,18 +172,16 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
 
 
 @jit
-def integrate_antiwindup(
-    integral: Scalar, step: Scalar, unlimited: Scalar, limited: Scalar
-) -> Scalar:
+def integrate_antiwindup(integral: Scalar, step: Scalar, output: Scalar, limited: Scalar) -> Scalar:
     """Integrate a step, unless it would push the output further past its limit.
 
     Args:
         integral: Integral before the step.
         step: Increment of the integral.
-        unlimited: Output before its limits.
+        output: Output before its limits.
         limited: Output within its limits.
     """
-    if unlimited == limited or (unlimited > limited) != (step > 0.0):
+    if output == limited or (output > limited) != (step > 0.0):
         return integral + step
     return integral
 

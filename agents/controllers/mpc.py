@@ -142,9 +142,7 @@ class Mpc(Lqr):
             if self.remembered:
                 memory[-1] = row_action[0]
 
-    def _solve(
-        self, speed: float, z: Array, memory: Array, row_action: Array, max_moment: float
-    ) -> str:
+    def _solve(self, v: float, z: Array, memory: Array, action: Array, max_moment: float) -> str:
         """Solve for a row's action (m,) and memory, in place; return the status."""
         m, count = self.width, self.horizon * self.width
         low, high = -np.ones(self._rows), np.ones(self._rows)
@@ -153,15 +151,15 @@ class Mpc(Lqr):
             low[count:], high[count:] = -self._change, self._change
             low[count] += memory[0]
             high[count] += memory[0]
-        program, solver = self._get_solver(float(min(SPEEDS, key=lambda knot: abs(knot - speed))))
+        program, solver = self._get_solver(float(min(SPEEDS, key=lambda knot: abs(knot - v))))
         solver.update_settings(rho=_RHO)
         solver.update(q=program.F @ z, l=low, u=high)
         solver.warm_start(x=memory[self._primal], y=memory[self._dual])
         solution = solver.solve(raise_error=False)
         if solution.info.status_val not in self._accepted:
-            row_action[:] = np.nan
+            action[:] = np.nan
             return str(solution.info.status)
-        row_action[:] = solution.x[:m]
+        action[:] = solution.x[:m]
         memory[0] = solution.x[1] if m > 1 else 0.0
         memory[self._primal] = self._shift_solution(solution.x, m)
         duals = [(solution.y[:count], m), (solution.y[count:], 1)]  # of limits, of the rate
@@ -283,10 +281,8 @@ def _prepare_prediction(
     a_x = (T_l + T_r) / (car.m * car.r)
     per_force = 1.0 / per[0], 1.0 / per[1]
     K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
-    terminal = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
-    return PredictionTask(
-        model, start, car, driver, a_x, steady, max_moment, K, terminal, design.blocks
-    )
+    T = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
+    return PredictionTask(model, start, car, driver, a_x, steady, max_moment, K, T, design.blocks)
 
 
 @jit

@@ -119,9 +119,7 @@ def _feedforward_law(x: Matrix, action: Matrix, design: tuple[Any, ...]) -> None
 
 
 @jit
-def _two_dof_law(
-    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
-) -> None:
+def _two_dof_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: Any) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state."""
     follows, car, k_p, k_i, full_scale, wait, dt = design
     for n in range(len(x)):

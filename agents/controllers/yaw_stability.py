@@ -72,9 +72,7 @@ def _apply_dead_zone(value: Scalar, band: Scalar) -> Scalar:
 
 
 @jit
-def _esc_law(
-    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
-) -> None:
+def _esc_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: Any) -> None:
     """Compute the actions from `EscInputs` x; the state is the integral (N m)."""
     target, speeds, gains, band, max_sideslip, stiffness, bounded, full_scale, dt = design
     for n in range(len(x)):

@@ -304,7 +304,7 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             steer_share = load_element(plans, m * b + 1)
             steer_beyond = model.authority * load_element(perturbations, m * b + 1)
         for k in range(blocks[b]):
-            share, added_command, moment_limit, steer_limit = _compute_commands(
+            share, added, moment_limit, steer_limit = _compute_commands(
                 task, state, beta, moment_share, steer_share
             )
             if k == 0:
@@ -313,10 +313,8 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
                     store_element(limits, steer_limit, m * b + 1)
             if row == 0:
                 store_element(first, share, 0)
-                store_element(first, added_command, 1)
-            state, efforts = _predict_step(
-                task, state, share, added_command, share_beyond, steer_beyond
-            )
+                store_element(first, added, 1)
+            state, efforts = _predict_step(task, state, share, added, share_beyond, steer_beyond)
             motion = state.motion
             beta = compute_sideslip_angle(motion.v_x, motion.v_y, model.kind.small_angle)
             # J sums the ticks after the start: trapezoid rule over the ends of the steps, plus half

@@ -10,7 +10,7 @@ filter parts its states but by their priors.
 
 import itertools
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -43,14 +43,9 @@ _TOLERANCE = 1e-6  # of a singular value where the largest is about 1, what coun
 
 
 def compute_error_bound(
-    vehicle: Vehicle,
-    *,
-    record: Record,
-    sensors: Mapping[str, SlowSensor],
-    speed: float,
-    dt: float = TICK,
-    **options: Any,
-) -> Array:
+    vehicle: Vehicle, *, record: Record, sensors: Mapping[str, SlowSensor], speed: float,
+    dt: float = TICK, **options: Any,
+) -> Array:  # fmt: skip
     """Compute the optimal estimate of beta's standard deviation (rad) at every row, shape (K,).
 
     The lowest possible RMSE over a stretch of time is the root of the mean square of this. The
@@ -66,27 +61,15 @@ def compute_error_bound(
     """
     prior = dict.fromkeys(select_states(tuple(sensors)), 0.0)
     options = {"slow": list(sensors), "prior": prior} | options
-    exact = make_estimator(
-        "exact-kf", vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options
-    )
-    return exact.run(record).std[:, 0]
-
-
-class _UnobservableSubspace(NamedTuple):
-    """Initial states that no measurement shows."""
-
-    names: tuple[str, ...]  # of the n states
-    basis: Array  # (n, k), columns, in the states' units
-
-    def is_observable(self, name: str) -> bool:
-        """Return whether a state is the same in all that the sensors cannot tell apart."""
-        return not np.abs(self.basis[self.names.index(name)]).any()
+    kf = make_estimator("exact-kf", vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options)
+    return kf.run(record).std[:, 0]
 
 
 def _find_unobservable_subspace(
     sensors: tuple[str, ...], unknowns: tuple[str, ...]
-) -> _UnobservableSubspace:
-    """Find the unobservable directions of exact-kf's model of `COMS` with unknown constants."""
+) -> tuple[tuple[str, ...], Array]:
+    """Find names of the n states, and a basis (n, k) of what no measurement shows of them."""
+    # of exact-kf's model of `COMS` with unknown constants, in the states' units
     slow = [name for name in sensors if name in SLOW_NAMES]
     fast = [name for name in sensors if name not in slow]
     options: dict[str, object] = {"slow": slow, "fast": fast}
@@ -105,7 +88,7 @@ def _find_unobservable_subspace(
         leaving = A @ basis - basis @ (basis.T @ A @ basis)
         basis = basis @ _find_kernel(leaving / np.linalg.norm(A))
     basis = np.where(np.abs(basis) > _TOLERANCE, basis, 0.0)
-    return _UnobservableSubspace(config.states, sd[:, None] * basis)
+    return config.states, sd[:, None] * basis
 
 
 def make_observability_table() -> list[dict[str, str]]:
@@ -119,11 +102,11 @@ def make_observability_table() -> list[dict[str, str]]:
     for slow, fast in itertools.product(_SLOW, _FAST):
         sensors, line = fast + slow, dict.fromkeys(UNKNOWNS, "")
         unknowns = tuple(name for name in UNKNOWNS if _NEEDS.get(name, "gyro") in sensors)
-        whole = _find_unobservable_subspace(sensors, unknowns)
-        for name in unknowns:
-            single = _find_unobservable_subspace(sensors, (name,))
-            is_alone = "alone" if single.is_observable(name) else "no"
-            line[name] = "yes" if whole.is_observable(name) else is_alone
+        names, basis = _find_unobservable_subspace(sensors, unknowns)
+        for name in unknowns:  # seen where it is the same in all that cannot be told apart
+            states, directions = _find_unobservable_subspace(sensors, (name,))
+            is_alone = "no" if directions[states.index(name)].any() else "alone"
+            line[name] = is_alone if basis[names.index(name)].any() else "yes"
         lines.append({"sensors": ", ".join(sensors)} | line)
     return lines
 

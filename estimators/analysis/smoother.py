@@ -134,11 +134,9 @@ def _filter_forwards(
     return position
 
 
-def _smooth_blocks(
-    undelayed: Estimator, fast: Array, packets: Array, lag: int
-) -> tuple[Array, Array, Array]:
+def _smooth_blocks(filter_: Estimator, fast: Array, packets: Array, lag: int) -> tuple[Array, ...]:
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
-    f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
+    f, gains, rows, n = filter_.filters[0], filter_.gains, len(fast), len(filter_.names)
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)  # two blocks side by side
     blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,), (n,))]

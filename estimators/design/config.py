@@ -157,7 +157,7 @@ def parse_config(
         chosen |= reader.read("force_share", "moment_share")
     if first.forces and TYRES[0] in states:
         chosen |= reader.read("model_error")
-    Q = _parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader)
+    Q = _parse_covariance(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     count = int(reader.read("wary")["wary"])
     wary = count if chosen["delay"] in ("clone", "buffer") else 0
@@ -322,9 +322,7 @@ def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[flo
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
 
 
-def _parse_process_noise(
-    states: Sequence[str], tuning: Mapping[str, float], reader: _Reader
-) -> Array:
+def _parse_covariance(states: Sequence[str], tuning: Mapping[str, float], reader: _Reader) -> Array:
     """Parse Q per second, shape (n, n): the tuning's or the option's, with each `q_STATE` in it."""
     n, matrix = len(states), reader.read_raw("Q")
     tuned_diagonal = [tuning.get(state, 0.0) for state in states]

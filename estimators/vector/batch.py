@@ -29,14 +29,8 @@ from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
-from ..wrappers.estimate import (
-    AnyEstimator,
-    EstimatorSpec,
-    find_base_env,
-    make_spec,
-    replace_body,
-    write_outputs,
-)
+from ..wrappers.estimate import EstimatorSpec, find_base_env, make_spec, replace_body, write_outputs
+from ..wrappers.truth import AnyEstimator
 from .lanes import FilterBank, observe_batch
 
 Build = Callable[..., AnyEstimator]
@@ -178,9 +172,7 @@ class BatchEstimator:
         """Lay the gains of all designs in use side by side in a new pool, and make empty lanes."""
         self._shared = {design: self._shared[design] for design in self._designs}
         self._shapes = {design: self._shapes[design] for design in self._designs}
-        self._pool = np.concatenate(
-            [estimator.gains.ravel() for estimator in self._shared.values()]
-        )
+        self._pool = np.concatenate([x.gains.ravel() for x in self._shared.values()])
         places, start = dict[Hashable, tuple[int, ...]](), 0
         for design, estimator in self._shared.items():
             shape, end = estimator.gains.shape, start + estimator.gains.size

@@ -122,22 +122,13 @@ class VectorObservation(VectorWrapper[Observations, Any, Observations, Any, Any]
             text = "makes no snapshots; the vector env that gym.make_vec builds by itself does"
             raise TypeError(f"{type(env).__name__} {text}")
         ended = None if self._ended is None else self._ended.copy()
-        return {"env": env.get_state(), "ended": ended} | self._get_memory()
+        return {"env": env.get_state(), "ended": ended}
 
     def set_state(self, snapshot: Snapshot) -> None:
         """Restore a snapshot of this env or of one built with the same arguments."""
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._ended = None if snapshot["ended"] is None else snapshot["ended"].copy()
-        self._set_memory(snapshot)
-
-    def _get_memory(self) -> Snapshot:
-        """Return a snapshot of what the wrapper has beside the env."""
-        raise NotImplementedError
-
-    def _set_memory(self, snapshot: Snapshot) -> None:
-        """Restore what `_get_memory` returned."""
-        raise NotImplementedError
 
     def _read_rows(self, name: str, rows: Sequence[int]) -> list[Any]:
         """Read an attribute of some rows' episodes; TypeError where it is out of reach."""
@@ -211,10 +202,14 @@ class EstimateObservation(VectorObservation):
         if isinstance(self._records, BatchedRecords) and isinstance(error, TypeError | ValueError):
             self._ended = ended_before
 
-    def _get_memory(self) -> Snapshot:
-        return {"estimator": self.estimator.get_state(), "out": self._out.copy()}
+    def get_state(self) -> Snapshot:
+        """Return a snapshot for `set_state` as `VectorObservation.get_state` does."""
+        memory = {"estimator": self.estimator.get_state(), "out": self._out.copy()}
+        return super().get_state() | memory
 
-    def _set_memory(self, snapshot: Snapshot) -> None:
+    def set_state(self, snapshot: Snapshot) -> None:
+        """Restore a snapshot as `VectorObservation.set_state` does."""
+        super().set_state(snapshot)
         self._update_cars(range(self.num_envs))
         self.estimator.set_state(snapshot["estimator"])
         self._out[:] = snapshot["out"]
@@ -331,10 +326,7 @@ class TruthObservation(VectorObservation):
     """
 
     def __init__(
-        self,
-        env: AnyVectorEnv,
-        parameters: Sequence[str] = STIFFNESSES,
-        states: Sequence[str] = (),
+        self, env: AnyVectorEnv, parameters: Sequence[str] = STIFFNESSES, states: Sequence[str] = ()
     ) -> None:
         super().__init__(env)
         refuse_stacked(env, type(self))
@@ -366,9 +358,13 @@ class TruthObservation(VectorObservation):
             states = np.array(self._read_rows("true_state", range(self.num_envs)))
         return self._entries.append(obs, self._values, self._calibration, states)
 
-    def _get_memory(self) -> Snapshot:
-        return {"values": self._values.copy(), "calibration": self._calibration.copy()}
+    def get_state(self) -> Snapshot:
+        """Return a snapshot for `set_state` as `VectorObservation.get_state` does."""
+        memory = {"values": self._values.copy(), "calibration": self._calibration.copy()}
+        return super().get_state() | memory
 
-    def _set_memory(self, snapshot: Snapshot) -> None:
+    def set_state(self, snapshot: Snapshot) -> None:
+        """Restore a snapshot as `VectorObservation.set_state` does."""
+        super().set_state(snapshot)
         self._values = snapshot["values"].copy()
         self._calibration = snapshot["calibration"].copy()

@@ -169,15 +169,10 @@ def _read_signals(b: LaneBlock) -> Any:
         is_outlier = is_outlier | (is_finite(load_element(b.y, i)) ^ True)
     speed = load_element(b.speed)
     if b.measured == 1:
-        wheel_speed = 0.5 * (
-            load_element(b.row, FAST.wheel_left) + load_element(b.row, FAST.wheel_right)
-        )
-        speed = speed + load_element(b.smoothing) * (wheel_speed - speed)
-        is_outlier = (
-            is_outlier
-            | (is_finite(wheel_speed) ^ True)
-            | is_speed_changed(speed, load_element(b.model_speed))
-        )
+        wheel = 0.5 * (load_element(b.row, FAST.wheel_left) + load_element(b.row, FAST.wheel_right))
+        speed = speed + load_element(b.smoothing) * (wheel - speed)
+        is_outlier = is_outlier | (is_finite(wheel) ^ True)
+        is_outlier = is_outlier | is_speed_changed(speed, load_element(b.model_speed))
     return speed, is_outlier & (load_element(b.here) == 1.0)
 
 
@@ -198,11 +193,8 @@ def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
     """Correct all lanes by their fast measurements; a residual that is not finite is skipped."""
     for i in range(b.fasts):
         residual = compute_residual(b, i)
-        is_invalid = (
-            (is_finite(residual) ^ True)
-            & (load_element(b.apart) == 0.0)
-            & (load_element(b.here) == 1.0)
-        )
+        is_together = (load_element(b.apart) == 0.0) & (load_element(b.here) == 1.0)
+        is_invalid = (is_finite(residual) ^ True) & is_together
         has_invalid = any_lane(is_invalid)
         if has_invalid:
             store_element(b.wild, select(is_invalid, 1.0, 0.0))

@@ -25,12 +25,11 @@ from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import find_entry_point, make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, compute_std, get_label
-from .truth import TRUTH, calibrate, choose_vehicle, set_stiffness
+from .truth import TRUTH, AnyEstimator, calibrate, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 _Floats = npt.NDArray[np.float32]
-AnyEstimator = Estimator | ForeignEstimator
 _TRUTHS = {"beta": 1, "gamma": 2}  # code of each state whose truth `observe` gets; 0: none
 _WRAPPED = ("psi", "psi_late")  # angles that are wrapped to +-pi
 _ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)

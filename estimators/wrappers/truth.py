@@ -20,6 +20,7 @@ from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
 _Floats = npt.NDArray[np.float32]
+AnyEstimator = Estimator | ForeignEstimator
 Readings = TypeVar("Readings", Array, _Floats)
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
@@ -119,9 +120,7 @@ class TruthEntries:
         return appended
 
 
-def choose_vehicle(
-    estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle
-) -> Vehicle:
+def choose_vehicle(estimator: AnyEstimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
     """Choose a filter's car: `vehicle` with stiffness and friction of `built` where these may stay.
 
     Where gains follow P no gain is designed from the stiffnesses, and `set_stiffness` suffices.
@@ -137,7 +136,7 @@ def choose_vehicle(
     return vehicle.replace(**{name: getattr(built, name) for name in fixed})
 
 
-def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
+def set_stiffness(estimator: AnyEstimator, vehicle: Vehicle) -> None:
     """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays.
 
     Args:
@@ -183,11 +182,9 @@ class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordCons
     """
 
     def __init__(
-        self,
-        env: gym.Env[_Floats, Any],
-        parameters: Sequence[str] = STIFFNESSES,
+        self, env: gym.Env[_Floats, Any], parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         gym.Wrapper.__init__(self, env)
         refuse_stacked(env, type(self))

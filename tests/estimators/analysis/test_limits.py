@@ -117,7 +117,7 @@ ASKEW = ("camera_yaw", "steer_offset", "bank")  # which together hide behind eac
 
 def is_together(sensors: Any, *unknowns: str) -> bool:
     """Whether a set of sensors sees all of some unknowns at once, straight on."""
-    return not _find_unobservable_subspace(sensors, unknowns).basis.size
+    return not _find_unobservable_subspace(sensors, unknowns)[1].size
 
 
 def test_every_pair_but_one_is_seen_straight_on() -> None:
