@@ -30,7 +30,7 @@ from ..envs.sensors.slow import HDOP_LAWS
 from ..envs.task import REFERENCES
 from ..envs.validation import check_choice
 from ..envs.vehicle.parameters import GRAVITY
-from ..estimators.design.models import select_states
+from ..estimators.design.options import select_states
 from ..estimators.make import make_estimator
 from ..estimators.vector import estimate as vector
 from ..estimators.wrappers.estimate import EstimateObservation

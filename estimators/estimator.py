@@ -27,8 +27,7 @@ from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
 from .design import periodic
-from .design.models import STATES
-from .design.options import FilterConfig
+from .design.options import STATES, FilterConfig
 from .design.periodic import MARGINAL, Schedule, allocate_gains, count_ticks, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 

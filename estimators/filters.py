@@ -18,7 +18,7 @@ class FilterDefinition:
 
     slow: tuple[str, ...] = ()  # slow sensors it can use, the preferred first
     uses_all: bool = False  # whether it uses all of them that are there, not the first alone
-    model: str = "bicycle"  # or a name of `models.MODELS`
+    model: str = "bicycle"  # or a name of `design.options.MODELS`
     fast: tuple[str, ...] = ("gyro",)  # measured in every row
     family: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate": between samples
     gains: str = "periodic"  # or "covariance", "placed"

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..envs.record import PACKET, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
-from .design.models import FOREIGN_STATE, STATES
+from .design.options import FOREIGN_STATE, STATES
 
 
 class UnobservableWarning(UserWarning):
@@ -43,7 +43,7 @@ class EstimatorLike(Protocol):
     def names(self) -> Sequence[str]:
         """Names of the n states; "beta" and "gamma" are the sideslip angle and the yaw rate.
 
-        States with a name of `design.models.STATES` are in that unit; others have the unit "-".
+        States with a name of `design.options.STATES` are in that unit; others have the unit "-".
         """
 
     @property

@@ -30,7 +30,7 @@ from ...envs.numerics import require_extra
 from ...envs.numerics.functions import TICK
 from ...envs.record import FAST, PACKET
 from ...envs.sensors.slow import WIDTHS
-from ...estimators.design.models import FOREIGN_STATE, STATES
+from ...estimators.design.options import FOREIGN_STATE, STATES
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout
 from .loop import LOOPBACK, Port, clock, wait_until

@@ -17,7 +17,7 @@ from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task import OBSERVATION_OPTIONS
 from ...envs.validation import short_repr
 from ...estimators import vector, wrappers
-from ...estimators.design.models import TYRES
+from ...estimators.design.options import TYRES
 from ...estimators.filters import FILTERS
 from ..harness.drives import call_quietly
 from .tasks import NOMINAL, ORACLES, STEERING, TIERS, YAW, ControlTask, find_oracle

@@ -15,7 +15,7 @@ from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import COLUMNS, name_log, parse_mapping, read_columns
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
-from ...estimators.design.models import MEASUREMENTS
+from ...estimators.design.options import MEASUREMENTS
 from ...estimators.make import make_estimator
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly

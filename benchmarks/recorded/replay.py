@@ -20,7 +20,7 @@ from ...envs.recordings.tables import parse_mapping
 from ...envs.sensors.link import SlowSensor
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
-from ...estimators.design.models import MEASUREMENTS
+from ...estimators.design.options import MEASUREMENTS
 from ...estimators.make import make_estimator
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly

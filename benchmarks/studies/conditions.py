@@ -17,8 +17,7 @@ from ...agents.baselines import CONSTANT_ERRORS, compute_range_rms
 from ...envs.record import FAST, PACKET, Log
 from ...envs.scenarios.world import IDEAL
 from ...envs.sensors.slow import SLOW_NAMES
-from ...estimators.design.models import COURSE_SPEED
-from ...estimators.design.options import NOISE
+from ...estimators.design.options import COURSE_SPEED, NOISE
 from ...estimators.make import make_estimator
 from ...estimators.protocol import Estimates
 from ...estimators.wrappers.truth import calibrate

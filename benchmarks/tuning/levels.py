@@ -25,7 +25,7 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.scenarios.world import GROUPS, make_world
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
-from ...estimators.design.models import BIASES, COURSE_SPEED
+from ...estimators.design.options import BIASES, COURSE_SPEED
 from ...estimators.filters import FILTERS
 from ..harness.drives import (
     SETTLED,

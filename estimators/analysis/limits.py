@@ -23,7 +23,7 @@ from ..core.filter import reset_filters
 from ..design.assemble import assemble
 from ..design.config import parse_config
 from ..design.gains import transition_matrix
-from ..design.models import select_states
+from ..design.options import select_states
 from ..filters import FILTERS
 from ..make import make_estimator
 

@@ -15,10 +15,8 @@ from ..core import record as size
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
 from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
-from . import models
 from .gains import kalman_gain
-from .models import TYRES, FilterModel
-from .options import FilterConfig
+from .options import LATE, MEASUREMENTS, SCALE, TYRES, WANDER, FilterConfig, FilterModel
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
 
@@ -253,10 +251,10 @@ def _write_signals(
         f.r_fast[i] = noise[name] ** 2
         if name in measured_state:
             f.C_fast[i, names.index(measured_state[name])] = 1.0
-    f.accel_scale_state = names.index(models.SCALE) if models.SCALE in model.biases else 0
-    for bias in models.WANDER.keys() & model.biases:
-        if models.WANDER[bias] in model.fast:
-            f.C_fast[model.fast.index(models.WANDER[bias]), names.index(bias)] = 1.0
+    f.accel_scale_state = names.index(SCALE) if SCALE in model.biases else 0
+    for bias in WANDER.keys() & model.biases:
+        if WANDER[bias] in model.fast:
+            f.C_fast[model.fast.index(WANDER[bias]), names.index(bias)] = 1.0
     if model.kind == LATERAL and "accel_y" in model.fast:
         f.accel_row = model.fast.index("accel_y")
     if model.kind == FORCES:  # m a_y = F_yf + F_yr
@@ -270,7 +268,7 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
     is_second_layer = model.kind == VELOCITY_ROLL
     for s in used:
         name = SLOW_NAMES[s]
-        sensor = models.MEASUREMENTS[name]
+        sensor = MEASUREMENTS[name]
         rows = sensor.velocities if is_second_layer else sensor.rows
         f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
         for place, value in enumerate(SLOW[s].values, PACKET.value):
@@ -281,7 +279,7 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
             f.r[s, i] = config.noise[row.noise] ** 2
             f.noise_over_speed[s, i] = config.noise_over_speed.get(row.noise, 0.0) ** 2
             for state in row.states:
-                late = models.LATE.get(state)
+                late = LATE.get(state)
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
         if name == "camera" and "camera_yaw" in model.biases:  # it turns about the car, not y_l
             f.C[s, :2, model.names.index("camera_yaw")] = 1.0, f.preview

@@ -15,21 +15,9 @@ from ..core.late_samples import RULES
 from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
-from . import models
+from . import options as tables
 from .gains import DUAL_RATE_GAINS, DUAL_RATE_RULES, INVERSES, check_covariance
-from .models import BIASES, SCALE, STATES, TYRES, WANDER, FilterModel
-from .options import (
-    FAST_CHANNELS,
-    FIND,
-    NOISE,
-    NOT_NEGATIVE,
-    NUMBER,
-    OPTIONS,
-    POSITIVE,
-    TUNINGS,
-    FilterConfig,
-    NumberRule,
-)
+from .options import BIASES, FIND, SCALE, STATES, TYRES, FilterConfig, FilterModel, NumberRule
 
 _GATE_PROBABILITY = 1.0 - 1e-9
 _MAX_LATENCY = 0.5  # s, largest latency that may be configured
@@ -66,7 +54,7 @@ class _Reader:
         """Read options that are numbers or flags, by their defaults and limits."""
         values: _Values = {}
         for key in keys:
-            about, usual = OPTIONS[key].metadata, OPTIONS[key].default
+            about, usual = tables.OPTIONS[key].metadata, tables.OPTIONS[key].default
             value = self.read_raw(key, usual if default is None else default)
             limits, unit = about["limits"], about["unit"]
             if value is not None or usual is not None:
@@ -138,17 +126,17 @@ def parse_config(
         chosen |= {"disturbances": disturbances} | reader.read("steer_rate")
         first = _make_bicycle_model(used, chosen, rolls=chosen["fast"] != row.fast)
     else:
-        first = models.MODELS[row.model]
-    layers = (first, models.MODELS[row.second]) if row.second else (first,)
+        first = tables.MODELS[row.model]
+    layers = (first, tables.MODELS[row.second]) if row.second else (first,)
     states = [state for model in layers for state in model.names]
     if chosen["poles"] and len(chosen["poles"]) != len(states):
         text = f"are one for each of {', '.join(states)}"
         raise reader.make_error("poles", text, chosen["poles"])
-    rows = [row for sensor in models.MEASUREMENTS.values() for row in sensor.rows]
+    rows = [row for sensor in tables.MEASUREMENTS.values() for row in sensor.rows]
     growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in options]
     noise = {
-        key.removesuffix("_noise"): reader.read_number(key, sd, POSITIVE)
-        for key, sd in NOISE.items()
+        key.removesuffix("_noise"): reader.read_number(key, sd, tables.POSITIVE)
+        for key, sd in tables.NOISE.items()
     }
     if _DISTURBANCES & {*states}:
         chosen |= reader.read("leak")
@@ -157,7 +145,7 @@ def parse_config(
         chosen |= reader.read("force_share", "moment_share")
     if first.forces and TYRES[0] in states:
         chosen |= reader.read("model_error")
-    Q = _parse_covariance(states, TUNINGS.get((name, ",".join(used)), {}), reader)
+    Q = _parse_covariance(states, tables.TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     count = int(reader.read("wary")["wary"])
     wary = count if chosen["delay"] in ("clone", "buffer") else 0
@@ -166,16 +154,16 @@ def parse_config(
     chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
     prior = _parse_prior(states, first.forces, chosen, reader)
     reader.check_unread()
-    chosen["noise_over_speed"] = {key: noise[key] * models.COURSE_SPEED for key in growing}
+    chosen["noise_over_speed"] = {key: noise[key] * tables.COURSE_SPEED for key in growing}
     chosen["sensors"] = {sensor: sensors[sensor] for sensor in used}
     return FilterConfig(name=name, row=row, models=layers, Q=Q, prior=prior, **chosen)
 
 
 def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) -> FilterModel:
     """Make the bicycle model with the states that slow sensors need; `rolls`: the body does."""
-    states = models.select_states(sensors)
+    states = tables.select_states(sensors)
     lags = chosen["delay"] in ("literal", "lag") and "camera" in sensors  # tie-vision (12)-(13)
-    late = tuple(models.LATE[state] for state in states if lags and state in models.LATE)
+    late = tuple(tables.LATE[state] for state in states if lags and state in tables.LATE)
     walking = tuple(pair for pair in _WALKS[chosen["disturbances"]] if pair[1] in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = chosen["disturbances"] == "forces", states + _BODY * rolls
@@ -260,13 +248,13 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
     """Parse the fast sensors, and the deviations and times of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return {"fast": row.fast, "bias_sds": {}}
-    value, known = reader.read_raw("fast", row.fast), models.INERTIAL
+    value, known = reader.read_raw("fast", row.fast), tables.INERTIAL
     words = list(value) if isinstance(value, list | tuple) else [value]
     fast = tuple(word for word in known if word in words)
     if len(fast) != len(words) or known[0] not in fast:
         raise reader.make_error("fast", f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
     biases = {
-        name: reader.read_number(f"{name}_sd", 0.0, NOT_NEGATIVE, STATES[name].unit)
+        name: reader.read_number(f"{name}_sd", 0.0, tables.NOT_NEGATIVE, STATES[name].unit)
         for name in BIASES
     }
     nominal = [name for name in TYRES if not biases[name] > 0.0]
@@ -280,9 +268,9 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         option, usable = ("slow", used) if BIASES[name] in SLOW_NAMES else ("fast", fast)
         if BIASES[name] not in (*usable, ""):
             raise reader.make_error(f"{name}_sd", f"needs {BIASES[name]} among {option}", usable)
-        if name in WANDER:
+        if name in tables.WANDER:
             key = f"{name}_time"
-            times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
+            times[name] = reader.read_number(key, 0.0, tables.NOT_NEGATIVE, "s")
             if times[name] > 0.0 and f"q_{name}" in reader.passed:
                 text = f"q_{name} is not used beside {key}, {times[name]:g} s, and {name}_sd"
                 raise ValueError(f"{reader.name}: {text}")
@@ -295,8 +283,9 @@ def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]
     if not isinstance(value, Mapping):
         raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
     for channel in value:
-        if channel not in FAST_CHANNELS:
-            raise reader.make_error("latency", f"is of {', '.join(FAST_CHANNELS)}", dict(value))
+        if channel not in tables.FAST_CHANNELS:
+            expected = f"is of {', '.join(tables.FAST_CHANNELS)}"
+            raise reader.make_error("latency", expected, dict(value))
     latencies: dict[str, float | str] = {}
     for channel, late in value.items():
         if late == FIND:
@@ -331,7 +320,7 @@ def _parse_covariance(states: Sequence[str], tuning: Mapping[str, float], reader
         raise ValueError(f"{reader.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
     Q = np.diag(Q) if Q.ndim == 1 else Q
     for i, state in enumerate(states):
-        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]), NUMBER)
+        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]), tables.NUMBER)
     check_covariance(f"{reader.name}: Q", Q)
     return Q
 

@@ -20,7 +20,7 @@ from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ..core.filter import Observed, OutputTable, StepRecord, observe
 from ..core.record import FILTER
-from ..design.models import FOREIGN_STATE, STATES
+from ..design.options import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import find_entry_point, make_estimator

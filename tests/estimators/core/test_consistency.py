@@ -16,8 +16,7 @@ from sideslip.envs import Log
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.design.models import MEASUREMENTS, select_states
-from sideslip.estimators.design.options import NOISE, FilterOptions
+from sideslip.estimators.design.options import MEASUREMENTS, NOISE, FilterOptions, select_states
 from tests.estimators.drives import Drives, told
 from tests.estimators.riccati import riccati
 

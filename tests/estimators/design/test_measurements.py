@@ -10,7 +10,7 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import CAMERA, GPS, SLOW, SLOW_NAMES
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design import assemble
-from sideslip.estimators.design.models import (
+from sideslip.estimators.design.options import (
     MEASUREMENTS,
     Measurement,
     MeasurementRow,
