@@ -60,8 +60,7 @@ def test_what_is_constant_of_a_sensor_costs_an_oracle_nothing() -> None:
     errors = {"camera_yaw": 0.005, "gyro_scale": 0.99, "accel_roll": 0.02, "map_lag": 0.2}
     costs = [
         evaluate_episodes(
-            *make_oracle("oracle-parameters-lqr", FUSION, 4, world=world, **SLALOM),
-            range(4),
+            *make_oracle("oracle-parameters-lqr", FUSION, 4, world=world, **SLALOM), range(4)
         )[0]
         for world in (errors, "ideal")
     ]
@@ -73,20 +72,15 @@ real = views.CarTruth
 
 def drive_uneven(world: dict[str, Any]) -> np.ndarray:
     """Costs in a world that is not ideal."""
-    driver = make_oracle(
-        "oracle-state-lqr", FUSION, CARS, world={"moment_rate": 1e-9} | world, **SLALOM
-    )
+    world = {"moment_rate": 1e-9} | world
+    driver = make_oracle("oracle-state-lqr", FUSION, CARS, world=world, **SLALOM)
     return evaluate_episodes(*driver, range(CARS))[0]
 
 
-def test_motors_that_pull_unevenly_are_commanded_accordingly(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_uneven_motors_are_commanded_accordingly(monkeypatch: pytest.MonkeyPatch) -> None:
     even, uneven = drive_uneven({}), {"torque_scale": 0.5, "torque_left": 1.3}
     np.testing.assert_allclose(drive_uneven(uneven), even, 0.004)
-    monkeypatch.setattr(
-        views, "CarTruth", lambda *facts: real(facts[0], facts[1], 1.0, 1.0, facts[-1])
-    )
+    monkeypatch.setattr(views, "CarTruth", lambda *x: real(x[0], x[1], 1.0, 1.0, x[-1]))
     assert np.abs(drive_uneven(uneven) / even - 1.0).max() > 0.02  # who does not know it
 
 

@@ -40,9 +40,7 @@ def steered() -> gym.Env[Any, Any]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_single_and_batch_agree_and_memory_is_outside(
-    name: str, steered: gym.Env[Any, Any]
-) -> None:
+def test_single_and_batch_agree_with_memory_outside(name: str, steered: gym.Env[Any, Any]) -> None:
     env, agent = steered, make_agent(name, steered)
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(15, 3, env.observation_space.shape[0])).astype(np.float32)  # type: ignore[index]
@@ -87,9 +85,7 @@ def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines3_evaluates_them(name: str, steered: gym.Env[Any, Any]) -> None:
     agent: Any = make_agent(name, steered)
-    reward, _ = evaluate_policy(
-        agent, DummyVecEnv([lambda: steered]), n_eval_episodes=1, warn=False
-    )
+    reward, _ = evaluate_policy(agent, DummyVecEnv([lambda: steered]), 1, warn=False)
     assert np.isfinite(reward) and float(np.mean(reward)) < 0.0
 
 
@@ -97,7 +93,7 @@ def test_rollout_and_evaluate_policy_agree(env: gym.Env[Any, Any]) -> None:
     agent: Any = make_agent("two-dof", env)
     vec = DummyVecEnv([lambda: env])
     vec.seed(3)
-    reward, _ = evaluate_policy(agent, vec, n_eval_episodes=1, warn=False)
+    reward, _ = evaluate_policy(agent, vec, 1, warn=False)
     assert -sideslip.rollout(env, agent, seed=3).cost == pytest.approx(reward, rel=1e-6)
 
 

@@ -98,9 +98,7 @@ def test_the_motion_told_is_the_cars() -> None:
 def test_a_rollout_of_many_cars_or_of_another_env_is_refused_in_one_line() -> None:
     many = gym.make_vec("sideslip/YawVision-v0", num_envs=2)
     for env in (many, gym.make("CartPole-v1"), "CartPole-v1", 5):
-        with pytest.raises(
-            TypeError, match=r"^rollout runs one env .*evaluate_episodes runs a vector env$"
-        ):
+        with pytest.raises(TypeError, match=r"^rollout runs one env .*episodes runs a vector env$"):
             sideslip.rollout(env)  # type: ignore[arg-type]
 
 

@@ -105,24 +105,19 @@ def test_levels_of_a_world_are_those_of_its_ranges() -> None:
     assert levels["camera_yaw_sd"] == pytest.approx(v1.camera_yaw[1] / 3**0.5)  # type: ignore[index]
     assert levels["steer_offset_sd"] == pytest.approx(v1.steer_offset[1] / 3**0.5)  # type: ignore[index]
     assert levels["bank_sd"] == pytest.approx(math.hypot(0.02, 0.02) / 3**0.5)
-    assert levels.keys() - make_noise_options(scenario, v1, True).keys() == {
-        "force_share",
-        "moment_share",
-    }
+    with_tyres = make_noise_options(scenario, v1, True)
+    assert levels.keys() - with_tyres.keys() == {"force_share", "moment_share"}
     still = make_noise_options(scenario, World(moment_rate=0.1), True)
     assert {key: value for key, value in still.items() if value and key in plain} == plain
-    assert {key for key, value in still.items() if not value} == {
-        *("camera_yaw_sd", "steer_offset_sd", "q_psi")
-    }
+    zeros = {key for key, value in still.items() if not value}
+    assert zeros == {"camera_yaw_sd", "steer_offset_sd", "q_psi"}
 
 
 @pytest.mark.parametrize(("name", "most"), [("coms-slalom", 6.0), ("car-slalom", 4.0)])
 def test_in_a_world_nominal_knows_how_wrong_its_slip_may_be(name: str, most: float) -> None:
     """Nobody drives: the squared error over its variance, in the median of the cars."""
     car = "coms" if name.startswith("coms") else "passenger-car"
-    env: Any = gym.make_vec(
-        FUSION, num_envs=CARS, scenario=name, vehicle=car, nominal=car, world="v1"
-    )
+    env: Any = gym.make_vec(FUSION, CARS, scenario=name, vehicle=car, nominal=car, world="v1")
     base, found = SCENARIOS[name], []
     for world in (WORLDS["v1"], WORLDS["ideal"]):
         options = make_noise_options(base, world) | {"slow": ["camera", "gps"]}
@@ -149,9 +144,7 @@ def test_biases_are_taken_away_for_the_oracle_alone() -> None:
 
 def test_one_table_serves_all_who_ask_for_it() -> None:
     """The design takes a second."""
-    rungs = [
-        make_oracle("oracle-parameters-lqr", FUSION, scenario=name)[1] for name in ("sine", "gust")
-    ]
+    rungs = [make_oracle("oracle-parameters-lqr", FUSION, scenario=x)[1] for x in ("sine", "gust")]
     assert all(isinstance(each, Lqr) for each in rungs)
     assert rungs[0].table is rungs[1].table  # type: ignore[attr-defined]
 

@@ -21,6 +21,10 @@ SHORT = type(FIG7)(duration=0.3)
 
 NEEDS = ": gate, adapt.* need gains='covariance'"
 ACCEL = {"fast": ["gyro", "accel_y"]}
+WINDOW = r"s late; delay='{0}' has a window of 0.{1} s \({1} ticks"
+ASSUMED: dict[str, Any] = {"delay": "constant", "assumed_delay": 0.512}
+LATE_GPS = {"sensors": {"gps": SlowSensor(0.2, (0.3,), jitter=0.2)}, "delay": "buffer"}
+MANY_FIXES = {"sensors": {"gps": SlowSensor(0.005, (0.4,))}, "delay": "buffer"}
 LARSEN_HDOP: dict[str, Any] = {"slow": "gps", "hdop_table": [(1.0, 1.0), (2.0, 2.0)]}
 LARSEN_HDOP |= {"delay": "larsen"}
 
@@ -89,36 +93,16 @@ def camera(late: float, jitter: float = 0.0) -> dict[str, Any]:
         ("multirate-kf", {"gains": "periodic"} | camera(0.01, jitter=0.02), ValueError, "random"),
         ("multirate-residual-kf", camera(0.05), ValueError, "before the next one"),
         ("exact-kf", camera(0.3), ValueError, "can hold 8"),
+        ("exact-kf", LATE_GPS, ValueError, rf"gps can be 0.5 {WINDOW.format('buffer', 496)}"),
+        ("exact-kf", {"delay": "stored"} | camera(0.512), ValueError, WINDOW.format("stored", 511)),
         (
             "exact-kf",
-            {"sensors": {"gps": SlowSensor(0.2, (0.3,), jitter=0.2)}, "delay": "buffer"},
+            ASSUMED | camera(0.0),
             ValueError,
-            r"gps can be 0.5 s late; delay='buffer' has a window of 0.496 s \(496 ticks",
+            "0.512 s is not within .* of 0.512 s",
         ),
-        (
-            "exact-kf",
-            {"delay": "stored"} | camera(0.512),
-            ValueError,
-            r"camera can be 0.512 s late; delay='stored' has a window of 0.511 s \(511 ticks",
-        ),
-        (
-            "exact-kf",
-            {"delay": "constant", "assumed_delay": 0.512} | camera(0.0),
-            ValueError,
-            r"assumed_delay of 0.512 s is not within the window of 0.512 s \(512 ticks\)",
-        ),
-        (
-            "exact-kf",
-            {"sensors": {"gps": SlowSensor(0.005, (0.4,))}, "delay": "buffer"},
-            ValueError,
-            "86 samples of gps can come within the longest delay; delay='buffer' stores 64",
-        ),
-        (
-            "exact-kf",
-            {"delay": "larsen"} | camera(0.1),
-            ValueError,
-            "the camera can be 0.1 s late, 4 of its periods .* delay='larsen' can hold 1",
-        ),
+        ("exact-kf", MANY_FIXES, ValueError, "86 samples of gps can come .*'buffer' stores 64"),
+        ("exact-kf", {"delay": "larsen"} | camera(0.1), ValueError, "0.1 s late, 4 .* can hold 1"),
         # rules that do not go together
         ("exact-kf", {"delay": "larsen", "gate": 0.99}, ValueError, "delay='larsen' .* no gate"),
         ("exact-kf", LARSEN_HDOP, ValueError, "no hdop_table"),
@@ -143,12 +127,9 @@ def test_constructor_errors_name_it(name: Any, options: Any, error: Any, message
 
 
 NUMBERS = [key for key, x in OPTIONS.items() if type(x.default) in {int, float}]
-NEEDED: dict[str, dict[str, Any]] = {
-    "assumed_delay": {"delay": "constant"},
-    "model_error": WITH_TYRES,
-}
-for name in ("force_sd", "moment_sd", "disturbance_time"):
-    NEEDED[name] = {"disturbances": "forces"}
+NEEDED: dict[str, Any] = {"assumed_delay": {"delay": "constant"}, "model_error": WITH_TYRES}
+FORCES = ("force_sd", "moment_sd", "disturbance_time")
+NEEDED |= {key: {"disturbances": "forces"} for key in FORCES}
 
 
 @pytest.mark.parametrize("key", ["gate", *NUMBERS])

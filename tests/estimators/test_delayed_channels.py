@@ -49,9 +49,8 @@ def test_it_equals_dense_conditioning_on_what_has_come(case: str, delay: str) ->
         for name, seconds in latency.items():
             fast[len(fast) - round(seconds / told.dt) :, getattr(FAST, name)] = np.nan
         record = dataclasses.replace(log.record, fast=fast)
-        assert (
-            differences(filter_, *told.posterior(filter_.names, record).at(told.rows - 1)) < EXACT
-        )
+        dense = told.posterior(filter_.names, record).at(told.rows - 1)
+        assert differences(filter_, *dense) < EXACT
         assert {name for name, count in filter_.counts.items() if count} <= {"duplicates"}
 
 
@@ -132,9 +131,7 @@ def test_the_bound_that_knows_it_is_a_bound() -> None:
     """A late gyro costs, a punctual one that is slower costs no less; the filter reaches it."""
     log, facts = drive()
     told: Any = {"record": log.record, "sensors": facts["sensors"], "speed": FIG7.speed}
-    best = [
-        compute_error_bound(FIG7.truth, **told, latency=how) for how in ({}, LATE, {"gyro": 0.12})
-    ]
+    best = [compute_error_bound(FIG7.truth, **told, latency=x) for x in ({}, LATE, {"gyro": 0.12})]
     assert (best[0][500:] < best[1][500:]).all() and (best[1][500:] < best[2][500:]).all()
 
 
@@ -252,9 +249,7 @@ def test_it_finds_the_latency_whatever_the_tyres(tyres: tuple[float, float], lat
     punctual = plain.run(simulate(FIG7, FACTS["sensors"], 0))
     if late == 0.0:
         assert (estimates.x == punctual.x).all()
-    squares = [
-        np.mean((each["beta"] - log.truth["beta"])[2000:] ** 2) for each in (estimates, punctual)
-    ]
+    squares = [np.mean((x["beta"] - log.truth["beta"])[2000:] ** 2) for x in (estimates, punctual)]
     assert squares[0] < 1.2 * squares[1]
 
 

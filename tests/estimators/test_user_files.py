@@ -107,9 +107,8 @@ def test_other_names_are_no_files(text: str) -> None:
 
 
 def test_a_reason_has_the_line_of_the_users_file(tmp_path: Path) -> None:
-    build = _load_user_class(
-        file(tmp_path, "def build(x):\n    y = 1\n    return y / x\n") + ":build"
-    )
+    path = file(tmp_path, "def build(x):\n    y = 1\n    return y / x\n")
+    build = _load_user_class(f"{path}:build")
     with pytest.raises(ZeroDivisionError) as caught:
         build(0)
     assert describe_error(caught.value) == "ZeroDivisionError: division by zero (my.py, line 3)"
@@ -168,9 +167,7 @@ def test_what_cannot_be_registered(register: Any) -> None:
 
 
 def test_an_entry_point_is_imported_when_asked_for(module: str) -> None:
-    assert (
-        _import_entry_point("tests.estimators.wrappers.constant:Constant.reset") is Constant.reset
-    )
+    assert _import_entry_point(f"{CONSTANT}.reset") is Constant.reset
     for text, message in (
         ("nowhere:Thing", "'nowhere:Thing': there is no module 'nowhere'"),
         ("tests.nowhere.at_all:Thing", "there is no module 'tests.nowhere'"),

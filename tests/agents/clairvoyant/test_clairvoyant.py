@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -36,12 +36,10 @@ assert sideslip.__version__
 ID = "sideslip/YawFusion-v0"
 
 
-def make(
-    name: str, duration: float = 2.0, period: int = 10, **changes: Any
-) -> gymnasium.Env[Any, Any]:
+def make(name: str, duration: float = 2.0, period: int = 10, **changes: Any) -> gym.Env[Any, Any]:
     """The fusion env on a shorter, changed scenario."""
     scenario = {"base": name, "duration": duration} | changes
-    return gymnasium.make(ID, scenario=scenario, control_period=period)
+    return gym.make(ID, scenario=scenario, control_period=period)
 
 
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
@@ -63,9 +61,7 @@ ACTING: dict[str, dict[str, Any]] = {
         **{"base": "random-steering", "friction": 0.3, "tyres": "magic-formula"},
         "vehicle": {"relaxation": 0.3},
     },
-    "motor power, load transfer": {
-        **{"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4}
-    },
+    "motor power, loads": {"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4},
     "a world that errs": {"base": "coms-slalom", "onset": 0.0, "amplitude": 0.1, "world": "v1"},
     "a road that winds and leans": {
         **{"base": "coms-slalom", "onset": 0.02, "amplitude": 0.1, "bank": 0.03, "grade": 0.02}
@@ -81,7 +77,7 @@ def test_a_symbolic_tick_is_the_envs(case: str) -> None:
     world = scenario.pop("world", "ideal")
     # the rate of the motors' commands is drawn: a fiftieth of their torque a tick at least
     actions = ACTIONS if world == "ideal" else 0.005 * ACTIONS
-    env = gymnasium.make(ID, scenario=scenario, control_period=1, world=world)
+    env = gym.make(ID, scenario=scenario, control_period=1, world=world)
     env.reset(seed=2)
     forecast = make_forecast(env.unwrapped, actions if case in ACTING else None)
     w = ca.SX.sym("w", len(PlanState._fields))
@@ -112,7 +108,7 @@ def test_the_forecast_is_what_the_car_meets() -> None:
 
 def test_a_lagged_reference_is_the_envs() -> None:
     """It hangs on the measured speed alone, which other actions change by little."""
-    env = gymnasium.make(
+    env = gym.make(
         ID, scenario={"base": "coms-slalom", "duration": 3.0}, control_period=1, reference="lagged"
     )
     env.reset(seed=5)
@@ -138,7 +134,7 @@ def test_no_run_is_better(scenario: str, world: str) -> None:
 
     The plan's steps are ten times the env's, hence the thousandth.
     """
-    env = gymnasium.make(ID, scenario={"base": scenario, "duration": 3.0}, world=world)
+    env = gym.make(ID, scenario={"base": scenario, "duration": 3.0}, world=world)
     sensed = EstimateObservation(env, "exact-kf")
     agent = make_agent("two-dof", sensed)
     rng = np.random.default_rng(1)
@@ -169,9 +165,7 @@ def test_a_car_that_is_lost_is_saved() -> None:
 def test_steering_too() -> None:
     """Two actions do better than one, and the steering that is found was within its rate."""
     alone, _ = _solve_ilqr(make("lane-change"), 0)
-    env = gymnasium.make(
-        "sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0}
-    )
+    env = gym.make("sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0})
     both, _ = _solve_ilqr(env, 0)
     assert both.actions.shape == (200, 2)
     assert both.cost < 0.5 * alone.cost
@@ -183,7 +177,7 @@ def test_steering_too() -> None:
 
 
 @pytest.mark.long
-def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
+def test_an_unfinished_plan_says_so_and_a_better_run_wins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(clairvoyant, "MAX_ITERATIONS", 1)
@@ -199,7 +193,7 @@ def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
 def test_a_plan_begins_where_the_lead_in_ends() -> None:
     """Its cost is that of the whole episode, in which the lead-in costs nothing but a loss."""
     scenario = {"base": "coms-slalom", "duration": 0.3, "onset": 0.0, "amplitude": 0.1}
-    env = gymnasium.make(ID, scenario=scenario, world="v1", lead_in=0.5)
+    env = gym.make(ID, scenario=scenario, world="v1", lead_in=0.5)
     result = compute_clairvoyant(env, 1)
     assert result.actions.shape == (30, 1) and result.winner == "from none"
     whole = _simulate_run(env, 1, np.vstack([np.ones((50, 1)), result.actions]))
@@ -207,7 +201,7 @@ def test_a_plan_begins_where_the_lead_in_ends() -> None:
     policy: Any = SimpleNamespace(predict=lambda obs, *_, **__: (np.full(1, obs[0]), None))
     assert record_actions(env, policy, 1).shape == (30, 1)
     scenario |= {"half_width": 0.01}
-    narrow = gymnasium.make(ID, scenario=scenario, world="v1", lead_in=2.0)
+    narrow = gym.make(ID, scenario=scenario, world="v1", lead_in=2.0)
     lost = compute_clairvoyant(narrow, 1)
     assert lost.costs == {"none": lost.cost} and lost.cost > 30.0
 

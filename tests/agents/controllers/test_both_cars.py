@@ -34,16 +34,14 @@ DEARER = {
 
 def costs(env_id: str, name: str, contest: tuple[str, str, str], **options: Any) -> np.ndarray:
     car, reference, scenario = contest
-    env: Any = gym.make_vec(
-        env_id, num_envs=CARS, scenario=scenario, vehicle=car, reference=reference
-    )
+    env: Any = gym.make_vec(env_id, CARS, scenario=scenario, vehicle=car, reference=reference)
     if name != "none":
         env = EstimateObservation(env, "exact-kf", outputs=["beta", "gamma"], std=False)
     return evaluate_episodes(env, make_agent(name, env, **options), range(CARS))[0]
 
 
 @cache
-def uncontrolled(env_id: str, contest: tuple[str, str, str]) -> np.ndarray:
+def idle_costs(env_id: str, contest: tuple[str, str, str]) -> np.ndarray:
     return costs(env_id, "none", contest)
 
 
@@ -55,7 +53,5 @@ def test_no_controller_is_dearer_than_none(name: str, contest: tuple[str, str, s
     env_id = AFS if name == "model-following" else YAW
     if contest[1] == "zero-slip" and env_id == AFS:
         contest = ("coms", "model", "coms-sine-with-dwell")  # the steering id has the other one
-    ratio = np.log(
-        costs(env_id, name, contest, **CONTROLLERS[name]) / uncontrolled(env_id, contest)
-    )
+    ratio = np.log(costs(env_id, name, contest, **CONTROLLERS[name]) / idle_costs(env_id, contest))
     assert (ratio.mean() > 0.0) == ((name, contest[0]) in DEARER)

@@ -9,12 +9,7 @@ import pytest
 
 from sideslip.agents import Lqr, make_agent
 from sideslip.agents.controllers.lqr import _solve_box_qp
-from sideslip.agents.design.sampled_model import (
-    DYNAMIC,
-    SPEEDS,
-    DesignSpec,
-    make_design_model,
-)
+from sideslip.agents.design.sampled_model import DYNAMIC, SPEEDS, DesignSpec, make_design_model
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.task import MODEL, ZERO_SLIP, compute_reference, make_reference_params
 from sideslip.envs.vehicle.linear import make_bicycle_model
@@ -239,7 +234,5 @@ def test_nothing_within_the_limits_costs_less(seed: int) -> None:
 
 
 def test_what_is_within_the_limits_stays() -> None:
-    assert _solve_box_qp(np.array([[1.0, 0.9], [0.9, 1.0]]), 0, 0.3, -0.2, 1.0, -0.5, 0.5) == (
-        0.3,
-        -0.2,
-    )
+    S = np.array([[1.0, 0.9], [0.9, 1.0]])
+    assert _solve_box_qp(S, 0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)

@@ -134,10 +134,8 @@ def test_disturbances_are_rejected_through_the_inverse_of_b() -> None:
     for rejection in (True, False):
         agent, env = agent_for(rejection=rejection)
         action, _ = agent.predict(observe(env, V, d1_hat=0.02, d2_hat=-0.3))
-        undone = make_bicycle_model(COMS, V).B @ commands(action) + float(rejection) * np.array(
-            [0.02, -0.3]
-        )
-        assert undone == pytest.approx(0.0, abs=1e-6)  # float32
+        rest = make_bicycle_model(COMS, V).B @ commands(action) + rejection * np.array([0.02, -0.3])
+        assert rest == pytest.approx(0.0, abs=1e-6)  # float32
 
 
 def driven(agent: Any, env: Any, model: LinearModel, steering: Any) -> np.ndarray:

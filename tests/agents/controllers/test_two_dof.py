@@ -24,10 +24,8 @@ def test_feedforward_is_the_ratio_of_dc_gains() -> None:
     """(24): -G_delta(0) / G_N(0), whose printed middle has the wrong sign."""
     for kmh in (10.0, 20.0, 25.0, 45.0):
         model = make_bicycle_model(COMS, kmh * KMH)
-        static = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
-        assert _compute_static_gain(CAR, kmh * KMH) == pytest.approx(
-            -static[0] / static[1], rel=1e-12
-        )
+        dc = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
+        assert _compute_static_gain(CAR, kmh * KMH) == pytest.approx(-dc[0] / dc[1], rel=1e-12)
 
 
 def test_feedforward_at_25_kmh_and_its_change_of_sign() -> None:
@@ -117,9 +115,7 @@ def test_the_integral_does_not_wind_up() -> None:
 @pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
 def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
     """The moment's part without an error, in the bicycle's steady turn: its slip is beta_ref."""
-    env = EstimateObservation(
-        gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf", std=False
-    )
+    env = EstimateObservation(gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf")
     model, delta, v = make_bicycle_model(COMS, kmh * KMH), 0.01, kmh * KMH
     for beta in (0.0, 2e-3, -1e-3):
         obs = observe(env, v, steer_command=delta, beta_ref=beta, beta_hat=beta)

@@ -112,9 +112,7 @@ def coefficients(speed: float) -> BicyclePlant:
 
 @pytest.mark.parametrize("reference", ["model", "zero-slip"])
 @pytest.mark.parametrize("state", [(0.004, 0.02), (-0.003, 0.05), (0.0, -0.03)])
-def test_the_distance_to_the_surface_decays_at_its_rate(
-    reference: str, state: tuple[float, float]
-) -> None:
+def test_the_distance_to_the_surface_decays(reference: str, state: tuple[float, float]) -> None:
     """s' = -rate s within the layer, straight from the nominal car's equations."""
     env = env_of(reference)
     agent = agent_of(env, rate=8.0, layer=10.0)

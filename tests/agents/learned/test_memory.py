@@ -22,9 +22,7 @@ from sideslip.agents.learned.policy import Card, Policy, load_policy, save_polic
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)
 sb3 = pytest.importorskip("stable_baselines3")
-from stable_baselines3.common.vec_env.stacked_observations import (  # noqa: E402
-    StackedObservations,
-)
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations  # noqa: E402
 
 from sideslip.agents.training.distill import _EpisodeBatches  # noqa: E402
 from sideslip.agents.training.student import (  # noqa: E402

@@ -56,10 +56,8 @@ def drive(
 ) -> tuple[Rollout, _WireAgent, Loop]:
     """A drive over loopback, its wires and the loop at the car's end."""
     with Port() as car, Port() as other:
-        loop = Loop(
-            onboard, StreamSynchroniser(None if step else round(PATIENCE / speed)), car, step=step
-        )
-        loop.recorder = recorder
+        synchroniser = StreamSynchroniser(None if step else round(PATIENCE / speed))
+        loop = Loop(onboard, synchroniser, car, step=step, recorder=recorder)
         if watch is not None:
             watch_ticks(onboard, watch)
         thread = Thread(target=loop.run)

@@ -39,22 +39,12 @@ SOUND = inertial(7).data
 
 @settings(max_examples=40)
 @given(
-    st.sampled_from(
-        [
-            DatagramKind.INERTIAL,
-            DatagramKind.CONTROL,
-            DatagramKind.END,
-            DatagramKind.STATUS,
-            *SENSORS,
-        ]
-    ),
+    st.sampled_from(sorted(FIELDS)),
     st.integers(0, 2**32 - 1),
     st.integers(0, MAX_STAMP),
     st.data(),
 )
-def test_a_message_comes_back(
-    kind: DatagramKind, sequence: int, stamp: int, data: st.DataObject
-) -> None:
+def test_a_message_comes_back(kind: int, sequence: int, stamp: int, data: st.DataObject) -> None:
     width = len(FIELDS[kind])
     values = data.draw(st.lists(NUMBER, min_size=width, max_size=width))
     if kind in SENSORS:
@@ -128,9 +118,8 @@ def test_the_format_is_the_documented_one() -> None:
     text = DOCUMENT.read_text()
     assert f"version {VERSION}" in text
     for kind, fields in FIELDS.items():
-        row = re.search(
-            rf"^\| {kind:d} \| {DatagramKind(kind).name.lower()} \| ([^|]*)\|", text, re.M
-        )
+        name = DatagramKind(kind).name.lower()
+        row = re.search(rf"^\| {kind:d} \| {name} \| ([^|]*)\|", text, re.M)
         assert row and [each.strip(" `") for each in row[1].split(",")] == list(fields or ("-",))
     assert FIELDS[DatagramKind.INERTIAL][:-1] == FAST._fields
     for kind, place in SENSORS.items():
@@ -203,9 +192,8 @@ def test_doubled_and_reordered_ones_change_nothing() -> None:
     plain = ticks_of(StreamSynchroniser(), *sound)
     assert numbers(with_noise) == numbers(plain)
     assert all(np.array_equal(a.row, b.row) for a, b in zip(plain, with_noise, strict=True))
-    assert (
-        noisy.counts[RejectReason.DUPLICATE] >= 200 and noisy.counts[RejectReason.REORDERED] > 200
-    )
+    assert noisy.counts[RejectReason.DUPLICATE] >= 200
+    assert noisy.counts[RejectReason.REORDERED] > 200
 
 
 def test_sequence_numbers_wrap_around() -> None:

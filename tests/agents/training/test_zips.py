@@ -25,11 +25,7 @@ import torch  # noqa: E402
 from stable_baselines3.common import envs  # noqa: E402
 from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
 from stable_baselines3.common.torch_layers import FlattenExtractor  # noqa: E402
-from stable_baselines3.common.vec_env import (  # noqa: E402
-    VecEnvWrapper,
-    VecFrameStack,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecFrameStack, VecNormalize  # noqa: E402
 
 from sideslip.agents.vec_env import get_scales, make_vec_env  # noqa: E402
 

@@ -128,9 +128,7 @@ def test_a_state_that_is_known_exactly_stays_known() -> None:
         ("exact-kf", {}, 0.0105, ValueError, "the lag of 0.0105 s is no whole number of ticks"),
     ],
 )
-def test_what_cannot_be_smoothed(
-    name: Any, options: Any, lag: float, error: Any, message: Any
-) -> None:
+def test_what_is_not_smoothed(name: Any, options: Any, lag: Any, error: Any, message: Any) -> None:
     log = simulate(SHORT, {"camera": CAMERA, "gps": GPS}, 0)
     with pytest.raises(error, match=message):
         smooth(name, log, lag, speed=7.0, **options)

@@ -37,9 +37,7 @@ def log() -> Any:
 
 
 @pytest.mark.parametrize("delay", ["clone", "buffer", "larsen", "stored", "ignore"])
-def test_a_gps_in_the_cameras_place_gives_the_same_bits(
-    delay: str, log: Any, monkeypatch: Any
-) -> None:
+def test_a_gps_in_the_cameras_place_gives_its_bits(delay: str, log: Any, monkeypatch: Any) -> None:
     """Noise by 1/V at the capture, HDOP, satellites and the heading fix go with it."""
     table = None if delay == "larsen" else [(1.0, 1.0), (8.0, 8.0)]
     options: dict[str, Any] = {"delay": delay, "gains": "covariance", "hdop_table": table}
@@ -80,8 +78,6 @@ def test_every_slow_sensor_has_an_entry() -> None:
         rows = MEASUREMENTS[kind.name].rows
         assert len(rows) <= len(kind.values)
         assert select_states((kind.name,))[:2] == ("beta", "gamma")
-    f = make_estimator(
-        "joint", sensors={"camera": SlowSensor(0.04), "gps": SlowSensor(0.2)}
-    ).filters[0]
+    f = make_estimator("joint", sensors=dict.fromkeys(SLOW_NAMES, SlowSensor(0.2))).filters[0]
     assert (f.hdop_column[GPS], f.satellites_column[GPS]) == (HDOP, SATELLITES)
     assert f.hdop_column[CAMERA] == f.satellites_column[CAMERA] == f.speed_column[CAMERA] == 0

@@ -129,9 +129,8 @@ def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
     row = np.random.default_rng(0).normal(size=len(FAST))
     found = sum(factor * row[column] for column, factor in _make_signals(vehicle)["N_z"])
     torques = row[FAST.torque_left], row[FAST.torque_right]
-    assert found == pytest.approx(
-        as_python(compute_yaw_moment)(*torques, make_car(vehicle)), rel=1e-12
-    )
+    wanted = as_python(compute_yaw_moment)(*torques, make_car(vehicle))
+    assert found == pytest.approx(wanted, rel=1e-12)
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])

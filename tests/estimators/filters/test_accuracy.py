@@ -24,10 +24,8 @@ def fig6() -> Any:
 
 def rmse(name: Any, logs: Any, drive: Any, **options: Any) -> Any:
     tuned = {**PAPER_TUNINGS.get(name, {}), **options}
-    filter_ = make_estimator(
-        name, vehicle=drive.told, sensors=logs[0].slow, speed=drive.speed, **tuned
-    )
-    return np.sqrt(np.mean([error(filter_.run(log), log) for log in logs]))
+    kf = make_estimator(name, vehicle=drive.told, sensors=logs[0].slow, speed=drive.speed, **tuned)
+    return np.sqrt(np.mean([error(kf.run(log), log) for log in logs]))
 
 
 @pytest.mark.smoke

@@ -208,9 +208,8 @@ def test_haras_error_map_is_the_single_rates(seed: Any) -> None:
     s = random_system(seed)
     A, _, C, Q = extended(s)
     r = s["ratio"]
-    held = frame_map(
-        A, C, SampledSystem(A, Q, C, s["R"], r).compute_shares("hold", "constant", None)
-    )
+    shares = SampledSystem(A, Q, C, s["R"], r).compute_shares("hold", "constant", None)
+    held = frame_map(A, C, shares)
     single = power(A, r) @ (np.eye(len(A)) - sampled(A, C, Q, s["R"], r) @ C)
     np.testing.assert_allclose(held, single, atol=1e-10)
 

@@ -90,9 +90,8 @@ def test_a_bias_is_recovered_by_the_state_alone() -> None:
 
 def drive(env: Any, rows: int, steps: int, estimator: str, **options: Any) -> Any:
     """beta and its estimate, (steps, rows)."""
-    env = vector.EstimateObservation(
-        gym.make_vec(FUSION, rows, scenario=env), estimator, options=options
-    )
+    fleet = gym.make_vec(FUSION, rows, scenario=env)
+    env = vector.EstimateObservation(fleet, estimator, options=options)
     env.reset(seed=7)
     still = np.zeros((rows, 1), np.float32)
     infos = [env.step(still)[4] for _ in range(steps)]
@@ -104,7 +103,7 @@ def spread(error: Any) -> Any:
 
 
 GYRO, ACCEL = ({"slow": ["camera", "gps"], "fast": INERTIAL[:n]} for n in (1, 2))
-STEERING = {"base": "random-steering", "duration": 6.0}
+STEERED = {"base": "random-steering", "duration": 6.0}
 
 
 @pytest.mark.parametrize(
@@ -114,15 +113,10 @@ STEERING = {"base": "random-steering", "duration": 6.0}
         ("random-steering", GYRO, ACCEL, spread),
         ("slalom", GYRO, ACCEL, spread),
         # a bias of 0.3 m/s2 costs a filter that believes its accelerometer most of its accuracy
-        (
-            STEERING | {"noise": {"accel_y_bias": 0.3}},
-            ACCEL,
-            ACCEL | {"accel_bias_sd": 0.3},
-            spread,
-        ),
+        (STEERED | {"noise": {"accel_y_bias": 0.3}}, ACCEL, ACCEL | {"accel_bias_sd": 0.3}, spread),
         # a crossfall of 0.03 all along leaves the mean of beta's error to a filter without a state
         (
-            STEERING | {"bank": 0.03, "curve_start": -100.0},
+            STEERED | {"bank": 0.03, "curve_start": -100.0},
             ACCEL | {"bank_sd": 0.0},
             ACCEL | {"bank_sd": 0.03},
             lambda error: abs(np.mean(error)),
@@ -142,9 +136,7 @@ def test_a_sensor_or_a_state_for_it_halves_the_error_of_beta(
 
 def test_all_states_are_outputs_and_a_row_has_the_bits_of_a_single_env() -> None:
     one = EstimateObservation(gym.make(FUSION), "exact-kf", outputs=STATES, options=ALL)
-    many = vector.EstimateObservation(
-        gym.make_vec(FUSION, 3), "exact-kf", outputs=STATES, options=ALL
-    )
+    many = vector.EstimateObservation(gym.make_vec(FUSION, 3), "exact-kf", STATES, options=ALL)
     assert one.estimator.names == STATES and one.layout[-12].name == "steer_offset_hat"
     single, batch = one.reset(seed=5)[0], many.reset(seed=4)[0]
     for _ in range(40):

@@ -166,12 +166,7 @@ def test_single_rate_filter_that_predicts_between_frames() -> None:
             x, P = correct(x, P, C_A[measured], R[np.ix_(measured, measured)], y)
         wanted.append(x[:4])
     found = make_estimator(
-        "single-rate-kf",
-        sensors=log.slow,
-        speed=V,
-        gains="covariance",
-        between="predict",
-        **Q,
+        "single-rate-kf", sensors=log.slow, speed=V, gains="covariance", between="predict", **Q
     ).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-10)
 

@@ -122,11 +122,7 @@ def test_snapshots_and_copies_continue_bit_for_bit() -> None:
 
 
 def test_an_env_without_a_scenario_tells_its_car_as_it_is() -> None:
-    facts: dict[str, Any] = {
-        "nominal": [COMS] * 2,
-        "slow_sensors": [{}] * 2,
-        "held_speed": [5.0] * 2,
-    }
+    facts: Any = {"nominal": [COMS] * 2, "slow_sensors": [{}] * 2, "held_speed": [5.0] * 2}
     fleet = SimpleNamespace(layout=(), dt=0.001, **facts)
     assert [spec.vehicle for spec in BatchedRecords(fleet).make_specs([0, 1])] == [COMS] * 2
     named = BatchedRecords(SimpleNamespace(**vars(fleet), scenario=["rainy", "dry"]))

@@ -107,9 +107,8 @@ def test_a_snapshot_of_a_wrapped_vector_env_continues_bit_for_bit(layer: Any, mo
     snapshot = env.get_state()
     steps = 10 if layer == UKF else 30
     once = [env.step(actions(env, step)) for step in range(7, 7 + steps)]
-    env.reset(
-        seed=8, options={"scenario": "uneven-delay-fig5", "vehicle": COMS.scale_stiffness(0.9)}
-    )
+    changes = {"scenario": "uneven-delay-fig5", "vehicle": COMS.scale_stiffness(0.9)}
+    env.reset(seed=8, options=changes)
     env.step(actions(env, 1))
     for _ in range(2):
         env.set_state(snapshot)

@@ -147,9 +147,7 @@ def test_which_filters_are_in_lanes() -> None:
         feed(batch, logs, 10)
         assert (batch._lanes["shaped"][0] == 1).sum() == there
         assert (batch._lanes["here"][0] == 1.0).sum() == there
-    few = make_batch(
-        "exact-kf", MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
-    )
+    few = make_batch("exact-kf", MIN_LANES - 1, sensors={"camera": CAMERA}, speed=7.0)
     feed(few, logs[: MIN_LANES - 1], 10)
     assert (few._lanes["model_speed"] == 0.0).all()
 

@@ -143,9 +143,7 @@ def test_copies_continue_bit_for_bit(options: dict[str, Any]) -> None:
 
 def wrap_both(env_id: str, count: int, mode: str, layer: dict[str, Any], **kwargs: Any) -> Any:
     """Around SyncVectorEnv, and around the vector env."""
-    return [
-        EstimateObservation(env, **layer) for env in batches.pair(env_id, count, mode, **kwargs)
-    ]
+    return [EstimateObservation(x, **layer) for x in batches.pair(env_id, count, mode, **kwargs)]
 
 
 QUICK = ("exact-kf", "course-kf")

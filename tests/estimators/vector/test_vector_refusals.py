@@ -56,9 +56,7 @@ REFUSALS: dict[type[Exception], dict[str, Callable[[], Any]]] = {
         "CartPoleEnv has no rows": lambda: wrap(SyncVectorEnv([CartPoleEnv])),
         "CartPoleVectorEnv has no rows": lambda: wrap(gym.make_vec("CartPole-v1", num_envs=2)),
         r"no vector env.*sideslip\.estimators\.EstimateObs": lambda: wrap(gym.make(VISION)),
-        "one Constant cannot estimate 3 rows: pass its class": lambda: wrap(
-            native("NextStep"), Constant()
-        ),
+        "Constant cannot estimate 3 rows: pass": lambda: wrap(native("NextStep"), Constant()),
         "of filters of ours or of none": lambda: reset(wavering, FIG7),
         "SyncVectorEnv makes no snapshots; the vector env that": lambda: wrap().get_state(),
     },

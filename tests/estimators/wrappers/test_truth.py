@@ -23,9 +23,8 @@ OPTIONS: dict[str, Any] = {"outputs": OUTPUTS, "std": False, "vehicle": "truth"}
 
 
 def test_filter_and_observation_have_the_car_of_each_episode() -> None:
-    env: Any = TruthObservation(
-        EstimateObservation(gym.make(FUSION), "exact-kf", **OPTIONS), PARAMETERS
-    )
+    inner = EstimateObservation(gym.make(FUSION), "exact-kf", **OPTIONS)
+    env: Any = TruthObservation(inner, PARAMETERS)
     seen = set()
     for seed in range(3):
         obs, _ = env.reset(seed=seed)

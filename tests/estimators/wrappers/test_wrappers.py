@@ -194,10 +194,7 @@ def test_no_car_that_a_filter_is_told_rolls_where_none_does(vehicle: str | None)
     together: Any = vector.EstimateObservation(fleet, "joint", vehicle=told)
     alone.reset(seed=0)
     together.reset(seed=0)
-    arms = {
-        float(f.roll_arm) for f in (alone.estimator.filters[0], together.estimator[0].filters[0])
-    }
-    rolling: Any = make_estimator(
-        "joint", vehicle=env.unwrapped.nominal, sensors=env.unwrapped.slow_sensors
-    )
+    filters = alone.estimator.filters[0], together.estimator[0].filters[0]
+    arms, base = {float(f.roll_arm) for f in filters}, env.unwrapped
+    rolling: Any = make_estimator("joint", vehicle=base.nominal, sensors=base.slow_sensors)
     assert len(arms) == 1 and arms.pop() < 0.01 * rolling.filters[0].roll_arm
