@@ -16,7 +16,7 @@ from ...envs.record import Array
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
-from ...estimators.wrappers.estimate import replace_body
+from ...estimators.wrappers.estimate import make_spec
 from ..harness.drives import call_quietly, make_filter_arguments
 from ..harness.stats import Bound, Estimate
 
@@ -235,7 +235,10 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
         base: Env without wrappers, in an episode.
     """
     facts = make_filter_arguments(base)
-    cars = {"nominal": facts["vehicle"], "true": replace_body(base.vehicle, base.scenario)}
+    cars = {
+        "nominal": facts["vehicle"],
+        "true": make_spec(base).replace_vehicle(base.vehicle).vehicle,
+    }
     by_label = {}
     for spec in filters:
         options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}

@@ -9,6 +9,7 @@ own estimators are an object a row. What all of them read are the records of the
 import copy
 import functools
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, ForeignEstimator, get_label
-from ..wrappers.estimate import EstimatorSpec, find_base_env, make_spec, replace_body, write_outputs
+from ..wrappers.estimate import EstimatorSpec, find_base_env, make_spec, write_outputs
 from ..wrappers.truth import AnyEstimator
 from .lanes import FilterBank, observe_batch
 
@@ -344,10 +345,10 @@ class BatchedRecords:
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
-        env = self._env
-        scenarios = getattr(env, "scenario", [None] * len(env.nominal))
-        cars = {i: replace_body(env.nominal[i], scenarios[i]) for i in rows}
-        return [EstimatorSpec(cars[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+        names = ("nominal", "slow_sensors", "held_speed", "scenario")
+        columns = {name: getattr(self._env, name) for name in names if hasattr(self._env, name)}
+        cars = ({name: values[i] for name, values in columns.items()} for i in rows)
+        return [make_spec(SimpleNamespace(**car)) for car in cars]
 
     def annotate(self, label: str, beta: Array, std: Array, mask: _Mask) -> None:
         """Pass estimates (rad) of some rows to an env that draws, beside the truth."""

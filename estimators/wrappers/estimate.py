@@ -82,23 +82,14 @@ class EstimatorSpec(NamedTuple):
         return self.vehicle, tuple(sorted(clocks)), self.speed
 
 
-def replace_body(nominal: Vehicle, scenario: object) -> Vehicle:
-    """Replace a vehicle's body by a rigid one where the scenario's does not roll.
-
-    Args:
-        nominal: The vehicle of designers.
-        scenario: `Scenario` of the episode, or whatever an env has instead.
-    """
-    return nominal if getattr(scenario, "roll", True) else nominal.replace(roll_arm=_RIGID)
-
-
 def make_spec(base: Any) -> EstimatorSpec:
-    """Make the spec of a bare single env in its present episode.
+    """Make the spec of a single env in its present episode; a body that does not roll is rigid.
 
     Args:
-        base: Environment without wrappers.
+        base: Environment without wrappers; its scenario and held speed may be missing.
     """
-    vehicle = replace_body(base.nominal, getattr(base, "scenario", None))
+    rolls = getattr(getattr(base, "scenario", None), "roll", True)
+    vehicle = base.nominal if rolls else base.nominal.replace(roll_arm=_RIGID)
     return EstimatorSpec(vehicle, base.slow_sensors, getattr(base, "held_speed", None))
 
 
