@@ -234,11 +234,8 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
         filters: Filters of a simulation.
         base: Env without wrappers, in an episode.
     """
-    facts = make_filter_arguments(base)
-    cars = {
-        "nominal": facts["vehicle"],
-        "true": make_spec(base).replace_vehicle(base.vehicle).vehicle,
-    }
+    facts, present = make_filter_arguments(base), make_spec(base)
+    cars = {"nominal": present.vehicle, "true": present.replace_vehicle(base.vehicle).vehicle}
     by_label = {}
     for spec in filters:
         options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}

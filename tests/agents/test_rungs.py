@@ -173,15 +173,8 @@ def share_seen(scenario: Scenario) -> float:
     """Of the camera's frames, under the rung that knows the nominal car."""
     car = "coms" if scenario.tier == "1" else "passenger-car"
     env: Any
-    env, agent = make_oracle(
-        "nominal",
-        "sideslip/YawFusion-v0",
-        CARS,
-        scenario=scenario.to_dict(),
-        vehicle=car,
-        nominal=car,
-        reference="limited",
-    )
+    facts: Any = {"scenario": scenario.to_dict(), "vehicle": car, "nominal": car}
+    env, agent = make_oracle("nominal", FUSION, CARS, reference="limited", **facts)
     base, state, start = env.unwrapped, None, np.ones(CARS, bool)
     obs, _ = env.reset(seed=100)
     seen = []

@@ -146,8 +146,7 @@ def test_every_number_but_one_has_a_limit(key: str) -> None:
 def test_random_delay_needs_no_option() -> None:
     sensors = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
     assert make_estimator("multirate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 0
-    late = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
-    assert make_estimator("single-rate-kf", sensors=late, speed=7.0).filters[0].periodic == 1
+    assert make_estimator("single-rate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 1
 
 
 @pytest.fixture

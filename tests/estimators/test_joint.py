@@ -67,18 +67,13 @@ def test_file_equals_table(tmp_path: Path) -> None:
 
 def test_units_and_names_are_the_users() -> None:
     table, _, car = drive()
-    other = pd.DataFrame(
-        {
-            "t": 1e3 * table.time_s,
-            "v": 3.6 * table.speed_x_mps,
-            "GyroZ": np.degrees(table.yaw_rate_radps),
-            "steer_deg": np.degrees(table.steer_rad),
-            "accel_y_g": table.accel_y_mps2 / GRAVITY,
-            "course_deg": np.degrees(table.course_rad),
-        }
-    )
+    columns = {
+        "t": 1e3 * table.time_s, "v": 3.6 * table.speed_x_mps,
+        "GyroZ": np.degrees(table.yaw_rate_radps), "steer_deg": np.degrees(table.steer_rad),
+        "accel_y_g": table.accel_y_mps2 / GRAVITY, "course_deg": np.degrees(table.course_rad),
+    }  # fmt: skip
     mapping = {"time_ms": "t", "speed_x_kmh": "v", "yaw_rate_degps": "GyroZ"}
-    result = estimate(other, car, mapping=mapping)
+    result = estimate(pd.DataFrame(columns), car, mapping=mapping)
     np.testing.assert_allclose(result.sideslip_rad, estimate(table, car).sideslip_rad, atol=1e-8)
 
 

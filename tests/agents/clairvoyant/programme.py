@@ -29,13 +29,9 @@ from sideslip.agents.clairvoyant.forecast import (
 Array = npt.NDArray[np.float64]
 
 _OPTIONS = {
-    "verbose": False,
-    "eps_abs": 1e-8,
-    "eps_rel": 1e-8,
-    "max_iter": 100_000,
-    "polishing": True,
+    "verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 100_000, "polishing": True,
     "scaled_termination": True,
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,9 @@ from tests.agents.clairvoyant.programme import Array, solve_linear
 assert sideslip.__version__
 
 LINEAR: dict[str, Any] = {
-    "base": "random-steering",
-    "small_angle": True,
-    "tyres": "linear",
-    "roll": False,
-    "speed": 25.0 / 3.6,
-    "onset": 0.0,
-}
+    "base": "random-steering", "small_angle": True, "tyres": "linear", "roll": False,
+    "speed": 25.0 / 3.6, "onset": 0.0,
+}  # fmt: skip
 
 
 def make(reference: str = "zero-slip", **changes: Any) -> gymnasium.Env[Any, Any]:

@@ -20,14 +20,9 @@ LIMIT = COMS.yaw_moment_limit
 
 def env_of(kappa: float, **changes: Any) -> Any:
     scenario = {
-        "name": "curve",
-        "curvature": kappa,
-        "curve_start": 10.0,
-        "curve_ramp": 10.0,
-        "half_width": 2.0,
-        "front_stiffness": (0.7, 1.3),
-        "rear_stiffness": (0.7, 1.3),
-    } | changes
+        "name": "curve", "curvature": kappa, "curve_start": 10.0, "curve_ramp": 10.0,
+        "half_width": 2.0, "front_stiffness": (0.7, 1.3), "rear_stiffness": (0.7, 1.3),
+    } | changes  # fmt: skip
     env = gym.make("sideslip/YawVisionUneven-v0", steering=True, scenario=scenario)
     return EstimateObservation(env, "uneven-delay-kf", outputs=OUTPUTS)
 

@@ -24,16 +24,11 @@ V, STEPS, PERIOD = 7.0, 200, 10
 LEVELS = {"force_sd": 15.0, "moment_sd": 6.0, "disturbance_time": 0.3, "gyro_noise": 0.002}
 CAR = {"base": "coms", "motor_lag": 0.0, "steering_lag": 0.0}
 SCENARIO = {
-    "name": "lqg",
-    "duration": STEPS * PERIOD * TICK,
-    "speed": V,
-    "small_angle": True,
-    "tyres": "linear",
-    "roll": False,
-    "disturbance_force": LEVELS["force_sd"],
+    "name": "lqg", "duration": STEPS * PERIOD * TICK, "speed": V, "small_angle": True,
+    "tyres": "linear", "roll": False, "disturbance_force": LEVELS["force_sd"],
     "disturbance_moment": LEVELS["moment_sd"],
     "noise": {"wheel": 0.0, "gyro": LEVELS["gyro_noise"]},
-}
+}  # fmt: skip
 KNOWN = dict.fromkeys(("beta", "gamma", "psi", "y_l"), 0.0)  # where the car starts
 
 

@@ -17,18 +17,10 @@ from sideslip.estimators import EstimateObservation
 from tests.agents.helpers import observe
 
 SMALL = {
-    "base": "straight",
-    "small_angle": True,
-    "tyres": "linear",
-    "roll": False,
-    "mirror": False,
-    "speed": 7.0,
-    "front_stiffness": 1.0,
-    "rear_stiffness": 1.0,
-    "disturbance_force": 0.0,
-    "disturbance_moment": 0.0,
-    "noise": {"wheel": 0.0},
-}
+    "base": "straight", "small_angle": True, "tyres": "linear", "roll": False, "mirror": False,
+    "speed": 7.0, "front_stiffness": 1.0, "rear_stiffness": 1.0, "disturbance_force": 0.0,
+    "disturbance_moment": 0.0, "noise": {"wheel": 0.0},
+}  # fmt: skip
 
 
 def estimating(env: Any, *disturbances: str) -> Any:

@@ -1,5 +1,6 @@
 """dakf-stability V: what feedback and feedforward make of the nominal car, and the limits."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import control
@@ -48,11 +49,8 @@ def response(system: Any) -> np.ndarray:
 
 def agent_for(**options: Any) -> tuple[ModelFollowing, Any]:
     """An agent that decides at every tick, and its env."""
-    env = EstimateObservation(
-        gym.make("sideslip/AfsYawFusion-v0", control_period=1),
-        "dakf",
-        outputs=["beta", "gamma", "d1", "d2"],
-    )
+    env: Any = gym.make("sideslip/AfsYawFusion-v0", control_period=1)
+    env = EstimateObservation(env, "dakf", outputs=["beta", "gamma", "d1", "d2"])
     agent = make_agent("model-following", env, **options)
     assert isinstance(agent, ModelFollowing)
     return agent, env
@@ -154,11 +152,7 @@ def driven(agent: Any, env: Any, model: LinearModel, steering: Any) -> np.ndarra
     return np.array(rows)
 
 
-class Nothing:
-    """The uncontrolled car."""
-
-    def predict(self, obs: Any, state: Any = None) -> tuple[np.ndarray, Any]:
-        return np.zeros(2), state
+UNCONTROLLED = SimpleNamespace(predict=lambda obs, state: (np.zeros(2), state))
 
 
 def test_feedforward_inverts_the_nominal_plant() -> None:
@@ -170,7 +164,7 @@ def test_feedforward_inverts_the_nominal_plant() -> None:
     # one millisecond late: the derivative is the last one, and the action holds
     slope = np.abs(np.diff(rows[:, 2:], axis=0)).max(axis=0)
     assert (error < 1.5 * slope).all()
-    alone = driven(Nothing(), env, make_bicycle_model(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
+    alone = driven(UNCONTROLLED, env, make_bicycle_model(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
     assert (np.abs(alone[:, :2] - alone[:, 2:]).max(axis=0) > 20.0 * error).all()
 
 

@@ -44,19 +44,11 @@ def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
 @pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
 def test_the_feedforward_agent_brings_static_slip_to_zero(kmh: float) -> None:
     """tie-vision (24) through `predict`, on the small-angle plant: |beta| < 1e-9 at 0.001 rad."""
-    env = gym.make(
-        "sideslip/YawVision-v0",
-        scenario={
-            "base": "tie-vision-fig8",
-            "steering": "step",
-            "amplitude": 0.001,
-            "hold": 100.0,
-            "speed": kmh * KMH,
-            "duration": 12.0,
-            "half_width": 1e6,
-            "noise": {"wheel": 0.0},
-        },
-    )
+    scenario = {
+        "base": "tie-vision-fig8", "steering": "step", "amplitude": 0.001, "hold": 100.0,
+        "speed": kmh * KMH, "duration": 12.0, "half_width": 1e6, "noise": {"wheel": 0.0},
+    }  # fmt: skip
+    env = gym.make("sideslip/YawVision-v0", scenario=scenario)
     drive = sideslip.rollout(env, make_agent("feedforward", env))
     assert abs(drive["gamma"][-1]) > 1e-4
     # the action is a float32, 6e-8 off, of a moment that alone cancels the uncontrolled slip

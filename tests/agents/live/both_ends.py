@@ -34,6 +34,12 @@ def contestant(env_id: str, estimator: Any, agent: Any, **options: Any) -> tuple
     return env, make_agent(agent, env)
 
 
+def onboard(
+    env_id: str = VISION, estimator: Any = "exact-kf", agent: Any = "lqr", **options: Any
+) -> OnboardController:
+    return OnboardController(*contestant(env_id, estimator, agent, **options), SEED)
+
+
 def watch_ticks(onboard: OnboardController, watch: Callable[[Tick], None]) -> None:
     """Call a function after each tick that the controller takes."""
     take = onboard.take

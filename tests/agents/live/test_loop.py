@@ -1,13 +1,12 @@
 """The loop ends with a reason, and what it measures is what happened."""
 
+import gc
 import time
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sideslip.agents.live.controller import OnboardController
 from sideslip.agents.live.loop import MAX_BATCH, PERIOD, Loop, Port, _Histogram, clock
 from sideslip.agents.live.messages import (
     FIELDS,
@@ -19,13 +18,9 @@ from sideslip.agents.live.messages import (
     decode,
 )
 from sideslip.benchmarks.cli.live import _parse_address
-from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial, watch_ticks
+from tests.agents.live.both_ends import camera, inertial, onboard, watch_ticks
 
 ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
-
-
-def onboard() -> OnboardController:
-    return OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
 
 
 def test_no_inertial_data_is_an_error_with_the_address() -> None:
@@ -52,6 +47,7 @@ def test_it_stops_when_asked_and_when_the_time_is_over() -> None:
         assert loop.ended == "stopped"
         loop.run(duration=0.05)
         assert loop.ended == "the time is over"
+    assert gc.isenabled()  # the collector is as it was
 
 
 def test_estimates_go_to_everybody_and_controls_back_to_the_car() -> None:
@@ -164,14 +160,3 @@ def test_addresses(text: str, found: Any) -> None:
 def test_what_is_no_address(text: str) -> None:
     with pytest.raises(ValueError, match="address"):
         _parse_address(text)
-
-
-def test_a_thread_that_stops_leaves_the_collector_as_it_was() -> None:
-    import gc
-
-    with Port() as port:
-        loop = Loop(onboard(), StreamSynchroniser(), port)
-        thread = Thread(target=loop.run, kwargs={"duration": 0.01})
-        thread.start()
-        thread.join()
-    assert gc.isenabled()

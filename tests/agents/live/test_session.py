@@ -12,12 +12,11 @@ from sideslip.agents.live.controller import (
     _BLOCK,
     _BLOCK_MAGIC,
     _ITEM,
-    OnboardController,
     Recorder,
     Session,
 )
 from sideslip.agents.live.messages import PATIENCE
-from tests.agents.live.both_ends import SEED, STEERING, contestant, drive, watch_ticks
+from tests.agents.live.both_ends import SEED, STEERING, drive, onboard, watch_ticks
 
 SETUP: dict[str, Any] = {
     **{"estimator": "dakf", "agent": "lqr", "env": "sideslip/YawGps-v0"},
@@ -26,16 +25,12 @@ SETUP: dict[str, Any] = {
 }
 
 
-def onboard() -> OnboardController:
-    return OnboardController(*contestant(STEERING, "dakf", "lqr"), SEED)
-
-
 @pytest.fixture(scope="module", params=[True, False], ids=["lock-step", "real time"])
 def driven(request: Any, tmp_path_factory: Any) -> tuple[Path, Any, int | None]:
     """(a session's file, its estimates (T, 2 n), its patience); the real one at a fifth of the
     speed, so that rows are missing at many a deadline."""
     path = tmp_path_factory.mktemp("session") / "drive.session"
-    car, found = onboard(), []
+    car, found = onboard(STEERING, "dakf"), []
     recorder = Recorder(path, SETUP)
     drive(
         STEERING, car, request.param, recorder,
@@ -49,7 +44,10 @@ def driven(request: Any, tmp_path_factory: Any) -> tuple[Path, Any, int | None]:
 def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> None:
     path, estimates, patience = driven
     replayed = list[Any]()
-    watch_ticks(car := onboard(), lambda _: replayed.append(np.concatenate([car.x, car.std])))
+    watch_ticks(
+        car := onboard(STEERING, "dakf"),
+        lambda _: replayed.append(np.concatenate([car.x, car.std])),
+    )
     ticks, same = Session(path).replay(car, patience)
     assert same and Session(path).setup == SETUP
     assert np.array_equal(replayed, estimates) and ticks == len(estimates) >= 500
@@ -60,7 +58,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
 ) -> None:
     path, estimates, patience = driven
     data, cut = path.read_bytes(), tmp_path / "cut.session"
-    blocks, car, lengths = list(Session(path).blocks), onboard(), set()
+    blocks, car, lengths = list(Session(path).blocks), onboard(STEERING, "dakf"), set()
     replayed = list[Any]()
     watch_ticks(car, lambda _: replayed.append(np.concatenate([car.x, car.std])))
     assert len(blocks) >= 5
@@ -87,8 +85,8 @@ def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
     data[len(data) // 2] ^= 1
     damaged = tmp_path / "damaged.session"
     damaged.write_bytes(data)
-    assert 0 < Session(damaged).replay(onboard(), patience)[0] < len(estimates)
-    other = OnboardController(*contestant(STEERING, "exact-kf", "lqr"), SEED)
+    assert 0 < Session(damaged).replay(onboard(STEERING, "dakf"), patience)[0] < len(estimates)
+    other = onboard(STEERING, "exact-kf")
     assert not Session(path).replay(other, patience)[1]
 
 

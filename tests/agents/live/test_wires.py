@@ -12,7 +12,7 @@ from sideslip.agents.live.loop import Port
 from sideslip.agents.live.peers import MAX_TICKS, simulate
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.envs.record import FAST
-from tests.agents.live.both_ends import SEED, SHORT, STEERING, VISION, contestant, drive
+from tests.agents.live.both_ends import SEED, SHORT, STEERING, VISION, contestant, drive, onboard
 
 
 class Reader:
@@ -29,18 +29,14 @@ class Reader:
         return found[: self.width[0]].astype(np.float32), count
 
 
+ROUGH = {"loss": 0.2, "duplicate": 0.3, "phase": None}
 CASES: dict[str, tuple[str, Any, Any, dict[str, Any]]] = {
     "camera": (VISION, "multirate-kf", "lqr", {"reference": "limited"}),
     "camera and GPS, steering": (STEERING, "dakf", "lqr", {"reference": "lagged"}),
     "every tick": (VISION, "exact-kf", "two-dof", {"control_period": 1}),
     "all that is observed": (STEERING, "exact-kf", Reader, {"reference": "lagged"}),
     "all samples": (VISION, "bicycle-kf", Reader, {"fast": "all"}),
-    "late, lost and double": (
-        VISION,
-        "exact-kf",
-        "lqr",
-        {"camera": {"loss": 0.2, "duplicate": 0.3, "phase": None}},
-    ),
+    "late, lost and double": (VISION, "exact-kf", "lqr", {"camera": ROUGH}),
 }
 
 
@@ -73,8 +69,8 @@ def assert_same(live: Rollout, offline: Rollout) -> None:
 def test_in_lock_step_the_drive_is_the_offline_one(case: str) -> None:
     env_id, estimator, agent, options = CASES[case]
     offline = rollout(*contestant(env_id, estimator, agent, **options), SEED)
-    onboard = OnboardController(*contestant(env_id, estimator, agent, **options), SEED)
-    found, wires, loop = drive(env_id, onboard, **options)
+    car = onboard(env_id, estimator, agent, **options)
+    found, wires, loop = drive(env_id, car, **options)
     assert_same(found, offline)
     assert loop.statistics.ticks == 501 and wires.periods == len(offline["t"]) - 1
     assert not any(loop.assembler.counts.values())
@@ -84,22 +80,22 @@ def test_estimates_are_those_of_the_offline_filter_at_every_tick() -> None:
     env, agent = contestant(VISION, "exact-kf", "lqr")
     offline = rollout(env, agent, SEED)
     expected = env.estimator.run(offline.log)
-    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
+    car = onboard()
     x, std = [], []
 
     def watch(_: Any) -> None:
-        x.append(onboard.x.copy())
-        std.append(onboard.std.copy())
+        x.append(car.x.copy())
+        std.append(car.std.copy())
 
-    drive(VISION, onboard, watch=watch)
+    drive(VISION, car, watch=watch)
     assert np.array_equal(x, expected.x) and np.array_equal(std, expected.std)
 
 
 def test_in_real_time_only_late_controls_make_a_difference() -> None:
     """At a tenth of the speed a control has ten times as long."""
     offline = rollout(*contestant(VISION, "exact-kf", "lqr"), SEED)
-    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
-    found, wires, loop = drive(VISION, onboard, step=False, speed=0.1)
+    car = onboard()
+    found, wires, loop = drive(VISION, car, step=False, speed=0.1)
     assert wires.late or loop.assembler.counts["held"] or found["beta"].shape == (51,)
     if not (wires.late or loop.assembler.counts["held"]):
         assert_same(found, offline)
@@ -108,7 +104,7 @@ def test_in_real_time_only_late_controls_make_a_difference() -> None:
 
 def test_garbage_between_the_datagrams_changes_nothing() -> None:
     offline = rollout(*contestant(VISION, "exact-kf", "lqr"), SEED)
-    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
+    car = onboard()
     over = Event()
 
     def throw(address: Any) -> None:
@@ -129,7 +125,7 @@ def test_garbage_between_the_datagrams_changes_nothing() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(both_ends, "Port", Known)
-        found, _, loop = drive(VISION, onboard)
+        found, _, loop = drive(VISION, car)
     over.set()
     threads[0].join()
     assert_same(found, offline)

@@ -29,14 +29,11 @@ from tests.agents.vec_env.test_zoo import wrapper_of
 ENV = "sideslip/YawGps-v0"
 NAME = "sideslip-YawGps-v0"
 TASK = TrainingTask(
-    env_id=ENV,
-    estimator="exact-kf",
-    estimator_options={"outputs": ["beta"], "std": False},
+    env_id=ENV, estimator="exact-kf", estimator_options={"outputs": ["beta"], "std": False},
     env_options={"reference": "zero-slip"},
-    scenarios=["sine-with-dwell", {"base": "lane-change", "duration": 3.0}],
-    num_envs=4,
+    scenarios=["sine-with-dwell", {"base": "lane-change", "duration": 3.0}], num_envs=4,
     n_eval_envs=4,
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -32,13 +32,9 @@ def test_every_step_has_its_standard_deviation() -> None:
 
 
 GOOD: dict[str, Any] = {
-    "A": [[0.9, 0.1], [0.0, 0.8]],
-    "B": [[1.0], [0.0]],
-    "C": [[1.0, 0.0]],
-    "ratio": 5,
-    "Q": 0.1,
+    "A": [[0.9, 0.1], [0.0, 0.8]], "B": [[1.0], [0.0]], "C": [[1.0, 0.0]], "ratio": 5, "Q": 0.1,
     "R": 1.0,
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

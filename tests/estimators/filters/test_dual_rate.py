@@ -35,17 +35,10 @@ def random_system(seed: Any) -> Any:
     a_d = np.diag(rng.uniform(0.9, 0.99, d)) + 0.01 * np.triu(rng.normal(size=(d, d)), 1)
     w, v, w_d = (rng.normal(size=(k, k)) for k in (m, q, d))
     return {
-        "A": a,
-        "B": rng.normal(size=(m, p)),
-        "C": rng.normal(size=(q, m)),
-        "ratio": r,
-        "disturbed": rows,
-        "leak": a_d,
-        "rate": 0.1 * rng.normal(size=d),
-        "Q": 1e-2 * w @ w.T,
-        "Q_d": 1e-3 * w_d @ w_d.T,
-        "R": v @ v.T + 0.1 * np.eye(q),
-    }
+        "A": a, "B": rng.normal(size=(m, p)), "C": rng.normal(size=(q, m)), "ratio": r,
+        "disturbed": rows, "leak": a_d, "rate": 0.1 * rng.normal(size=d), "Q": 1e-2 * w @ w.T,
+        "Q_d": 1e-3 * w_d @ w_d.T, "R": v @ v.T + 0.1 * np.eye(q),
+    }  # fmt: skip
 
 
 def extended(s: Any) -> Any:
