@@ -102,23 +102,6 @@ def test_gains_are_designed_for_each_rows_car(kind: str) -> None:
         assert other.design.model.car.C_f == fit_fiala(car).front_stiffness
 
 
-@pytest.mark.parametrize("name", ["oracle-parameters-lqr", "oracle-state-nmpc"])
-def test_rows_of_a_vector_env_have_the_bits_of_single_ones(name: str) -> None:
-    envs, agent = make_oracle(name, AFS, num_envs=2, world="v1", **SLALOM)
-    env, alone = make_oracle(name, AFS, world="v1", **SLALOM)
-    obs, state = envs.reset(seed=7)[0], None
-    one, own = env.reset(seed=8)[0], None
-    for _ in range(8):
-        assert bits(obs[1]) == bits(one)
-        action, state = agent.predict(obs, state)
-        single, own = alone.predict(one, own)
-        assert bits(action[1]) == bits(single)
-        obs, one = envs.step(action)[0], env.step(single)[0]
-    obs[0, :] = np.nan
-    action, _ = agent.predict(obs, state)
-    assert np.isnan(action[0]).all() and np.isfinite(action[1]).all()
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("env_id", [FUSION, AFS])
 def test_who_knows_more_pays_less_in_the_world(env_id: str) -> None:

@@ -19,6 +19,7 @@ from sideslip.envs.scenarios.manoeuvres import SCENARIOS, TIERS
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.scenarios.world import WORLDS, World
 from sideslip.estimators.vector.estimate import EstimateObservation
+from tests.agents.test_car_truth import SLALOM
 from tests.envs.helpers import bits
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
@@ -30,13 +31,24 @@ OFTEN = [*((rung, FUSION) for rung in ORACLES), ("oracle-state-lqr", AFS), ("nom
 RARELY = [each for each in itertools.product(ORACLES, (AFS, VISION)) if each not in OFTEN]
 
 
+WORLDLY = [(rung, AFS, True) for rung in ("oracle-parameters-lqr", "oracle-state-nmpc")]
+
+
 @pytest.mark.parametrize(
-    ("rung", "env_id"), [*OFTEN, *(pytest.param(*each, marks=pytest.mark.long) for each in RARELY)]
+    ("rung", "env_id", "in_world"),
+    [
+        *((*each, False) for each in OFTEN),
+        *WORLDLY,
+        *(pytest.param(*each, False, marks=pytest.mark.long) for each in RARELY),
+    ],
 )
-def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: str) -> None:
-    options: Any = {"controller": {} if rung == "nominal" else {"knots": 2}}
-    envs, agent = make_oracle(rung, env_id, num_envs=2, options=options)
-    env, alone = make_oracle(rung, env_id, options=options)
+def test_rows_of_a_vector_env_have_the_bits_of_single_ones(
+    rung: str, env_id: str, in_world: bool
+) -> None:
+    options = {"controller": {} if rung == "nominal" else {"knots": 2}}
+    told: Any = SLALOM | {"world": "v1"} if in_world else {"options": options}
+    envs, agent = make_oracle(rung, env_id, num_envs=2, **told)
+    env, alone = make_oracle(rung, env_id, **told)
     assert isinstance(agent, Controller) and agent.grip
     obs, state = envs.reset(seed=7)[0], None
     one, own = env.reset(seed=8)[0], None
@@ -46,6 +58,9 @@ def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: st
         single, own = alone.predict(one, own)
         assert bits(action[1]) == bits(single)
         obs, one = envs.step(action)[0], env.step(single)[0]
+    obs[0, :] = np.nan
+    action, _ = agent.predict(obs, state)
+    assert np.isnan(action[0]).all() and np.isfinite(action[1]).all()
 
 
 def test_nominal_knows_the_noise_of_the_sensors_that_are_there() -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -31,14 +32,28 @@ from tests.estimators.vector.fleets import (
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 
+def wrap_both(
+    env_id: str, count: int, mode: str, layers: Sequence[dict[str, Any]], **kwargs: Any
+) -> Any:
+    """Around SyncVectorEnv, and around the vector env."""
+    both = batches.pair(env_id, count, mode, **kwargs)
+    return [EstimateObservation(env, **layers[0]) for env in both]
+
+
+QUICK = ("exact-kf", "course-kf")
+SLOW = [pytest.param(wrap_both, name, marks=pytest.mark.long) for name in FILTERS]
+CASES = [(pair, name) for name in FILTERS] + [(wrap_both, name) for name in QUICK]
+CASES += [case for case in SLOW if case.values[1] not in QUICK]
+
+
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", FILTERS)
-def test_every_row_is_the_environment_wrapped_alone(name: Any, mode: Any) -> None:
+@pytest.mark.parametrize(("make", "name"), CASES)
+def test_every_row_is_the_environment_wrapped_alone(make: Any, name: Any, mode: Any) -> None:
     """Observations, rewards, ends and infos, with `final_obs`, over several episodes."""
     env_id, sensor = home(name)
     layer = {"estimator": name, "outputs": outputs(name)}
-    alone, together = pair(env_id, 3, mode, [layer], **{sensor: {"phase": None, "loss": 0.2}})
-    assert drive_both(alone, together, 25, seed=[11, 5, 7]) > 3
+    alone, together = make(env_id, 3, mode, [layer], **{sensor: {"phase": None, "loss": 0.2}})
+    assert drive_both(alone, together, 25 if make is pair else 60, seed=[11, 5, 7]) > 3
 
 
 @pytest.mark.smoke
@@ -72,17 +87,6 @@ def test_rows_may_be_different_cars(mode: Any) -> None:
     assert drive_both(alone, together, 30, seed=3) > 3
     tables = [each.gains for each in together.estimator]
     assert np.shares_memory(tables[0], tables[3]) and not np.shares_memory(tables[0], tables[1])
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_reset_to_another_scenario_tells_the_filters(mode: Any) -> None:
-    alone, together = pair(VISION, 2, mode, [{"estimator": "multirate-kf"}])
-    drive_both(alone, together, 5, seed=1)
-    for scenario in ("uneven-delay-fig5", "tie-vision-fig7", "sine"):
-        options = {"scenario": scenario, "duration": 0.05}
-        one = alone.reset(seed=2, options=dict(options))
-        same_bits(one, together.reset(seed=2, options=options))
-        drive_both(alone, together, 12)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -141,37 +145,18 @@ def test_copies_continue_bit_for_bit(options: dict[str, Any]) -> None:
     assert drive_both(env, twin, 12, 8) > 2
 
 
-def wrap_both(env_id: str, count: int, mode: str, layer: dict[str, Any], **kwargs: Any) -> Any:
-    """Around SyncVectorEnv, and around the vector env."""
-    return [EstimateObservation(x, **layer) for x in batches.pair(env_id, count, mode, **kwargs)]
-
-
-QUICK = ("exact-kf", "course-kf")
-KINDS = [pytest.param(name, marks=() if name in QUICK else (pytest.mark.long,)) for name in FILTERS]
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", KINDS)
-def test_every_filter_says_the_same(name: Any, mode: str) -> None:
-    env_id, sensor = home(name)
-    layer = {"estimator": name, "outputs": outputs(name)}
-    clocks: dict[str, Any] = {sensor: {"phase": None, "loss": 0.2}}
-    alone, together = wrap_both(env_id, 3, mode, layer, **clocks)
-    assert together.layout == alone.layout
-    assert drive_both(alone, together, 60, seed=[11, 5, 7]) > 6
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("env_id", "mode"), [*zip(IDS, itertools.cycle(MODES), strict=False)])
 def test_so_it_does_over_many_episodes(env_id: str, mode: str) -> None:
     name = "course-kf" if env_id == "sideslip/YawGps-v0" else "multirate-kf"
-    alone, together = wrap_both(env_id, 5, mode, {"estimator": name})
+    alone, together = wrap_both(env_id, 5, mode, [{"estimator": name}])
     assert drive_both(alone, together, 5_000, seed=1) > 50
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_masks_and_other_scenarios_tell_the_filters(mode: str) -> None:
-    alone, together = wrap_both(VISION, 3, mode, {"estimator": "multirate-kf"})
+@pytest.mark.parametrize("make", [pair, wrap_both])
+def test_masks_and_other_scenarios_tell_the_filters(make: Any, mode: str) -> None:
+    alone, together = make(VISION, 3, mode, [{"estimator": "multirate-kf"}])
     same_bits(alone.reset(seed=1), together.reset(seed=1))
     for k, scenario in enumerate(("uneven-delay-fig5", "tie-vision-fig7", "sine")):
         drive_both(alone, together, 12)
