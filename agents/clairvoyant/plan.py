@@ -26,6 +26,7 @@ from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
+from ..env_info import CarEnv
 from ..rollout import iterate_steps
 from .forecast import (
     N_INPUTS,
@@ -184,8 +185,7 @@ def _run_backward_pass(
 
 
 def _simulate_run(
-    env: gym.Env[Actions, Actions], seed: int, actions: Array | Actions,
-    feedback: tuple[Array, Array] | None = None,
+    env: CarEnv, seed: int, actions: Array | Actions, feedback: tuple[Array, Array] | None = None,
 ) -> PlanRun:  # fmt: skip
     """Simulate an episode; feedback: states (K + 1, n), gains (K, width, n) on the miss."""
     env.reset(seed=seed)
@@ -206,9 +206,7 @@ def _simulate_run(
     return PlanRun(states, applied.astype(np.float64), cost, length)
 
 
-def _solve_ilqr(
-    env: gym.Env[Actions, Actions], seed: int, start: npt.ArrayLike | None = None
-) -> tuple[PlanRun, str]:
+def _solve_ilqr(env: CarEnv, seed: int, start: npt.ArrayLike | None = None) -> tuple[PlanRun, str]:
     """Return the best run of the steps from a start: "settled", "stuck" at first, or "stopped"."""
     env.reset(seed=seed)
     forecast = make_forecast(_get_base(env))
@@ -233,8 +231,7 @@ def _solve_ilqr(
 
 
 def _run_line_search(
-    env: gym.Env[Actions, Actions], seed: int, problem: IlqrProblem, forecast: Forecast,
-    run: PlanRun, damping: float,
+    env: CarEnv, seed: int, problem: IlqrProblem, forecast: Forecast, run: PlanRun, damping: float,
 ) -> tuple[PlanRun, float]:  # fmt: skip
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
@@ -282,7 +279,7 @@ class ClairvoyantResult:
 
 
 def compute_clairvoyant(
-    env: gym.Env[Actions, Actions], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
+    env: CarEnv, seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
 ) -> ClairvoyantResult:
     """Compute the best of the plans from other methods' runs, and of those runs themselves."""
     start_time, base, env = time.process_time(), _get_base(env), _ManoeuvreEnv(env)
@@ -304,7 +301,7 @@ def compute_clairvoyant(
     return ClairvoyantResult(*best, winner, costs, statuses, seconds)
 
 
-def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Actions:
+def record_actions(env: CarEnv, agent: Any, seed: int) -> Actions:
     """Record actions after the lead-in (of full scale), shape (K, width), zeros after a failure."""
     base, (_, *steps) = _get_base(env), iterate_steps(env, agent, seed)
     actions = np.zeros((_count_periods(base), *(base.action_space.shape or ())), np.float32)
@@ -313,7 +310,7 @@ def record_actions(env: gym.Env[Actions, Actions], agent: Any, seed: int) -> Act
     return actions
 
 
-def _get_base(env: gym.Env[Actions, Actions]) -> "StabilityEnv":
+def _get_base(env: CarEnv) -> "StabilityEnv":
     return cast("StabilityEnv", env.unwrapped)
 
 
