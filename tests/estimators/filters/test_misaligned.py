@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
 
 from sideslip.envs import COMS, Log
 from sideslip.envs.record import FAST, PACKET, Record
@@ -18,7 +17,7 @@ from tests.estimators.core.test_wary import CAMERA as CAMERA_PLACE
 from tests.estimators.core.test_wary import FROM, built, change_lane, drives, spoilt
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.drives import Drives, told
-from tests.estimators.simulation import CAMERA, GPS
+from tests.estimators.simulation import CAMERA
 
 YAW, OFFSET = math.radians(0.3), math.radians(0.1)  # largest ones
 SDS = {"camera_yaw_sd": YAW / math.sqrt(3.0), "steer_offset_sd": OFFSET / math.sqrt(3.0)}
@@ -134,19 +133,3 @@ def test_a_lane_change_is_not_taken_for_a_yaw_of_the_camera() -> None:
     found = filter_.run(lane)
     assert filter_.counts["gated"] > 0
     assert found.std[FROM:, i].max() <= found.std[FROM - 1, i]
-
-
-REFUSED: list[tuple[str, dict[str, Any], type[Exception], str]] = [
-    ("exact-kf", {"slow": "gps", "camera_yaw_sd": 0.01}, ValueError, "camera_yaw_sd needs camera"),
-    ("exact-kf", {"steer_offset_sd": -0.1}, ValueError, "steer_offset_sd is in rad and not neg"),
-    ("exact-kf", {"camera_yaw_time": 1.0}, TypeError, "unknown option 'camera_yaw_time'"),
-    ("exact-kf", SDS | {"gains": "periodic"}, ValueError, "no settled gain"),
-    ("yaw-moment-observer", {"steer_offset_sd": 0.01}, TypeError, "unknown option 'steer_offset"),
-    ("multirate-kf", {"camera_yaw_sd": 0.01}, TypeError, "unknown option 'camera_yaw_sd'"),
-]
-
-
-@pytest.mark.parametrize(("name", "options", "error", "message"), REFUSED)
-def test_what_cannot_be_is_refused(name: str, options: Any, error: Any, message: str) -> None:
-    with pytest.raises(error, match=message):
-        make_estimator(name, sensors={"camera": CAMERA, "gps": GPS}, **options)

@@ -15,6 +15,7 @@ from .literal import T, car, correct, due, excited, gain, inputs, observer, sett
 V = FIG7.speed
 QUICK = type(FIG7)(duration=0.5)
 Q: dict[str, Any] = {"q_beta": 2e-3, "q_gamma": 2e-2, "q_psi": 1e-5, "q_y_l": 1e-4}
+WITH_P: dict[str, Any] = {"gains": "covariance", **Q}
 NOISE = np.diag([2e-3, 2e-2, 1e-5, 1e-4, 0.0, 0.0])
 R = np.diag([0.005**2, 3.5e-3**2, 0.02**2])
 C_A = np.zeros((3, 6))  # (13): gyro and the states that the camera saw
@@ -84,9 +85,7 @@ def test_multirate_with_delayed_states(delay: Any, share: Any, camera: Any) -> N
         y = np.array([row[FAST.gyro], *(at[k][5:7] if k in at else ())])
         x, P = correct(x, P, C_A[measured], R[np.ix_(measured, measured)], y)
         wanted.append([x[:n], np.sqrt(np.diag(P)[:n])])
-    filter_ = make_estimator(
-        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay=delay, **Q
-    )
+    filter_ = make_estimator("multirate-kf", sensors=log.slow, speed=V, delay=delay, **WITH_P)
     found, (states, stds) = filter_.run(log), np.array(wanted).swapaxes(0, 1)
     assert found.names[4:] == ("psi_late", "y_l_late")[: n - 4]
     np.testing.assert_allclose(found.x, states, rtol=0.0, atol=1e-11)
@@ -143,9 +142,7 @@ def test_single_rate_filter_lives_at_the_cameras_rate() -> None:
         y: Any = [log.record.fast[k, FAST.gyro], *(captured[k - 33][5:7] if k > 0 else ())]
         x, P = correct(x, P, C_A[measured], R[np.ix_(measured, measured)], y)
         wanted[k : k + 33] = x[:4]
-    found = make_estimator(
-        "single-rate-kf", sensors=log.slow, speed=V, gains="covariance", **Q
-    ).run(log)
+    found = make_estimator("single-rate-kf", sensors=log.slow, speed=V, **WITH_P).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-10)
 
 
@@ -165,9 +162,8 @@ def test_single_rate_filter_that_predicts_between_frames() -> None:
             y: Any = [row[FAST.gyro], *(captured[k - 33][5:7] if k > 0 else ())]
             x, P = correct(x, P, C_A[measured], R[np.ix_(measured, measured)], y)
         wanted.append(x[:4])
-    found = make_estimator(
-        "single-rate-kf", sensors=log.slow, speed=V, gains="covariance", between="predict", **Q
-    ).run(log)
+    predicting: Any = {"between": "predict", **WITH_P}
+    found = make_estimator("single-rate-kf", sensors=log.slow, speed=V, **predicting).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-10)
 
 

@@ -120,7 +120,6 @@ def test_slip_from_vision_alone() -> None:
         if k in at:
             x, P = correct(x, P, C_late, R[1:, 1:], at[k][5:7])
         wanted.append(x[:4])
-    found = make_estimator(
-        "vision-only-kf", sensors=log.slow, speed=V, gains="covariance", **Q
-    ).run(log)
+    with_P: Any = {"gains": "covariance", **Q}
+    found = make_estimator("vision-only-kf", sensors=log.slow, speed=V, **with_P).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-10)
