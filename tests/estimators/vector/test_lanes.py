@@ -61,30 +61,26 @@ def same_as_alone(
         assert batch[i].counts == alone.counts
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_every_lane_is_the_filter_alone(name: Any) -> None:
+INERTIAL = ["gyro", "accel_y"]
+OPTIONS: list[dict[str, Any]] = [
+    {"gains": "covariance", "bias_sd": 0.01, "fast": INERTIAL},
+    {"camera_yaw_sd": 0.005, "steer_offset_sd": 0.002, "fast": INERTIAL},
+    {"gains": "covariance", "robust": 2.0},
+    {"delay": "stored", "gains": "covariance"},
+    {"delay": "buffer"},
+]
+CASES = [
+    *((name, 10, None, {}) for name in FILTERS),
+    *((name, 1, None, {}) for name in ("exact-kf", "multirate-kf", "uneven-delay-kf")),
+    *((name, 64, 7.0, {}) for name in ("exact-kf", "multirate-kf", "uneven-delay-kf")),
+    *(("exact-kf", 10, 7.0, options) for options in OPTIONS),
+]
+
+
+@pytest.mark.parametrize(("name", "n", "speed", "options"), CASES)
+def test_every_lane_is_the_filter_alone(name: Any, n: int, speed: Any, options: Any) -> None:
     """Own phases, cars, speeds and troubles; gains that are missing are made on the way."""
-    same_as_alone(name, 10, None)
-
-
-@pytest.mark.parametrize(("n", "speed"), [(1, None), (64, 7.0)])
-@pytest.mark.parametrize("name", ["exact-kf", "multirate-kf", "uneven-delay-kf"])
-def test_so_it_is_for_every_step(name: Any, n: Any, speed: Any) -> None:
-    same_as_alone(name, n, speed)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"gains": "covariance", "bias_sd": 0.01, "fast": ["gyro", "accel_y"]},
-        {"camera_yaw_sd": 0.005, "steer_offset_sd": 0.002, "fast": ["gyro", "accel_y"]},
-        {"gains": "covariance", "robust": 2.0},
-        {"delay": "stored", "gains": "covariance"},
-        {"delay": "buffer"},
-    ],
-)
-def test_so_it_is_with_options(options: Any) -> None:
-    same_as_alone("exact-kf", 10, 7.0, **options)
+    same_as_alone(name, n, speed, **options)
 
 
 def test_a_capture_is_of_its_own_tick() -> None:
