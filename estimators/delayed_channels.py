@@ -215,7 +215,7 @@ class LateEstimator(Estimator):
         """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
         layers = self.filters, self.delayed_filters
         current, delayed = (f.view(np.uint8).reshape(len(f), -1) for f in layers)
-        skip_history = self.config.delay == "clone" and not self._f.store_predictions
+        skip_history = self.config.delay == "clone" and self._f.stored == 0
         end = _HISTORY_OFFSET if skip_history else None
         current[:, :end] = delayed[:, :end]
         rows = _align_rows(self._rows, self._lags)

@@ -23,7 +23,7 @@ from .core.filter import (
     reset_filters,
     write_estimate,
 )
-from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
+from .core.model import LATERAL, VELOCITY
 from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .core.update import is_healthy
 from .design import periodic
@@ -92,9 +92,9 @@ class Estimator:
         columns |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
         # a log without them had no yaw moment and a straight road
         columns -= {FAST.torque_left, FAST.torque_right, FAST.curvature}
-        if any(f.kind in (KINEMATIC, VELOCITY_ROLL) for f in self.filters):
+        if any(f.kind == VELOCITY for f in self.filters):
             columns.add(FAST.gyro)
-        if self._f.measured and (self._f.kind == LATERAL or self._f.speed_state >= 0):
+        if self._f.measured and (self._f.kind == LATERAL or self._f.speed_share > 0.0):
             columns.add(FAST.wheel_left)
         return tuple(FAST._fields[column] for column in sorted(columns))
 

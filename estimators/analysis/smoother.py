@@ -89,7 +89,7 @@ def _remove_delay(estimator: Estimator) -> Estimator:
     undelayed = copy.copy(estimator)
     undelayed.filters = estimator.filters.copy()
     f = undelayed.filters[0]
-    f.delay_rule, f.total, f.store_predictions = IGNORE, f.n, 1
+    f.delay_rule, f.total, f.stored = IGNORE, f.n, f.n
     f.frames[:] = 0
     return undelayed
 

@@ -16,7 +16,7 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ...envs.record import PACKET
 from .innovation import interpolate_hdop
 from .late_samples import store_due_captures
-from .model import BETA, CURVATURE, LATERAL, build_model, is_finite, linearise
+from .model import BETA, CURVATURE, build_model, is_finite, linearise
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, read_fast_row
 from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
@@ -113,9 +113,8 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
         for i in range(f.fasts):
             f.r_fast[i] = FIRST_VARIANCE * f.r_nominal[i]
     f.steer_before = np.nan
-    if f.accel_scale_state > 0:
-        f.C_fast[f.accel_row, f.accel_scale_state] = 0.0
-    if f.tyres > 0:
+    f.felt[f.accel_scale_state] = 0.0
+    if f.tyre_states > 0:
         linearise(f, 0.0)
     if f.measured == 1:
         f.speed, f.model_speed = 0.0, 0.0
@@ -141,19 +140,18 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
             for i in range(f.inputs):
                 f.u_sum[i] /= f.u_count
         u = f.u_sum if f.stride > 1 else f.u
-        if f.kind == LATERAL and f.inputs > CURVATURE:
+        if f.inputs > CURVATURE:
             f.road_turn += f.model_speed * u[CURVATURE] * f.step
         advance_state(f, u)
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
     else:  # the first step has nothing to predict from
         f.has_started = 1
         f.at = ((f.tick - f.origin) // f.stride) % f.cycle
-        if f.speed_state >= 0:
-            f.x[f.speed_state] = f.speed
-    if f.store_predictions == 1:
-        f.past_road_turn[f.tick % WINDOW] = f.road_turn
-        for i in range(f.n):
-            f.predicted[f.tick % WINDOW, i] = f.x[i]
+        f.x[0] += f.speed_share * f.speed
+    slot = f.tick % WINDOW
+    f.past_road_turn[slot] = f.road_turn
+    for i in range(f.stored):
+        f.predicted[slot, i] = f.x[i]
     if listens:
         correct_fast(f, gains)
     store_history(f)

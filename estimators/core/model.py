@@ -16,40 +16,32 @@ from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
-LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES = range(6)  # kinds of models
+FIXED, LATERAL, VELOCITY = range(3)  # kinds: what makes A and B anew: nothing, speed, yaw rate
 BETA, GAMMA, PSI, Y_L = range(4)  # places of a bicycle's states
 CURVATURE = 2  # place of the road's curvature among a bicycle's inputs
 MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
-_FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
-_MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
+# limits of the estimated factors on the stiffness and of the reciprocal of friction
+_LOWEST, _HIGHEST = (0.2, 0.2, 0.0), (3.0, 3.0, 4.0)
 _MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its stiffness
 
 
 @jit
 def _build_lateral(f: FilterRecord, V: Scalar) -> None:
     """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
-    A, B = f.A, f.B
-    rolling = 2 if f.roll_state > 0 else 0
-    write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
-    if f.forces == 1:
-        B[0, N_INPUTS], B[1, N_INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
-    if rolling > 0:
-        _write_body(f, V)
-    if f.accel_row > 0:
-        _write_accel(f, V)
-    if f.tyres > 0:
-        _write_tyres(f, V)
-    if f.bank_state >= 0:  # gravity: no accelerometer feels it, and the body does not roll by it
-        B[0, N_INPUTS + f.bank_state] = -GRAVITY / V
-    if f.map_heading_state > 0:
-        B[Y_L, N_INPUTS + f.map_heading_state - f.dense] = V
-    if f.steer_offset_state > 0:  # the input is the measured angle, with the offset in it
-        felt = 1.0 if _is_steering_felt(V) else 0.0
-        for i in range(f.dense):
-            B[i, N_INPUTS + f.steer_offset_state - f.dense] = 0.0 - felt * B[i, 0]
-        if f.accel_row > 0:
-            f.C_fast[f.accel_row, f.steer_offset_state] = 0.0 - felt * f.D_fast[f.accel_row, 0]
+    A, B, first = f.A, f.B, N_INPUTS - f.dense  # state j pushes by column first + j of B
+    if f.model_speed > 0.0:
+        f.beta_scale *= f.model_speed / V
+    write_lateral(A, B, f.car, V, f.planar, f.inputs, f.preview)
+    B[0, N_INPUTS] = f.push_rate + f.push_force / (f.car[CAR.mass] * V)
+    _write_body(f, V)
+    _write_tyres(f, V)
+    B[0, first + f.bank_state] = -GRAVITY / V  # the body does not roll by gravity
+    B[Y_L, first + f.map_heading_state] = V
+    acts = 1.0 if _is_steering_felt(V) else 0.0
+    for i in range(f.dense):  # the input is the measured angle, with the offset in it
+        B[i, first + f.steer_offset_state] = 0.0 - acts * B[i, 0]
+    _write_accel(f, V)
 
 
 @jit
@@ -61,7 +53,7 @@ def _is_steering_felt(V: Scalar) -> Scalar:
 @jit
 def _write_body(f: FilterRecord, V: Scalar) -> None:
     """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
-    A, B, i = f.A, f.B, f.roll_state
+    A, B, i = f.A, f.B, f.phi_state
     # phi'' enters F_y, hence phi'' itself: with S = M_s h_s all divides by 1 - S^2 / (M I_x)
     inverse = 1.0 / (1.0 - f.roll_arm * f.sway)
     lift, beta_per_roll = inverse * f.roll_arm, f.sway / V  # 1/m, s
@@ -69,7 +61,8 @@ def _write_body(f: FilterRecord, V: Scalar) -> None:
     write_roll(A, B, i, 0, stiffness, inverse * f.roll_damping, lift * V * B[0, 0])
     A[i + 1, BETA], A[i + 1, GAMMA] = lift * V * A[0, BETA], lift * V * (A[0, GAMMA] + 1.0)
     B[i + 1, N_INPUTS] = lift * V * B[0, N_INPUTS]  # the force that pushes beta
-    for j in range(f.dense):
+    A[0, i], A[0, i + 1] = 0.0, 0.0
+    for j in (BETA, GAMMA, i, i + 1):
         A[0, j] += beta_per_roll * A[i + 1, j]
     B[0, 0] += beta_per_roll * B[i + 1, 0]
     B[0, N_INPUTS] += beta_per_roll * B[i + 1, N_INPUTS]
@@ -78,14 +71,13 @@ def _write_body(f: FilterRecord, V: Scalar) -> None:
 @jit
 def _write_accel(f: FilterRecord, V: Scalar) -> None:
     """Write the specific force a_y = V (beta' + gamma) + g phi, with feed-through of steering."""
-    row = f.C_fast[f.accel_row]
+    row, first = f.C_fast[f.accel_row], N_INPUTS - f.dense
     for j in range(f.dense):
-        row[j] = V * f.A[0, j]
+        row[j] = V * f.A[0, j] + f.felt[j]
     row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
-    if f.pushed[0] >= 0:  # the first state behind the dense ones is no bias
-        row[f.dense] = V * f.B[0, N_INPUTS]
-    if f.roll_state > 0:
-        row[f.roll_state] += GRAVITY
+    for j in range(f.dense, f.n):
+        row[j] = V * f.B[0, first + j] + f.felt[j]
+    row[f.bank_state] = 0.0  # gravity, which no accelerometer feels
     f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
 
 
@@ -94,8 +86,6 @@ def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> t
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
-    if f.roll_state == 0:
-        return beta, gamma, 0.0
     phi_rate = f.roll_arm / (1.0 - f.roll_arm * f.sway) * V * beta
     return beta + f.sway / V * phi_rate, gamma, phi_rate
 
@@ -103,25 +93,16 @@ def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> t
 @jit
 def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
-    for j in range(3):  # the factors of front and rear stiffness, then 1/friction
-        if j < 2 or f.inverse_friction > 0:
-            front = f.force_slopes[0, j // 2] if j != 1 else 0.0
-            rear = f.force_slopes[1, j // 2] if j != 0 else 0.0
-            column = (f.tyres + j if j < 2 else f.inverse_friction) - f.dense
-            beta, gamma, phi_rate = _compute_rates(f, V, front, rear)
-            f.B[0, N_INPUTS + column], f.B[1, N_INPUTS + column] = beta, gamma
-            if f.roll_state > 0:
-                f.B[f.roll_state + 1, N_INPUTS + column] = phi_rate
-            if f.accel_row > 0:
-                f.C_fast[f.accel_row, f.dense + column] = V * beta
-    beta, gamma, phi_rate = _compute_rates(f, V, f.rest[0], f.rest[1])
-    f.push[0], f.push[1] = beta, gamma
-    if f.roll_state > 0:
-        f.push[f.roll_state + 1] = phi_rate
-    if f.map_heading_state > 0:  # y_l' = V sin(course); without it the papers' linear law stays
-        course = f.x[BETA] + f.x[PSI]
-        f.push[Y_L] = V * (sincos(course)[0] - course)
-    f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0
+    B, push, phi_rate = f.B, f.push, f.phi_state + 1
+    for j in range(f.tyre_states):
+        front = f.force_slopes[0, j // 2] if j != 1 else 0.0
+        rear = f.force_slopes[1, j // 2] if j != 0 else 0.0
+        k = N_INPUTS - f.dense + f.tyres + j
+        B[0, k], B[1, k], B[phi_rate, k] = _compute_rates(f, V, front, rear)
+    push[0], push[1], push[phi_rate] = _compute_rates(f, V, f.rest[0], f.rest[1])
+    course = f.x[BETA] + f.x[PSI]  # y_l' = V sin(course)
+    push[f.curved_state] = V * (sincos(course)[0] - course)
+    f.rest_fast[f.accel_row] = V * push[0]
 
 
 @jit
@@ -152,37 +133,30 @@ def _compute_axle_force(
 @jit
 def linearise(f: FilterRecord, steer: Scalar) -> None:
     """Expand both axles' forces at the present state, and set the process noise that follows it."""
-    x, V = f.x, maximum(f.model_speed, MIN_SPEED)
-    if f.steer_offset_state > 0 and _is_steering_felt(V):
-        steer = steer - x[f.steer_offset_state]
-    for i in range(2):
-        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
-    inverse = 0.0  # 1 / friction
-    if f.inverse_friction > 0:
-        inverse = minimum(maximum(x[f.inverse_friction], 0.0), _MAX_INVERSE_FRICTION)
-        x[f.inverse_friction] = inverse
+    x, V, tyre = f.x, maximum(f.model_speed, MIN_SPEED), f.tyre
+    if _is_steering_felt(V):
+        steer = steer - f.offset_share * x[f.steer_offset_state]
     beta, gamma = x[0], x[1]
     total_force, moves = 0.0, f.speed > MIN_SPEED
-    for i in range(3 if f.inverse_friction > 0 else 2):  # tyres walk while the car moves
-        index = f.tyres + i if i < 2 else f.inverse_friction
+    for i in range(f.tyre_states):  # tyres walk while the car moves
+        index = f.tyres + i
+        tyre[i] = x[index] = minimum(maximum(x[index], _LOWEST[i]), _HIGHEST[i])
         walks = moves and f.P[index, index] < f.prior[index, index]
         f.Q[index, index] = f.q_tyres[i] if walks else 0.0
-    if f.map_heading_state > 0:  # a map that is late errs by the road's turn in that time
-        error = f.map_lag * V * f.u[CURVATURE]
-        i = f.map_heading_state
-        f.Q[i, i] = (1.0 - f.decay[i] * f.decay[i]) * (f.prior[i, i] + error * error)
+    # a map that is late errs by the road's turn in that time
+    error, i = f.map_lag * V * f.u[CURVATURE], f.map_heading_state
+    f.Q[i, i] = (1.0 - f.decay[i] * f.decay[i]) * (f.prior[i, i] + error * error)
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
-        factor = x[f.tyres + i]
         force, slope, per_factor, per_friction = _compute_axle_force(
-            f.stiffness[i], f.load[i], alpha, factor, inverse
+            f.stiffness[i], f.load[i], alpha, tyre[i], tyre[2]
         )
         f.car[CAR.front_stiffness + i] = 0.5 * slope  # of one tyre
         if not moves:  # the tyres are unobservable
             per_factor, per_friction = 0.0, 0.0
         f.force_slopes[i, 0], f.force_slopes[i, 1] = per_factor, per_friction
-        f.rest[i] = force - slope * alpha - per_factor * factor - per_friction * inverse
+        f.rest[i] = force - slope * alpha - per_factor * tyre[i] - per_friction * tyre[2]
         total_force += absolute(force)
     if f.model_error > 0.0:
         force_error = f.model_error * total_force
@@ -193,34 +167,17 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
 
 
 @jit
-def _build_continuous(f: FilterRecord, V: Scalar, turning: Scalar) -> None:
-    """Build f.A and f.B = [inputs, disturbances] at a speed V (m/s) and yaw rate (rad/s)."""
-    A, B = f.A, f.B
-    for i in range(f.dense):
-        for j in range(0, N_CORE, 8):
-            store8(A, 0.0, i, j)
-        for j in range(0, N_DRIVERS, 8):
-            store8(B, 0.0, i, j)
-    if f.forces == 0:
-        for j in range(f.n - f.dense):
-            if f.pushed[j] >= 0:
-                B[f.pushed[j], N_INPUTS + j] = 1.0
-    if f.kind == LATERAL:
-        _build_lateral(f, V)
-    elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
-        i = 0 if f.kind == ROLL else 2
-        write_roll(A, B, i, f.inputs - 1, f.roll_stiffness, f.roll_damping, f.roll_arm)
-    if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:  # v_x, v_y: double-layer-gps (4)-(5)
-        A[0, 1], A[1, 0] = turning, -turning
-        B[0, 0], B[1, 1] = 1.0, 1.0
-        if f.kind == VELOCITY_ROLL:
-            A[1, 2] = -GRAVITY  # double-layer-gps (5)
-    if f.kind == YAW or f.kind == FORCES:
-        I = f.car[CAR.yaw_inertia]  # noqa: E741  the papers' letter
-        B[0, 0] = 1.0 / I
-        B[0, N_INPUTS] = 1.0 / I
-        if f.kind == FORCES:
-            B[0, N_INPUTS], B[0, N_INPUTS + 1] = f.car[CAR.front_arm] / I, -f.car[CAR.rear_arm] / I
+def expand(f: FilterRecord, steer: Scalar) -> None:
+    """Build the model of estimated tyres at the present state."""
+    linearise(f, steer)
+    f.felt[f.accel_scale_state] = 0.0
+    build_model(f, f.model_speed, f.turning)
+    i, row = f.accel_row, f.C_fast[f.accel_row]
+    if f.speed > MIN_SPEED:  # the scale's column is what a_y predicts, 0 at standstill
+        specific_force = f.rest_fast[i] + f.D_fast[i, 0] * f.u[0]
+        for k in range(f.n):
+            specific_force += row[k] * f.x[k]
+        row[f.accel_scale_state] = f.felt[f.accel_scale_state] = specific_force
 
 
 @jit
@@ -292,10 +249,11 @@ def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
 def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     """Build the model at a speed, and the noise that grows with 1/V."""
     V = maximum(speed, MIN_SPEED)
-    if f.kind == LATERAL and f.model_speed > 0.0:
-        f.beta_scale *= f.model_speed / V
+    if f.kind == LATERAL:
+        _build_lateral(f, V)
+    elif f.kind == VELOCITY:  # v_x, v_y: double-layer-gps (4)-(5)
+        f.A[0, 1], f.A[1, 0] = turning, -turning
     f.model_speed, f.turning = V, turning
-    _build_continuous(f, V, turning)
     discretise(f)
     first = f.dense - f.delayed
     for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step

@@ -11,7 +11,7 @@ from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
 from .late_samples import BUFFER, DROPPED, find_target, get_direct, is_duplicate
-from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
+from .model import MIN_SPEED, build_model, compute_row_variance, is_finite
 from .predict import advance_state
 from .record import COUNTERS, N_SNAPSHOTS, SNAPSHOT_INTERVAL, WINDOW, FilterRecord, GainTables
 from .update import correct_fast, update_filter
@@ -43,7 +43,6 @@ def store_history(f: FilterRecord) -> None:
     copy_into(f.u, f.past_u[slot])
     copy_into(f.y, f.past_y[slot])
     f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
-    f.past_road_turn[slot] = f.road_turn
     if (f.tick - f.start) % SNAPSHOT_INTERVAL == 0:
         slot = _find_slot(f, f.tick)
         _copy_moments(f.n, f.x, f.P, f.snapshot_x[slot], f.snapshot_P[slot])
@@ -73,8 +72,9 @@ def _has_sample(f: FilterRecord, s: int, captured: int) -> bool:
 @jit
 def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new: bool) -> bool:
     """Use a stored sample; False if it is new and the gate refuses it, now and for ever."""
-    if f.kind == VELOCITY_ROLL:  # its noise comes with each packet
-        copy_into(f.recent_r[place], f.r[s])
+    for i in range(f.rows[s]):  # noise that does not follow the speed can come with the packet
+        f.r[s, i] = f.recent_r[place, i]
+        f.r[s, i] = compute_row_variance(f, s, i, f.model_speed)
     copy_into(f.recent[place], f.sample)
     passed = update_filter(f, gains, s, get_direct(), is_new)
     if not passed:

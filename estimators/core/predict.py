@@ -13,13 +13,12 @@ from .intersample import predict_error
 from .late_samples import predict_late
 from .model import (
     BETA,
-    KINEMATIC,
     MIN_SPEED,
     SPEED_TOLERANCE,
-    VELOCITY_ROLL,
+    VELOCITY,
     build_model,
+    expand,
     is_finite,
-    linearise,
 )
 from .record import COUNTERS, N_SLOW, FilterRecord
 
@@ -69,11 +68,8 @@ def _find_cell(f: FilterRecord, speed: float) -> int:
 @jit
 def find_next_cell(f: FilterRecord, fast_row: Vector) -> Scalar:
     """Find the index of the table of gains that the next row will use."""
-    if f.measured == 1:
-        speed = _filter_speed(f, fast_row)
-        if is_speed_changed(speed, f.model_speed):
-            return _find_cell(f, speed)
-    return f.cell
+    speed = _filter_speed(f, fast_row)
+    return _find_cell(f, speed) if is_speed_changed(speed, f.model_speed) else f.cell
 
 
 @jit
@@ -99,14 +95,13 @@ def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
     for i in range(f.fasts):
         f.y[i] = compute_signal(fast_row, f.y_column[i], f.y_factor[i])
     turning, f.speed_before = f.turning, f.model_speed
-    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(fast_row[FAST.gyro]):
+    if f.kind == VELOCITY and is_finite(fast_row[FAST.gyro]):
         turning = fast_row[FAST.gyro]
-    is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
-    if f.measured == 1:
-        f.speed = _filter_speed(f, fast_row)
-        if is_speed_changed(f.speed, f.model_speed):
-            is_outdated, speed = True, f.speed
-            f.cell = _find_cell(f, f.speed)
+    is_outdated, speed = turning != f.turning, f.model_speed
+    f.speed = _filter_speed(f, fast_row)
+    if is_speed_changed(f.speed, f.model_speed):
+        is_outdated, speed = True, f.speed
+        f.cell = _find_cell(f, f.speed)
     if is_outdated:
         build_model(f, speed, turning)
 
@@ -120,10 +115,7 @@ def propagate(f: FilterRecord, u: Vector) -> None:
         total = load8(f.x, j)
         for k in range(f.inputs):
             total = total + load_element(u, k) * load8(f.HT, k, j)
-        store8(f.x, total, j)
-    if f.tyres > 0:
-        for j in range(0, f.n, step):
-            store8(f.x, load8(f.x, j) + load8(f.drift, j), j)
+        store8(f.x, total + load8(f.drift, j), j)
     if f.periodic == 0:
         predict_covariance(f)
 
@@ -148,17 +140,8 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
     """Predict by the present model, and what else is carried along."""
     if f.beta_scale != 1.0:
         _scale_beta(f)
-    if f.tyres > 0 and f.tick % f.linearise_every == 0:
-        linearise(f, u[0])
-        build_model(f, f.model_speed, f.turning)
-        if f.accel_scale_state > 0:  # its column is what a_y predicts, 0 at standstill
-            row = f.C_fast[f.accel_row]
-            row[f.accel_scale_state] = 0.0
-            if f.speed > MIN_SPEED:
-                specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
-                for k in range(f.n):
-                    specific_force += row[k] * f.x[k]
-                row[f.accel_scale_state] = specific_force
+    if f.tyre_states > 0 and f.tick % f.linearise_every == 0:
+        expand(f, u[0])
     propagate(f, u)
     predict_error(f)
     predict_late(f)

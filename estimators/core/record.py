@@ -2,8 +2,10 @@
 
 A copy is a complete snapshot. Sizes are fixed, so every filter runs on the same compiled code; the
 codes `kind`, `delay_rule`, `intersample_rule` and `periodic` say which fields are used.
-`design.assemble` writes what options and vehicle decide, `reset_filters` and the ticks the rest. A
-missing place is 0 where place 0 is always taken, else -1.
+`design.assemble` writes what options and vehicle decide, `reset_filters` and the ticks the rest.
+
+What a model lacks takes no branch: its coefficients are 0 and its state stands at SPARE. Rows and
+columns of that place in A, B, C and Q are written as all others are, and lie behind those in use.
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +18,7 @@ from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
 N_CORE = 24  # states of a model; in whole eights, as `N_TOTAL`
+SPARE = N_CORE - 2  # the place, with the one behind it, of states that a model lacks
 N_INPUTS = 4  # inputs that drive a model
 N_FAST = 3  # measurements of a fast row
 N_DRIVERS = N_CORE + 8  # columns of B: inputs, then disturbances
@@ -71,22 +74,28 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("dense", _INT),
     ("delayed", _INT),  # the last dense states that lag behind what the camera sees
     ("total", _INT),  # states and clones
-    ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
-    ("pushed", _INT, (N_CORE,)),  # the state that each state behind the dense ones pushes; -1: none
-    ("bank_state", _INT),  # the road's bank, counted from the last dense state; -1: none
-    ("steer_offset_state", _INT),  # 0: none
-    ("map_heading_state", _INT),  # error of the map's heading; 0: none
+    ("first_bias", _INT),  # the first state that nothing drives but noise
+    ("planar", _INT),  # states of a bicycle that does not roll, of beta, gamma, psi, y_l
+    # beta' by the first disturbance d: (push_rate + push_force / (M V)) d
+    ("push_rate", _FLOAT),
+    ("push_force", _FLOAT),
+    ("bank_state", _INT),  # the road's bank
+    ("steer_offset_state", _INT),
+    ("offset_share", _FLOAT),  # 1: the measured steering angle has the offset in it
+    ("map_heading_state", _INT),  # error of the map's heading
+    ("curved_state", _INT),  # y_l where sin(course) is not taken for the course
     ("map_lag", _FLOAT),  # s, deviation of the time by which the road's curvature is late
-    ("roll_state", _INT),  # a bicycle's phi, followed by phi_rate; 0: it does not roll
+    ("phi_state", _INT),  # a bicycle's phi, followed by phi_rate
     ("car", _FLOAT, (len(CarIndex._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
     ("roll_damping", _FLOAT),  # C_x / I_x
-    ("roll_arm", _FLOAT),  # M_s h_s / I_x
+    ("roll_arm", _FLOAT),  # M_s h_s / I_x; 0: it does not roll
     ("sway", _FLOAT),  # m, M_s h_s / M
     ("preview", _FLOAT),  # m
     # tyres that are estimated: `car` has their slopes by slip at the present state
-    ("tyres", _INT),  # where the factors of front and rear stiffness stand; 0: they are known
-    ("inverse_friction", _INT),  # state 1 / friction; 0: tyres without a limit
+    ("tyre_states", _INT),  # factors of front and rear stiffness, then 1/friction; 0: known tyres
+    ("tyres", _INT),  # where they begin
+    ("tyre", _FLOAT, (3,)),  # what they are; without 1/friction that is 0, tyres without a limit
     ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("force_slopes", _FLOAT, (2, 2)),  # N, of each axle's force: by its factor, by 1/friction
@@ -98,7 +107,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("q_share", _FLOAT, (2,)),  # fractions of their variances that come in a step
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # fraction by which the delayed states follow in a step
-    ("A", _FLOAT, (N_CORE, N_CORE)),
+    ("A", _FLOAT, (N_CORE, N_CORE)),  # `build_model` writes what speed and yaw rate change
     ("B", _FLOAT, (N_CORE, N_DRIVERS)),  # inputs, then disturbances
     ("push", _FLOAT, (N_CORE,)),  # what `rest` adds to dx
     ("G", _FLOAT, (N_CORE, N_CORE)),  # tie-vision (9), rows of the dense states
@@ -111,7 +120,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("Q", _FLOAT, (N_CORE, N_CORE)),  # process noise of one step
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
-    ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
+    ("speed_share", _FLOAT),  # 1: the first state is v_x, which starts at the measured speed
     # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
@@ -123,8 +132,9 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("y_factor", _FLOAT, (N_FAST, 2)),
     ("C_fast", _FLOAT, (N_FAST, N_CORE)),
     ("D_fast", _FLOAT, (N_FAST, N_INPUTS)),
-    ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
-    ("accel_scale_state", _INT),  # 0: none
+    ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; without one the last row
+    ("accel_scale_state", _INT),
+    ("felt", _FLOAT, (N_CORE,)),  # what a_y has of each state besides V (beta' + gamma)
     ("rest_fast", _FLOAT, (N_FAST,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (N_FAST,)),  # variances of the fast measurements
     ("r_nominal", _FLOAT, (N_FAST,)),  # configured variances, the least that may be found
@@ -164,7 +174,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; 0: it has none
-    ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
+    ("stored", _INT),  # states whose predictions are stored; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains
     ("periodic", _INT),
@@ -178,12 +188,12 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # C^+ transposed; PSEUDO, not periodic
     # speed
     ("measured", _INT),  # 1: from the wheels, 0: fixed
-    ("smoothing", _FLOAT),  # weight of a new sample in the low-pass
+    ("smoothing", _FLOAT),  # weight of a new sample in the low-pass; 0: fixed
     ("speed", _FLOAT),  # m/s, low-passed
     ("model_speed", _FLOAT),  # m/s, speed of the present model
     ("beta_scale", _FLOAT),  # old speed over new, by which beta = v_y / V is scaled before a step
     ("speed_before", _FLOAT),  # m/s, speed of the model at the row before
-    ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
+    ("turning", _FLOAT),  # rad/s, the present model's yaw rate; VELOCITY
     ("cell", _INT),  # the present table of gains
     ("missing_cell", _INT),  # the table that is missing; -1: none
     # state of the filter now
@@ -239,13 +249,13 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("e_seen", _FLOAT, (N_FAST,)),  # C G e of the fast rows
 ]
 _WINDOW = [  # history: of tick k in row k % WINDOW
-    ("predicted", _FLOAT, (WINDOW, N_CORE)),  # states; `store_predictions`
+    ("predicted", _FLOAT, (WINDOW, N_CORE)),  # the first `stored` states
+    ("past_road_turn", _FLOAT, (WINDOW,)),  # rad
     # the rest: BUFFER
     ("past_u", _FLOAT, (WINDOW, N_INPUTS)),
     ("past_y", _FLOAT, (WINDOW, N_FAST)),
     ("past_speed", _FLOAT, (WINDOW,)),  # m/s, speed of the model
     ("past_turning", _FLOAT, (WINDOW,)),
-    ("past_road_turn", _FLOAT, (WINDOW,)),  # rad; also where `store_predictions`
     # the last snapshot is "now", while the past is redone
     ("snapshot_x", _FLOAT, (N_SNAPSHOTS + 1, N_CORE)),
     ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),

@@ -13,7 +13,7 @@ from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import late_samples as rule
 from ..core import record as size
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
+from ..core.model import MIN_SPEED, VELOCITY, Y_L
 from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
 from .gains import kalman_gain
 from .options import LATE, MEASUREMENTS, SCALE, TYRES, WANDER, FilterConfig, FilterModel
@@ -112,8 +112,8 @@ def assemble(
     for f, model in zip(layers, config.models, strict=True):
         _write_clocks(f, config, dt)
         n, f.step = len(model.names), f.stride * dt
-        too_many = f"{n} states are more than the {size.N_CORE} of a filter: {model.names}"
-        _refuse(config.name, (n > size.N_CORE, too_many))
+        too_many = f"{n} states are more than the {size.SPARE} of a filter: {model.names}"
+        _refuse(config.name, (n > size.SPARE, too_many))
         block = slice(first, first + n)
         _write_model(f, model, vehicle, config, config.Q[block, block] * f.step)
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
@@ -124,7 +124,7 @@ def assemble(
                 f.decay[i], f.Q[i, i] = decay, (1.0 - decay * decay) * f.prior[i, i]
         _allocate_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
-        f.smoothing = 1.0 - math.exp(-dt / _SMOOTHING_TIME)
+        f.smoothing = 1.0 - math.exp(-dt / _SMOOTHING_TIME) if f.measured else 0.0
         _write_trust(f, config)
         first += n
     planned = _make_schedules(layers[0], config, dt)
@@ -132,7 +132,6 @@ def assemble(
         f.assumed = layers[0].assumed
         _write_rules(f, config, planned)
         _check_window(f, config)
-    layers[0].store_predictions |= len(layers) > 1
     return layers, planned
 
 
@@ -163,7 +162,7 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
         from scipy.special import gammaincinv  # chi-square's quantiles: scipy.stats loads long
 
         f.gate[1:] = 2.0 * gammaincinv(0.5 * np.arange(1, size.N_ROWS + 1), config.gate)
-    knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
+    knots = () if f.r_speed > 0.0 else config.hdop_table  # of a second layer: the first applies it
     f.knots = len(knots)
     for i, (hdop, factor) in enumerate(knots):
         f.hdop[i], f.hdop_factor[i] = hdop, factor
@@ -176,55 +175,65 @@ def _write_model(
     names, dense = model.names, len(model.states) + len(model.late)
     n = len(names)
     f.kind, f.n, f.total, f.dense, f.delayed = model.kind, n, n, dense, len(model.late)
-    f.forces = int(model.forces)
-    for j, (_, pushed) in enumerate(model.disturbances):
-        f.pushed[j] = names.index(pushed)
-    f.pushed[n - len(model.biases) - dense : n - dense] = -1
-    f.bank_state = names.index("bank") - dense if "bank" in model.biases else -1
-    f.steer_offset_state = names.index("steer_offset") if "steer_offset" in model.biases else 0
-    f.map_heading_state = names.index("map_heading") if "map_heading" in model.biases else 0
-    f.roll_state = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
+    f.first_bias = n - len(model.biases)
+    for state in ("bank", "phi", "steer_offset", "map_heading", SCALE):
+        f[f"{state}_state"] = names.index(state) if state in names else size.SPARE
+    f.offset_share, f.speed_share = "steer_offset" in names, "v_x" in names
     f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
-    body = make_roll_model(vehicle)
-    f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
-    f.sway = vehicle.roll_moment_arm / vehicle.mass
-    f.preview, f.Q[:n, :n], f.decay[:] = vehicle.preview, Q, 1.0
+    f.Q[:n, :n], f.decay[:] = Q, 1.0
+    _write_constants(f, model, vehicle)
     if model.forces:  # exact discretisation of the process
-        force_sd, moment_sd = config.force_sd, config.moment_sd
         weight, arm = vehicle.mass * GRAVITY, 0.5 * (vehicle.front_arm + vehicle.rear_arm)
-        if config.force_share > 0.0:
-            force_sd = math.hypot(force_sd, config.force_share * weight)
-        if config.moment_share > 0.0:
-            moment_sd = math.hypot(moment_sd, config.moment_share * weight * arm)
+        force_sd = math.hypot(config.force_sd, config.force_share * weight)
+        moment_sd = math.hypot(config.moment_sd, config.moment_share * weight * arm)
         times = config.disturbance_time, config.moment_time or config.disturbance_time
         decay = np.array([math.exp(-f.step / time) for time in times])
         both = range(dense, dense + 2)
         f.decay[both], f.q_share[:] = decay, 1.0 - decay * decay
         f.Q[both, both] += f.q_share * np.square([force_sd, moment_sd])
         f.q_nominal[:] = f.Q[both, both]
-    f.speed_state = names.index("v_x") if "v_x" in names else -1
+        f.B[1, size.N_INPUTS + 1] = 1.0 / vehicle.yaw_inertia
     _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, config.noise)
     _write_rows(f, model, config)
 
 
+def _write_constants(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
+    """Write the entries of A and B that `build_model` leaves, and what it makes the others of."""
+    names, inertia, phi, behind = model.names, vehicle.yaw_inertia, int(f.phi_state), size.N_INPUTS
+    body, rolls = make_roll_model(vehicle), "phi" in names
+    for j, (_, pushed) in enumerate(model.disturbances):
+        f.B[names.index(pushed), behind + j] = 1.0
+    f.planar, f.preview = len(model.states) - 2 * rolls, vehicle.preview
+    f.push_rate, f.push_force = f.B[0, behind], model.forces
+    f.roll_stiffness, f.roll_damping = -body.A[1, 0], -body.A[1, 1]
+    f.roll_arm, f.sway = rolls * body.B[1, 0], rolls * vehicle.roll_moment_arm / vehicle.mass
+    f.A[phi : phi + 2, phi : phi + 2] = body.A
+    if "accel_y" in model.inputs:
+        f.B[phi + 1, model.inputs.index("accel_y")] = body.B[1, 0]
+    if "v_x" in names:
+        f.B[0, 0], f.B[1, 1], f.A[1, phi] = 1.0, 1.0, -GRAVITY  # double-layer-gps (5)
+    if model.inputs == ("N_z",):
+        f.B[0, 0] = f.B[0, behind] = 1.0 / inertia
+    if "F_yf" in names:
+        f.B[0, behind : behind + 2] = np.array([vehicle.front_arm, -vehicle.rear_arm]) / inertia
+
+
 def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     """Write where the tyres' states stand and start: at the nominal ones."""
     names = model.names
+    f.curved_state = Y_L if {TYRES[0], "map_heading"} <= {*names} else size.SPARE
     if TYRES[0] not in names:
         return
-    f.tyres = names.index(TYRES[0])
-    f.inverse_friction = names.index(TYRES[2]) if TYRES[2] in names else 0
+    f.tyre_states, f.tyres = len({*TYRES} & {*names}), names.index(TYRES[0])
     f.linearise_every = max(1, round(_EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])
     f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
-    f.first[f.tyres : f.tyres + 2] = 1.0
-    f.q_tyres[:2] = np.diag(f.Q)[f.tyres : f.tyres + 2]
-    if f.inverse_friction:
-        f.q_tyres[2] = f.Q[f.inverse_friction, f.inverse_friction]
-        f.first[f.inverse_friction] = 1.0 / vehicle.friction
+    places = slice(f.tyres, f.tyres + f.tyre_states)
+    f.first[places] = (1.0, 1.0, 1.0 / vehicle.friction)[: f.tyre_states]
+    f.q_tyres[: f.tyre_states] = np.diag(f.Q)[places]
 
 
 def _make_signals(vehicle: Vehicle) -> dict[str, tuple[tuple[int, float], tuple[int, float]]]:
@@ -251,13 +260,13 @@ def _write_signals(
         f.r_fast[i] = noise[name] ** 2
         if name in measured_state:
             f.C_fast[i, names.index(measured_state[name])] = 1.0
-    f.accel_scale_state = names.index(SCALE) if SCALE in model.biases else 0
     for bias in WANDER.keys() & model.biases:
         if WANDER[bias] in model.fast:
             f.C_fast[model.fast.index(WANDER[bias]), names.index(bias)] = 1.0
-    if model.kind == LATERAL and "accel_y" in model.fast:
-        f.accel_row = model.fast.index("accel_y")
-    if model.kind == FORCES:  # m a_y = F_yf + F_yr
+    f.accel_row = model.fast.index("accel_y") if "accel_y" in model.fast else size.N_FAST - 1
+    f.felt[:] = f.C_fast[f.accel_row]
+    f.felt[f.phi_state] = GRAVITY
+    if "F_yf" in names:  # m a_y = F_yf + F_yr
         f.C_fast[1, 1] = f.C_fast[1, 2] = 1.0 / vehicle.mass
 
 
@@ -265,7 +274,7 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
     """Write what the used slow sensors measure."""
     used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
     f.first_slow = used[0] if used else -1
-    is_second_layer = model.kind == VELOCITY_ROLL
+    is_second_layer = model is not config.models[0]
     for s in used:
         name = SLOW_NAMES[s]
         sensor = MEASUREMENTS[name]
@@ -281,10 +290,8 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
             for state in row.states:
                 late = LATE.get(state)
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
-        if name == "camera" and "camera_yaw" in model.biases:  # it turns about the car, not y_l
-            f.C[s, :2, model.names.index("camera_yaw")] = 1.0, f.preview
-        if name == "camera" and f.map_heading_state > 0:
-            f.C[s, :2, f.map_heading_state] = 1.0, f.preview
+        for bias in {"camera_yaw", "map_heading"} & {*model.biases} if name == "camera" else ():
+            f.C[s, :2, model.names.index(bias)] = 1.0, f.preview  # they turn about the car, not y_l
         if is_second_layer:
             f.r_speed = f.r[s, 0]
 
@@ -323,7 +330,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     f.intersample_rule = PSEUDO if pseudo else DUAL_RATE if shared else NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
-    f.store_predictions = f.delay_rule in (rule.STORED, rule.CONSTANT)
+    f.stored = f.n if f.delay_rule in (rule.STORED, rule.CONSTANT) or config.row.second else 0
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
@@ -352,7 +359,7 @@ def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
         return True
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
-    if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
+    if f.kind == VELOCITY or config.row.second:
         impossible = "its model changes with the yaw rate"
     elif f.intersample_rule == PSEUDO:
         early = f"a sample must arrive before the next one is captured, got {config.sensors}"

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ...envs.record import FAST, Array
 from ...envs.sensors.link import SlowSensor
 from ..core.late_samples import RULES
-from ..core.model import FORCES, KINEMATIC, ROLL, VELOCITY_ROLL, YAW
+from ..core.model import FIXED, VELOCITY
 from ..filters import FilterDefinition
 from .gains import INVERSES
 
@@ -133,18 +133,18 @@ says what they are. The tyres' count too: factors of stiffness, and the reciproc
 NONLINEAR = (*TYRES, SCALE)
 
 MODELS: dict[str, FilterModel] = {
-    "roll": FilterModel(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
-    "kinematic": FilterModel(KINEMATIC, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
+    "roll": FilterModel(FIXED, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
+    "kinematic": FilterModel(VELOCITY, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
     "velocity-roll": FilterModel(
-        VELOCITY_ROLL,
+        VELOCITY,
         ("v_x", "v_y", "phi", "phi_rate"),
         ("accel_x", "accel_y"),
         ("roll_rate",),
         (("d", "phi_rate"),),
     ),
-    "yaw-moment": FilterModel(YAW, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
+    "yaw-moment": FilterModel(FIXED, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
     "tyre-forces": FilterModel(
-        FORCES, ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
+        FIXED, ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
     ),
 }
 """Models other than the bicycle's, by name."""

@@ -136,7 +136,7 @@ def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> Fil
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.intersample_rule = 0
     copy.pace = 1 if f.stride > 1 else f.pace
-    copy.stride, copy.speed = 1, speed
+    copy.stride, copy.speed, copy.smoothing = 1, speed, 0.0
     copy.delay_rule = CLONE if f.delay_rule == CLONE else IGNORE
     copy.frames[:] = f.frames * (f.delay_rule == CLONE)  # other rules have no clones
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
@@ -149,9 +149,8 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
     """Design the table of gains (rows, columns) of a filter at a speed (m/s)."""
     filters = _copy_for_schedule(f, schedule, speed)
     copy = filters.view(np.recarray)[0]
-    for i in range(int(f.dense), int(f.n)):  # a bias that never moves has no settled gain
-        if f.pushed[i - f.dense] < 0:
-            copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
+    for i in range(int(f.first_bias), int(f.n)):  # a bias that never moves has no settled gain
+        copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
     s = int(f.first_slow)
     table = np.zeros(_compute_table_shape(f, schedule))
     table[0, 0] = 1.0
@@ -271,7 +270,7 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
     g.intersample_rule, g.periodic = f.intersample_rule, 1
     g.joint = int(f.joint or f.intersample_rule == PSEUDO)
     latest, g.heading_fix[:] = max(lags, default=0), 0
-    g.assumed, g.spacing, g.recovery_count, g.speed_state = latest, 0.0, 0, -1
+    g.assumed, g.spacing, g.recovery_count, g.speed_share = latest, 0.0, 0, 0.0
     reset_filters(filters, 0)
     start = (latest // cycle + 1) * cycle  # until then the first samples arrive
     captured = np.arange(0, start + cycle, period) if lags else np.zeros(0)

@@ -24,7 +24,7 @@ from ...envs.task import ObservationEntry
 from ..core.filter import Observed, OutputTable, StepRecord
 from ..core.intersample import NONE
 from ..core.late_samples import CLONE, CONSTANT, IGNORE, STORED
-from ..core.model import KINEMATIC, VELOCITY_ROLL
+from ..core.model import VELOCITY
 from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
 from ..estimator import Estimator
 from ..filters import FILTERS
@@ -64,8 +64,8 @@ _SCALARS = (
 # packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
 _SHAPE = (  # what the filters of a block share
-    *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
-    *("store_predictions", "tyres", "robust", "u_column", "y_column"),
+    *("n", "dense", "total", "inputs", "fasts", "periodic", "measured", "cycle"),
+    *("stored", "robust", "u_column", "y_column"),
 )
 _FIELDS = (
     [
@@ -85,7 +85,7 @@ def _read_shape(layers: FilterRecords) -> _Shape:
     # lanes compute models that change by speed alone, of which every tick predicts and corrects
     # without rules between samples, and store nothing of the past but predictions
     f = layers[0]
-    is_steady = f.tyres == 0 and f.kind not in (KINEMATIC, VELOCITY_ROLL)
+    is_steady = f.tyre_states == 0 and f.kind != VELOCITY
     is_plain = f.stride == f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
     has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
     is_small = f.delay_rule in (CLONE, IGNORE, STORED, CONSTANT) and f.total <= _MAX_STATES

@@ -17,7 +17,7 @@ from ...envs.record import FAST, PACKET, Array
 from ..core.covariance import correct_scalar, project
 from ..core.filter import Observed, StepRecord, observe, run_tick
 from ..core.late_samples import store_due_captures
-from ..core.model import CURVATURE, LATERAL, is_finite
+from ..core.model import CURVATURE, is_finite
 from ..core.packets import process_packet
 from ..core.predict import (
     compute_residual,
@@ -230,19 +230,19 @@ def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> No
     store_element(b.speed, speed)
     for k in range(b.inputs):
         store_element(b.u, load_element(b.u_new, k), k)
-    if b.kind == LATERAL and b.inputs > CURVATURE:
+    if b.inputs > CURVATURE:
         turn = load_element(b.model_speed) * load_element(b.u, CURVATURE) * load_element(b.step)
         store_element(b.road_turn, load_element(b.road_turn) + turn)
     propagate(b, b.u)
     for lane in range(count_lanes()):
         b.tick[lane] += 1
         b.at[lane] = b.at[lane] + 1 if b.at[lane] + 1 < b.cycle else 0
-    if b.store_predictions == 1:
+    if b.stored > 0:
         for lane in range(count_lanes()):
             if b.here[lane] == 1.0 and b.apart[lane] == 0.0:
                 f, slot = bank.filters[first + lane, 0], b.tick[lane] % WINDOW
                 f.past_road_turn[slot] = b.road_turn[lane]
-                for i in range(b.n):
+                for i in range(b.stored):
                     f.predicted[slot, i] = b.x[i, lane]
     if b.periodic == 1:
         _gather_gains(b, first, bank)

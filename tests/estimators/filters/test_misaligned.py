@@ -36,7 +36,7 @@ def test_an_estimated_tyre_s_model_is_the_force_at_the_angle_less_the_offset() -
     def rates(offset: float) -> Any:
         turn = 0.3 / 7.0
         slips = (steer - offset - 0.02 - COMS.front_arm * turn, COMS.rear_arm * turn - 0.02)
-        inverse_friction = f.x[f.inverse_friction]
+        inverse_friction = f.x[f.tyres + 2]
         front, rear = (
             _compute_axle_force(f.stiffness[i], f.load[i], slips[i], 1.0, inverse_friction)[0]
             for i in range(2)
