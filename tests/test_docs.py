@@ -33,6 +33,7 @@ MOST_FILES = {
     "delay rule": 1,
     "controller": 2,
     "policy": 0,
+    "network kind": 1,
     "scenario": 1,
     "metric": 2,
     "study": 2,

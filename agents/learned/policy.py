@@ -23,13 +23,14 @@ from ... import __version__
 from ...envs.io import check_types, from_json, write_atomic
 from ...envs.record import Array
 from ...envs.scenarios.world import WORLD_VERSION
-from ...envs.validation import describe_unknown
+from ...envs.validation import check_choice, describe_unknown
 from ...estimators.make import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env
-from .network import CELL_WEIGHTS, MemoryLayer, MovingAverages, Network, RecurrentCell, Tensors
+from .layers import MEMORY_LAYERS, MemoryLayer
 from .network import SUFFIX as SUFFIX
+from .network import Network, Tensors
 
 FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
 MAX_BYTES = 2**26  # a larger file is not opened, which bounds the tensors' sizes too
@@ -285,12 +286,12 @@ def _build_network(fields: Any, tensors: Tensors) -> Network:
     return network
 
 
-def _build_cell(prefix: str, kind: str, _: int, *traces: Any, unused: Tensors) -> MemoryLayer:
-    """Build a cell of its tensors, which are taken out of `unused`."""
-    is_average = kind == MovingAverages.kind
-    parts = MovingAverages.parts if is_average else CELL_WEIGHTS
-    arrays: list[Any] = [unused.pop(prefix + part) for part in parts]
-    return MovingAverages(*arrays, *traces) if is_average else RecurrentCell(kind, *arrays)
+def _build_cell(prefix: str, kind: str, _: int, *fields: Any, unused: Tensors) -> MemoryLayer:
+    """Build a memory layer of its tensors, which are taken out of `unused`."""
+    check_choice("cell", kind, MEMORY_LAYERS)
+    layer: Any = MEMORY_LAYERS[kind]
+    built: MemoryLayer = layer(*(unused.pop(prefix + name) for name in layer.arrays), *fields)
+    return built
 
 
 class PolicyController(Controller):

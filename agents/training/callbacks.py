@@ -36,7 +36,7 @@ with require_extra("train", "training needs {}"):
     from stable_baselines3.common.utils import get_device, get_latest_run_id
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
-POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
+POLICY, BEST, INITIAL_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 EVALUATIONS = "evaluations.npz"  # in a folder of rl-baselines3-zoo
 _ZOO_WRAPPER = "sideslip.estimators.EstimateObservation"
 _FORMAT = 3  # of a checkpoint

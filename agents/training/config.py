@@ -13,7 +13,7 @@ import inspect
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-WARM_START_ENTRY = "begun"  # the entry of training a policy further
+INITIAL_ENTRY = "begun"  # the entry of training a policy further
 PERIOD = 0.01  # s, control period for which the files give `gamma`
 
 # Seeds of tests and of the calibration are below 2^63, those of `distill` beyond.
@@ -266,23 +266,23 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
         task_fields["estimator"] = card.estimator
         task_fields["estimator_options"] = dict(card.estimator_options)
     algo = fields.get("algo", "ppo")
-    settings = fields.pop("settings", None) or _read_settings(algo, WARM_START_ENTRY)
+    settings = fields.pop("settings", None) or _read_settings(algo, INITIAL_ENTRY)
     task_fields["settings"] = _add_policy_form(settings, policy, algo)
     return TrainingTask(**task_fields | fields)
 
 
-def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: object) -> Settings:
+def resolve_settings(file: str | Path | None, algo: str, env_id: str, initial: object) -> Settings:
     """Resolve the settings of an environment, or of training a policy further.
 
     Args:
         file: File of settings; None: the package's own.
         algo: Name of the algorithm.
         env_id: Id of the env.
-        start: Policy to train further, or anything else for a new training.
+        initial: Policy to train further, or anything else for a new training.
     """
-    if not isinstance(start, Policy):
+    if not isinstance(initial, Policy):
         return _read_settings(algo, env_id, file)
-    return _add_policy_form(_read_settings(algo, WARM_START_ENTRY, file), start, algo)
+    return _add_policy_form(_read_settings(algo, INITIAL_ENTRY, file), initial, algo)
 
 
 def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
@@ -308,3 +308,42 @@ def get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     if network.activation != "silu":
         raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
     return {"net_arch": list(network.hidden), "cells": network.cells[0].size}
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """The configuration of a student and its training.
+
+    The auxiliary loss is that of the teacher's inputs that a student with memory does not see:
+    squared errors in standard deviations, where the loss of zero actions counts 1.
+    Raises ValueError for a number out of range, cells beside traces, or `told` without memory.
+    """
+
+    rounds: int = 7  # of driving and learning; in the first one the teacher drives
+    epochs: int = 12  # over all drives in a round; in the last one three times as many
+    cells: int = 0  # of a GRU, 0 for none
+    hidden: tuple[int, ...] = (64, 64)  # sizes of the dense layers
+    learning_rate: float = 3e-3  # of Adam, which falls to a fiftieth in each round
+    noise: float = 0.02  # largest standard deviation of the noise on the teacher's actions
+    seed: int = 0  # of weights and episodes
+    batch: int = 16  # episodes of a batch, for a student with memory
+    auxiliary_weight: float = 0.0  # weight of predicting the teacher's inputs it cannot see
+    traces: int = 0  # SiLU units in front of the moving averages; 0: no averages
+
+    def __post_init__(self) -> None:
+        sizes = self.rounds, self.epochs, self.batch, *self.hidden
+        if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
+            rule = "rounds, epochs and sizes are 1 at least, cells, traces and seed 0"
+            raise ValueError(f"{rule}: {self}")
+        if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.auxiliary_weight >= 0.0):
+            raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
+        if self.cells and self.traces:
+            raise ValueError(f"a student has cells or traces, got {self.cells} and {self.traces}")
+        if self.auxiliary_weight and not (self.cells or self.traces):
+            raise ValueError("a student without memory has nothing to say: told is for those with")
+
+    def describe(self) -> dict[str, object]:
+        """Collect all numbers but the seed, in JSON types; cards call `auxiliary_weight` told."""
+        numbers = asdict(self) | {"hidden": list(self.hidden)}
+        numbers["told"] = numbers.pop("auxiliary_weight")
+        return {name: value for name, value in numbers.items() if name != "seed"}

@@ -7,6 +7,7 @@ the cost of the rest of the drive, by the Riccati matrix of the teacher's design
 the episode: the score's logarithm, linearised.
 """
 
+import functools
 import itertools
 import sys
 import time
@@ -16,23 +17,58 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from ...envs.record import Array
+from ...envs.task import ObservationEntry
 from ..controllers.lqr import Lqr
+from ..learned.layers import MovingAverages
+from ..learned.network import Network
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from .student import Demonstrations, DistillConfig, Scaling, Student, compute_scale, compute_scaling
+from .config import DistillConfig
+from .export import convert_cells, mix_inputs
+from .normalise import Single, Standardisation, compute_scale, compute_whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
 from torch.nn.utils.rnn import pad_sequence  # isort: skip
 
-_Drives = Sequence[Demonstrations]
 _DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`
 _SEEDS_PER_TRAINING = 2**40
 _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
 _WINDOW = 50  # steps through which the gradient goes back in time, but for traces
 _SAMPLES = 512  # steps of a batch of a student without memory
 _LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
+_CLIP = 8.0  # limit of a normalised input (standard deviations)
+_UNREAD = ("gps_X", "gps_Y", "gps_satellites")  # without information for control
+# Beginnings of entries that a filter has read: behind it they would only shake the action.
+_FILTERED = ("gyro", "accel_", "roll_rate", "camera_", "gps_")
+_MIN_TRACE_VARIANCE = 1e-4  # least variance of a mixture of inputs and their averages
+_EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
+_TIMES = (3, 10, 30, 100, 300)  # steps, of 10 ms each: from the motors' lag to half a drive
+_SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
+_BLOCK = 50  # steps whose means are one product of matrices
+_MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
+
+
+class Demonstrations(NamedTuple):
+    """Episodes of a task, oldest step first."""
+
+    obs: Single  # observations, shape (N, T, k)
+    labels: Single  # the teacher's actions, shape (N, T, m)
+    privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
+    weights: Single  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
+    curvature: Single  # S (m, m), of the cost-to-go: an action's error e adds e'S e
+    costs: Array  # costs J, shape (N,)
+
+    @property
+    def is_valid(self) -> npt.NDArray[np.bool_]:
+        """Whether a step counts, shape (N, T)."""
+        return self.weights > 0.0
+
+
+_Drives = Sequence[Demonstrations]
 
 
 class DistillTask(NamedTuple):
@@ -54,7 +90,7 @@ class RoundResult(NamedTuple):
 class _Batch(NamedTuple):
     """B episodes, or a window of T steps of them, as tensors; fields as in `Demonstrations`."""
 
-    inputs: torch.Tensor  # (B, T, k), mixed by `Scaling`
+    inputs: torch.Tensor  # (B, T, k), mixed by a `Standardisation`
     labels: torch.Tensor  # (B, T, m)
     privileged: torch.Tensor  # (B, T, q)
     weights: torch.Tensor  # (B, T)
@@ -112,6 +148,167 @@ def _list_privileged_columns(task: DistillTask) -> list[int]:
     return [names.index(name) for name in task.teacher.needs if name not in known]
 
 
+def _compute_scaling(
+    drives: _Drives, layout: Sequence[ObservationEntry], needs: Sequence[str]
+) -> Standardisation:
+    """Compute the scaling of a student's inputs from drives; needs: what the teacher reads."""
+    # A student that has all of `needs` reads nothing else, which would only be noise to it. One
+    # that has less reads all that varies, but for `_UNREAD` and, behind a filter, what that has
+    # read. An age is scaled by its variation while packets come.
+    x = np.concatenate([demo.obs[demo.is_valid] for demo in drives])
+    names = [entry.name for entry in layout]
+    is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, _UNREAD)
+    if "beta_hat" in names:
+        is_read &= [not x.startswith(_FILTERED) or x.endswith(("_hat", "_std")) for x in names]
+    mean, spread = x.mean(0, np.float64), x.std(0, dtype=np.float64)
+    for i, name in enumerate(names):
+        if name.endswith("_age"):
+            early, median = np.percentile(x[:, i], (_EARLY, _MEDIAN))
+            if median > early:
+                mean[i], spread[i] = median, median - early
+    plain = Standardisation(mean, np.where(is_read, compute_scale(spread), 0.0), _CLIP)
+    return plain._replace(mixing=compute_whitening(plain.transform(x)))
+
+
+class _TraceLayer(nn.Module):
+    """The inputs and SiLU units, with the moving averages of all over some times (steps).
+
+    The inputs and their averages are whitened, by `mean` and `mixing`: small differences of two of
+    them say how a sensor changes.
+    """
+
+    mean: torch.Tensor
+    mixing: torch.Tensor
+
+    def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = _TIMES) -> None:
+        super().__init__()
+        self.inputs, self.times = inputs, tuple(times)
+        self.unit = nn.Linear(inputs, n_silu)
+        n_linear = inputs * (1 + len(self.times))
+        self.register_buffer("mean", torch.zeros(n_linear))
+        self.register_buffer("mixing", torch.eye(n_linear))
+
+    @property
+    def size(self) -> int:
+        """Size of the output: inputs and their averages, then SiLU units and theirs."""
+        return (self.inputs + self.unit.out_features) * (1 + len(self.times))
+
+    def forward(
+        self, z: torch.Tensor, state: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute units and averages (B, T, size) of inputs (B, T, k); episodes begin together."""
+        # the state, which follows, has averages and the steps so far, (B, times, units + 1)
+        u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
+        if state is None:
+            state = u.new_zeros(len(u), len(self.times), u.shape[-1] + 1)
+        first, means, blocks = int(state[0, 0, -1]), state[..., :-1], []
+        for part in torch.split(u, _BLOCK, 1):
+            new, old = _compute_weights(self.times, first, part.shape[1])
+            values = torch.einsum("nts,bsk->bntk", new, part) + old[..., None] * means[:, :, None]
+            blocks.append(values)
+            first, means = first + part.shape[1], values[:, :, -1]
+        all_values = torch.cat([u[:, None], torch.cat(blocks, 2)], 1).transpose(1, 2)
+        linear, silu = (values.flatten(2) for values in all_values.tensor_split([self.inputs], -1))
+        age = means.new_full((*means.shape[:-1], 1), float(first))
+        mixed = (linear - self.mean) @ self.mixing
+        return torch.cat([mixed, silu], -1), torch.cat([means, age], -1)
+
+    def fit_whitening(self, drives: _Drives, scaling: Standardisation) -> None:
+        """Fit the whitening of inputs and their averages on drives."""
+        outputs, size = [], len(self.mean)
+        with torch.no_grad():
+            for demo in drives:
+                linear_part = self(torch.from_numpy(scaling.transform(demo.obs)))[0][..., :size]
+                outputs.append(linear_part[torch.from_numpy(demo.is_valid)][::_SAMPLE_STRIDE])
+        linear = torch.cat(outputs).numpy()
+        self.mean.copy_(torch.from_numpy(linear.mean(0)))
+        self.mixing.copy_(torch.from_numpy(compute_whitening(linear, _MIN_TRACE_VARIANCE)))
+
+    def cell(self, mixing: Array) -> MovingAverages:
+        """Make the runtime's layer for inputs that a mixing (k, k) mixes first."""
+        silu_weights = self.unit.weight.detach().numpy() @ mixing
+        bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
+        weights = np.concatenate([mixing, silu_weights])
+        return MovingAverages(weights, bias, self.unit.out_features, self.times)
+
+    def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
+        """Convert the next layer's weights (m, size) and biases (m,) for the output of `cell`."""
+        # that output is in the order of times, inputs before SiLU units, without whitening
+        size, times = len(self.mean), 1 + len(self.times)
+        linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
+        bias = bias - linear @ self.mean.numpy()
+        parts = [block.reshape(len(bias), times, -1) for block in (linear, weight[:, size:])]
+        return np.concatenate(parts, -1).reshape(len(bias), -1), bias
+
+
+@functools.cache
+def _compute_weights(
+    times: tuple[float, ...], first: int, steps: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
+    # They solve m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share a_t =
+    # max(1 / steps so far, 1 - exp(-1 / time)): u_s has a_s prod (1 - a_r), r = s + 1, ..., t.
+    ages = first + 1.0 + np.arange(steps)
+    shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
+    left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
+    since = left[:, :, None] - left[:, None, :]  # `left`: log of what is left of earlier averages
+    new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
+    new, old = new.astype(np.float32), np.exp(left).astype(np.float32)
+    return torch.from_numpy(new), torch.from_numpy(old)
+
+
+class _Student(nn.Module):
+    """A GRU or moving averages, if there are any, and dense layers, on whitened observations.
+
+    Args:
+        inputs: Number of inputs.
+        width: Entries of an action.
+        config: Configuration of the student.
+        n_privileged: Outputs of the auxiliary head, which serve in training alone.
+    """
+
+    def __init__(
+        self, inputs: int, width: int, config: DistillConfig, n_privileged: int = 0
+    ) -> None:
+        super().__init__()
+        self.cell = nn.GRU(inputs, config.cells, batch_first=True) if config.cells else None
+        self.traces = _TraceLayer(inputs, config.traces) if config.traces else None
+        memory_size = self.traces.size if self.traces else config.cells
+        sizes = [memory_size or inputs, *config.hidden, width]
+        self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        head_inputs = config.cells or sizes[-2] if config.auxiliary_weight else 0
+        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if head_inputs else None
+        self.recurrent = bool(memory_size)
+
+    def forward(
+        self, z: torch.Tensor, state: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Compute actions and auxiliary outputs (B, T, m + q) of inputs (B, T, k); next state."""
+        memory = self.cell or self.traces
+        if memory is not None:
+            z, state = memory(z, state)
+        memory_output = z
+        for layer in self.dense[:-1]:
+            z = nn.functional.silu(layer(z))
+        outputs = [self.dense[-1](z)]
+        if self.auxiliary_head is not None:
+            outputs.append(self.auxiliary_head(memory_output if self.cell else z))
+        return torch.cat(outputs, dim=-1), state
+
+    def network(self, scaling: Standardisation) -> Network:
+        """Convert the student to a network of plain observations without auxiliary outputs."""
+        mean, scale = np.array(scaling.mean), np.array(scaling.scale)
+        mixing = np.eye(len(mean)) if scaling.mixing is None else np.array(scaling.mixing)
+        numbers = [parameter.detach().numpy() for parameter in self.dense.parameters()]
+        weights, biases, cells = numbers[::2], numbers[1::2], convert_cells(self.cell)
+        if self.traces:
+            cells = [self.traces.cell(mixing)]
+            weights[0], biases[0] = self.traces.convert_weights(weights[0], biases[0])
+        else:
+            mix_inputs(cells, weights, mixing)
+        return Network(mean, scale, weights, biases, "silu", clip=scaling.clip, cells=cells)
+
+
 def distill(
     card: Card, tasks: Sequence[DistillTask], config: DistillConfig, path: str | Path,
     report: Callable[[RoundResult], None] = lambda _: None,
@@ -133,10 +330,10 @@ def distill(
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
-    model = Student(len(cars.layout), cars.single_action_space.shape[0], config, n_privileged)
+    model = _Student(len(cars.layout), cars.single_action_space.shape[0], config, n_privileged)
     seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, cars.num_envs)
     policy: Policy | None = None
-    scaling: Scaling | None = None
+    scaling: Standardisation | None = None
     drives, max_costs, steps = list[Demonstrations](), [np.inf] * len(tasks), 0
     for i in range(config.rounds):
         new_drives = []
@@ -146,14 +343,15 @@ def distill(
             new_drives.append(_collect_demonstrations(task, policy, numbers, *limits))
         steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
         if scaling is None:
-            scaling = compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
+            scaling = _compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
             if model.traces is not None:
                 model.traces.fit_whitening(new_drives, scaling)
             max_costs = [float(np.median(demo.costs)) for demo in new_drives]
             privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
-            standard = Scaling(privileged.mean(0), compute_scale(privileged.std(0)))
+            scale = compute_scale(privileged.std(0))
+            standard = Standardisation(privileged.mean(0), scale, _CLIP)
         for demo in new_drives:
-            drives.append(demo._replace(privileged=standard.mix_inputs(demo.privileged)))
+            drives.append(demo._replace(privileged=standard.transform(demo.privileged)))
         epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
         loss = _fit_model(model, drives, scaling, config, epochs)
         cpu_seconds = round(time.process_time() - start_time, 1)
@@ -169,7 +367,7 @@ def distill(
 class _EpisodeBatches:
     """Batches of episodes, cut into windows through which the state is carried."""
 
-    def __init__(self, drives: _Drives, scaling: Scaling, config: DistillConfig) -> None:
+    def __init__(self, drives: _Drives, scaling: Standardisation, config: DistillConfig) -> None:
         self.drives, self.scaling = drives, scaling
         self.batch, self.window = config.batch, sys.maxsize if config.traces else _WINDOW
         self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
@@ -185,7 +383,7 @@ class _EpisodeBatches:
                 for name in ("obs", "labels", "privileged", "weights")
             ]
             parts = [pad_sequence(column, batch_first=True) for column in columns]
-            parts[0] = torch.from_numpy(self.scaling.mix_inputs(parts[0].numpy()))
+            parts[0] = torch.from_numpy(self.scaling.transform(parts[0].numpy()))
             for start in range(0, parts[0].shape[1], self.window):
                 z, y, q, w = (part[:, start : start + self.window] for part in parts)
                 yield _Batch(z, y, q, w, S, start == 0)
@@ -194,12 +392,13 @@ class _EpisodeBatches:
 class _StepBatches:
     """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
 
-    def __init__(self, drives: _Drives, scaling: Scaling, _: DistillConfig) -> None:
+    def __init__(self, drives: _Drives, scaling: Standardisation, _: DistillConfig) -> None:
         parts = []
         for demo in drives:
-            inputs, count = scaling.mix_inputs(demo.obs[demo.is_valid]), int(demo.is_valid.sum())
-            arrays = [x[demo.is_valid] for x in (demo.labels, demo.privileged, demo.weights)]
-            parts.append((inputs, *arrays, np.repeat(demo.curvature[None], count, axis=0)))
+            valid = demo.is_valid
+            inputs = scaling.transform(demo.obs[valid])
+            arrays = [x[valid] for x in (demo.labels, demo.privileged, demo.weights)]
+            parts.append((inputs, *arrays, np.repeat(demo.curvature[None], len(inputs), axis=0)))
         columns = zip(*parts, strict=True)
         self.arrays = [torch.from_numpy(np.concatenate(column)) for column in columns]
         self.n_batches = -(-len(self.arrays[0]) // _SAMPLES)
@@ -211,7 +410,7 @@ class _StepBatches:
 
 
 def _fit_model(
-    model: Any, drives: _Drives, scaling: Scaling, config: DistillConfig, epochs: int
+    model: Any, drives: _Drives, scaling: Standardisation, config: DistillConfig, epochs: int
 ) -> float:
     """Fit a model to drives; return what its errors add to an episode, as a share of its cost."""
     # the mean over the episodes in the last epoch, without the auxiliary loss

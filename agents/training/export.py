@@ -1,4 +1,4 @@
-"""Deterministic actors of stable-baselines3 models and zips as networks and policies without torch.
+"""Torch's layers, and actors of stable-baselines3's models and zips, as networks without torch.
 
 A zip holds pickles, and unpickling runs the code in them. So nothing is read without `trust`, and
 `export_zip` writes a file that is read without it.
@@ -26,7 +26,8 @@ from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_info import AnyEnv, CarEnv, get_env_facts
-from ..learned.network import ACTIVATIONS, SUFFIX, Network, RecurrentCell
+from ..learned.layers import ACTIVATIONS, Gru, Lstm, MemoryLayer, RecurrentLayer
+from ..learned.network import SUFFIX, Network
 from ..learned.policy import Card, Policy, save_policy
 from ..vec_env import get_scales, scale_layout
 from .normalise import Standardised, read_normalisation
@@ -36,11 +37,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy  # i
 from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 from stable_baselines3.common.torch_layers import FlattenExtractor  # isort: skip
 from stable_baselines3.common.vec_env import VecNormalize  # isort: skip
-from torch import Tensor, nn  # isort: skip
+import torch  # isort: skip
+from torch import nn  # isort: skip
 
-# torch's activations by their names in a `Network`
+# torch's activations by their names in a `Network`, and its cells by layers without it
 _KINDS = (nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU)
 TORCH_ACTIVATIONS: dict[str, type[nn.Module]] = dict(zip(ACTIVATIONS, _KINDS, strict=True))
+TORCH_CELLS: dict[type[nn.RNNBase], type[RecurrentLayer]] = {nn.GRU: Gru, nn.LSTM: Lstm}
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
 _NORMALISER = "vecnormalize.pkl"
@@ -68,18 +71,14 @@ def convert_sb3_policy(
     output = activations.pop() if len(activations) == len(weights) else "linear"
     if len(set(activations)) > 1:
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
-    cells = _convert_cells(actor.recurrent)
+    cells = convert_cells(actor.recurrent)
     n_inputs = (cells[0].weight_in if cells else weights[0]).shape[1]
     mean, scale, clip = read_normalisation(normaliser, n_inputs, history)
     if isinstance(actor.extractor, Standardised):
         if clip is not None:
             raise ValueError("the observation is normalised twice: outside and by the network")
         mean, scale, clip = actor.extractor.numbers
-        mixing = _to_array(actor.extractor.mixing).T
-        if cells:
-            cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ mixing)
-        else:
-            weights[0] = weights[0] @ mixing
+        mix_inputs(cells, weights, _to_array(actor.extractor.mixing).T)
     kinds = activations[0] if activations else "tanh", "tanh" if actor.squashed else output
     return Network(mean, scale, weights, biases, *kinds, clip, history, cells)
 
@@ -116,6 +115,9 @@ def _find_actor(policy: Any) -> _Actor:
     _check_known(type(policy))
     if hasattr(policy, "mlp_extractor"):  # on-policy
         layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
+        options = ("bidirectional", "proj_size", "batch_first")
+        if recurrent and (any(getattr(recurrent, x) for x in options) or not recurrent.bias):
+            raise ValueError(f"recurrent layers with further arguments are not known: {recurrent}")
         squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
         return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
     if not hasattr(policy, "actor"):  # a `GruPolicy`
@@ -128,17 +130,53 @@ def _find_actor(policy: Any) -> _Actor:
     return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
 
 
-def _convert_cells(module: nn.RNNBase | None) -> list[RecurrentCell]:
-    """Convert the cells of torch's GRU or LSTM; none for a policy without them."""
+def convert_cells(module: nn.RNNBase | None) -> list[MemoryLayer]:
+    """Convert the cells of a module of `TORCH_CELLS`; none for None.
+
+    Args:
+        module: Module, one direction of plain cells.
+    """
     if module is None:
         return []
-    if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
-        raise ValueError(f"recurrent layers with further arguments are not known: {module}")
-    layers = [map(_to_array, weights) for weights in module.all_weights]  # as `CELL_WEIGHTS`
-    return [RecurrentCell(module.mode.lower(), *arrays) for arrays in layers]
+    cell = TORCH_CELLS[type(module)]
+    return [cell(*map(_to_array, weights)) for weights in module.all_weights]
 
 
-def _to_array(parameter: Tensor) -> Array:
+def mix_inputs(cells: list[MemoryLayer], weights: list[Array], mixing: Array) -> None:
+    """Mix the inputs of a network's first layer.
+
+    Args:
+        cells: Memory layers, of which the first one is replaced, if any.
+        weights: Weights of the dense layers, of which the first ones are replaced otherwise.
+        mixing: Mixing, shape (inputs, inputs).
+    """
+    if cells:
+        cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ mixing)
+    else:
+        weights[0] = weights[0] @ mixing
+
+
+def load_network(policy: BasePolicy, network: Network) -> None:
+    """Load a network's weights into an actor of the same form, whose extractor stays.
+
+    Args:
+        policy: Policy of a class of `_POLICIES`.
+        network: Network to load.
+    """
+    actor, parameters = _find_actor(policy), list[nn.Parameter]()
+    arrays = [getattr(cell, name) for cell in network.cells for name in cell.arrays]
+    arrays += [x for pair in zip(network.weights, network.biases, strict=True) for x in pair]
+    for module in (actor.recurrent, *actor.layers):
+        parameters += [] if module is None else module.parameters()
+    with torch.no_grad():
+        for parameter, array in zip(parameters, arrays, strict=True):
+            if parameter.shape != array.shape:
+                text = f"a network has {array.shape} weights where the actor"
+                raise ValueError(f"{text} has {tuple(parameter.shape)}: it is another one")
+            parameter.copy_(torch.from_numpy(array))
+
+
+def _to_array(parameter: torch.Tensor) -> Array:
     return parameter.detach().cpu().numpy()
 
 

@@ -22,17 +22,33 @@ with require_extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+Single = npt.NDArray[np.float32]
+Row = list[float] | Array  # JSON has lists
+
 CLIP = 10.0  # limit of a standardised entry (standard deviations)
+_MIN_SPREAD = 1e-9  # standard deviation below which an input counts as constant
+_MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
 class Standardisation(NamedTuple):
-    """The standardisation of observations by `Standardised`, in JSON types."""
+    """The standardisation of observations: clip((x - mean) scale, +-clip) mixing."""
 
-    mean: list[float]
-    scale: list[float]  # 0: not read
-    clip: float | None  # limit (standard deviations)
-    mixing: list[list[float]] | None = None
+    mean: Row  # shape (k,)
+    scale: Row  # factors, shape (k,), 0 for an entry that is not read
+    clip: float | None  # limit (standard deviations), None for none
+    mixing: list[list[float]] | Array | None = None  # shape (k, k), None for none
+
+    def transform(self, observations: Single) -> Single:
+        """Standardise and mix observations, shape (..., k), as `Standardised` does.
+
+        Args:
+            observations: Observations, shape (..., k).
+        """
+        mean, scale = np.array(self.mean, np.float32), np.array(self.scale, np.float32)
+        limit = math.inf if self.clip is None else self.clip
+        z: Single = np.clip((observations - mean) * scale, -limit, limit)
+        return z if self.mixing is None else z @ np.array(self.mixing, np.float32)
 
 
 class Standardised(FlattenExtractor):
@@ -52,8 +68,8 @@ class Standardised(FlattenExtractor):
     mixing: torch.Tensor
 
     def __init__(
-        self, observation_space: gym.Space[Observations], mean: list[float], scale: list[float],
-        clip: float | None = CLIP, mixing: list[list[float]] | None = None,
+        self, observation_space: gym.Space[Observations], mean: Row, scale: Row,
+        clip: float | None = CLIP, mixing: list[list[float]] | Array | None = None,
     ) -> None:  # fmt: skip
         super().__init__(observation_space)
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
@@ -76,6 +92,26 @@ class Standardised(FlattenExtractor):
         """
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
+
+
+def compute_scale(spread: Array) -> Array:
+    """Compute the inverse of each standard deviation, shape (k,), zero where nothing varies.
+
+    Args:
+        spread: Standard deviations, shape (k,).
+    """
+    return np.where(spread > _MIN_SPREAD, 1.0 / np.maximum(spread, _MIN_SPREAD), 0.0)
+
+
+def compute_whitening(z: npt.NDArray[np.floating], minimum: float = _MIN_VARIANCE) -> Array:
+    """Compute the symmetric whitening (k, k) of samples, ZCA (Bell and Sejnowski 1997).
+
+    Args:
+        z: Samples, shape (n, k).
+        minimum: Value that the covariance's lower eigenvalues count as.
+    """
+    sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
+    return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)
 
 
 def read_normalisation(

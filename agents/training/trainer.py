@@ -22,13 +22,12 @@ from ...envs.io import from_json
 from ...envs.record import Array
 from ...envs.task import make_space
 from ..env_info import CarVectorEnv, get_layout
-from ..learned.network import CELL_WEIGHTS
 from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
 from ..rollout import COST_FLOOR
 from ..vec_env import get_scales, make_vec_env, scale_layout
 from .callbacks import (
     CHECKPOINT,
-    WARM_START_FILE,
+    INITIAL_FILE,
     Checkpoint,
     EvalCallback,
     RunOptions,
@@ -36,9 +35,16 @@ from .callbacks import (
     read_checkpoint,
 )
 from .config import TrainingTask, get_policy_form
-from .export import check_zip, load_normaliser
-from .normalise import CLIP, RewardScale, RewardScaleWrapper, Standardisation, read_normalisation
-from .student import compute_scale, compute_whitening
+from .export import check_zip, load_network, load_normaliser
+from .normalise import (
+    CLIP,
+    RewardScale,
+    RewardScaleWrapper,
+    Standardisation,
+    compute_scale,
+    compute_whitening,
+    read_normalisation,
+)
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -51,7 +57,6 @@ if TYPE_CHECKING:
     from .. import Agent
     from .gradient import TrainingSource
 
-_GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
@@ -64,11 +69,11 @@ class SavedTraining(NamedTuple):
     folder: Path
     task: TrainingTask
     record: RunRecord
-    state: Checkpoint
+    checkpoint: Checkpoint
 
     def load_initial_policy(self) -> Policy | None:
         """Load the policy that it started from, under its own name; None for another training."""
-        name, file = self.record.begun_with, self.folder / WARM_START_FILE
+        name, file = self.record.begun_with, self.folder / INITIAL_FILE
         if not name:
             return None
         if not file.is_file():
@@ -103,80 +108,66 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
     return SavedTraining(Path(folder), task, record, state)
 
 
-class _WarmStart(NamedTuple):
-    """The tensors with which a model begins."""
+class _ZipTensors(NamedTuple):
+    """The tensors of a zip of stable-baselines3 with which a model begins."""
 
-    name: str  # of the zip or the policy
-    parameters: dict[str, Any]  # as of `get_parameters`; of a policy the actor's alone
+    file: Path
+    parameters: dict[str, Any]  # as of `get_parameters`
+    variables: dict[str, Any]  # tensors of no module
     scaling: Standardisation  # of the model's observations
-    variables: dict[str, Any] = {}  # noqa: RUF012  a zip's tensors of no module
-    is_whole: bool = False  # whether it is a zip, which has all tensors of a model
-
-    @classmethod
-    def from_zip(cls, file: Path, task: TrainingTask, trust: bool) -> "_WarmStart":
-        """Read a zip without running code from it; ValueError where it cannot be read."""
-        try:
-            _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
-            parameters = dict[str, Any](loaded)
-            policy = parameters["policy"]
-        except Exception as error:  # torch raises many for one that is cut short
-            raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-        inner = [name for name in policy if "features_extractor." in name]
-        buffers = {name.rpartition(".")[2]: policy[name].tolist() for name in inner}
-        if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
-            clip = buffers["clip"] if buffers["clip"] < math.inf else None
-            numbers = buffers["mean"], buffers["scale"], clip, buffers.get("mixing")
-        else:
-            layout = get_layout(task.vector_env(1))
-            mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
-            with ZipFile(file) as archive:
-                space = json.loads(archive.read("data")).get("observation_space", {})
-            # as JSON has the space of a `ScaledVecEnv`
-            is_scaled = space.get("low") == str(make_space(scale_layout(layout)).low)
-            scales = get_scales(layout) if is_scaled else np.ones(len(layout))
-            numbers = (mean * scales).tolist(), (scale / scales).tolist(), clip, None
-        return cls(str(file), parameters, Standardisation(*numbers), variables or {}, True)
-
-    @classmethod
-    def from_policy(cls, policy: Policy, task: TrainingTask) -> "_WarmStart":
-        """Read a policy's actor; ValueError where the task's observation or form is another."""
-        network, entries = policy.network, [name for name, _ in policy.card.observation]
-        names = [entry.name for entry in get_layout(task.vector_env(1))]
-        if entries != names:
-            known, here = ", ".join(entries), ", ".join(names)
-            raise ValueError(f"{policy.name} reads {known}; here there is {here}")
-        form, kwargs = get_policy_form(policy, task.algo), task.settings.get("policy_kwargs", {})
-        if kwargs != kwargs | form:
-            text = f"{policy.name} is a network of {form}"
-            raise ValueError(f"{text}, and the settings say {kwargs}")
-        if task.algorithm.on_tensors:
-            cell = network.cells[0]
-            arrays = dict(zip(_GRU, (getattr(cell, part) for part in CELL_WEIGHTS), strict=True))
-            layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
-        else:
-            arrays, hidden = {}, range(len(network.hidden))
-            layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in hidden), "action_net"]
-        for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
-            arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
-        tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
-        numbers = network.mean.tolist(), network.scale.tolist(), network.clip
-        return cls(policy.name, {"policy": tensors}, Standardisation(*numbers))
 
     def load(self, model: BaseAlgorithm) -> None:
         """Load the tensors into a model; ValueError where it has other ones."""
         before = model.get_parameters()
-        policy = before["policy"]
-        if self.is_whole:  # a zip, which from elsewhere has its extractor outside
-            policy = {name: x for name, x in policy.items() if "features_extractor." in name}
-        parameters = before | self.parameters | {"policy": policy | self.parameters["policy"]}
+        # a zip from elsewhere has its extractor outside
+        inner = {name: x for name, x in before["policy"].items() if "features_extractor." in name}
+        policy = {"policy": inner | self.parameters["policy"]}
         try:
-            model.set_parameters(parameters, device=model.device)
+            model.set_parameters(before | self.parameters | policy, device=model.device)
             for name, tensor in self.variables.items():
                 getattr(model, name).data.copy_(tensor)
         except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-            text = f"{self.name} holds other networks than this training's {type(model).__name__}"
+            text = f"{self.file} holds other networks than this training's {type(model).__name__}"
             reason = " ".join(str(error).split())[:300]
             raise ValueError(f"{text} (its settings say which): {reason}") from error
+
+
+def _read_zip(file: Path, task: TrainingTask, trust: bool) -> _ZipTensors:
+    """Read a zip without running code from it; ValueError where it cannot be read."""
+    try:
+        _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
+        parameters = dict[str, Any](loaded)
+        policy = parameters["policy"]
+    except Exception as error:  # torch raises many for one that is cut short
+        raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+    inner = [name for name in policy if "features_extractor." in name]
+    buffers = {name.rpartition(".")[2]: policy[name].tolist() for name in inner}
+    if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
+        clip = buffers["clip"] if buffers["clip"] < math.inf else None
+        scaling = Standardisation(buffers["mean"], buffers["scale"], clip, buffers.get("mixing"))
+    else:
+        layout = get_layout(task.vector_env(1))
+        mean, scale, clip = read_normalisation(load_normaliser(file, trust), len(layout), 1)
+        with ZipFile(file) as archive:
+            space = json.loads(archive.read("data")).get("observation_space", {})
+        # as JSON has the space of a `ScaledVecEnv`
+        is_scaled = space.get("low") == str(make_space(scale_layout(layout)).low)
+        scales = get_scales(layout) if is_scaled else np.ones(len(layout))
+        scaling = Standardisation((mean * scales).tolist(), (scale / scales).tolist(), clip)
+    return _ZipTensors(file, parameters, variables or {}, scaling)
+
+
+def _check_policy(policy: Policy, task: TrainingTask) -> None:
+    """Check that a task's observation and form are those of an initial policy; else ValueError."""
+    entries = [name for name, _ in policy.card.observation]
+    names = [entry.name for entry in get_layout(task.vector_env(1))]
+    if entries != names:
+        known, here = ", ".join(entries), ", ".join(names)
+        raise ValueError(f"{policy.name} reads {known}; here there is {here}")
+    form, kwargs = get_policy_form(policy, task.algo), task.settings.get("policy_kwargs", {})
+    if kwargs != kwargs | form:
+        text = f"{policy.name} is a network of {form}"
+        raise ValueError(f"{text}, and the settings say {kwargs}")
 
 
 @dataclass
@@ -196,11 +187,11 @@ class Trainer:
     run_options: RunOptions = field(default_factory=RunOptions)
     # zip of stable-baselines3 with the first weights; or, for `ppo` and `gradient`, a `Policy`
     # or its name, whose costs weigh the drives
-    trained_agent: str | Path | Policy | None = None
+    initial: str | Path | Policy | None = None
     trust: bool = False  # whether a pickle of VecNormalize beside the zip may be read
 
     def __post_init__(self) -> None:
-        agent, self._folder = self.trained_agent, Path(self.folder)
+        agent, self._folder = self.initial, Path(self.folder)
         if self.steps < 1:
             raise ValueError(f"steps is at least 1, got {self.steps}")
         if agent is not None and self.resume:
@@ -209,7 +200,7 @@ class Trainer:
             raise ValueError("a network reads what it was trained on: give reads or a network")
         if isinstance(agent, str | Path):
             if is_policy(str(agent)):
-                self.trained_agent = load_policy(agent)
+                self.initial = load_policy(agent)
             else:
                 check_zip(Path(agent))
         logs = {"tensorboard": self.run_options.tensorboard_log, "wandb": self.run_options.track}
@@ -217,10 +208,10 @@ class Trainer:
             if is_wanted and find_spec(package) is None:
                 raise ModuleNotFoundError(f"a log for {package} needs it: pip install {package}")
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
-        self._state: Checkpoint | None = None
+        self._checkpoint: Checkpoint | None = None
         if self.resume:
             saved = read_training(self._folder, **asdict(self.task))
-            self._state, self.trained_agent = saved.state, saved.load_initial_policy()
+            self._checkpoint, self.initial = saved.checkpoint, saved.load_initial_policy()
         elif (self._folder / CHECKPOINT).exists():
             text = f"{self._folder} holds a training already: go on with it (resume), or"
             raise ValueError(f"{text} take another folder")
@@ -229,9 +220,9 @@ class Trainer:
 
     def train(self) -> EvalCallback:
         """Train up to the number of steps; the callback has the model and its evaluations."""
-        callback, file = self.build(), self._folder / WARM_START_FILE
+        callback, file = self.build(), self._folder / INITIAL_FILE
         policy, model, run = callback.policy, callback.model, None
-        if self._state is None:
+        if self._checkpoint is None:
             file.unlink(missing_ok=True)  # of one without a checkpoint
             if policy is not None:
                 save_policy(file, policy.network, policy.card)
@@ -255,18 +246,25 @@ class Trainer:
 
     def build(self) -> EvalCallback:
         """Build the callback with its model, new or from a checkpoint, a zip or a policy."""
-        task, agent, state = self.task, self.trained_agent, self._state
-        policy, start = None, None
-        if isinstance(agent, Policy):
-            policy, start = agent, _WarmStart.from_policy(agent, task)
-        elif agent is not None:
-            start = _WarmStart.from_zip(Path(agent), task, self.trust)
-        callback = EvalCallback(task, self._folder, self.run_options, self.steps, policy, state)
-        steps = state.steps if state else 0
-        if state:
-            callback.scaling = Standardisation(*state.scaling)
+        task, initial, checkpoint = self.task, self.initial, self._checkpoint
+        policy, tensors = None, None
+        if isinstance(initial, Policy):
+            policy = initial
+            _check_policy(policy, task)
+        elif initial is not None:
+            tensors = _read_zip(Path(initial), task, self.trust)
+        callback = EvalCallback(
+            task, self._folder, self.run_options, self.steps, policy, checkpoint
+        )
+        steps = checkpoint.steps if checkpoint else 0
+        if checkpoint:
+            callback.scaling = Standardisation(*checkpoint.scaling)
+        elif policy:
+            network = policy.network
+            numbers = network.mean.tolist(), network.scale.tolist(), network.clip
+            callback.scaling = Standardisation(*numbers)
         else:
-            callback.scaling = start.scaling if start else _measure_scaling(task)
+            callback.scaling = tensors.scaling if tensors else _measure_scaling(task)
         options = dict[str, Any](env_kwargs=task.options(task.num_envs), scaled=False)
         env = make_vec_env(task.env_id, task.num_envs, None, task.estimator_kwargs, **options)
         first, period = task.first_seed + steps, callback.period
@@ -282,12 +280,14 @@ class Trainer:
             further["source"] = partial(_make_source, task, first, scaled_env.reward_scale)
         model = task.make_model(scaled_env, period, callback.scaling, **further)
         callback.init_callback(model)
-        if state:
+        if checkpoint:
             callback.load_parameters()
             if isinstance(model, OffPolicyAlgorithm):
                 model.learning_starts += steps  # its buffer begins empty
-        elif start:
-            start.load(model)
+        elif policy:
+            load_network(model.policy, policy.network)
+        elif tensors:
+            tensors.load(model)
         model.num_timesteps = steps
         env.seed(first)
         return callback

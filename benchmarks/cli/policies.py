@@ -198,8 +198,8 @@ class _Distill:
 
     def run(self) -> None:
         common.announce_torch()
+        from ...agents.training.config import DistillConfig
         from ...agents.training.distill import RoundResult, distill
-        from ...agents.training.student import DistillConfig
         from ..studies.policies import Lessons
 
         target, console = self.out or Path(f"{self.name}.safetensors"), Console()

@@ -175,7 +175,7 @@ BAD_NETWORKS: dict[str, tuple[dict[str, Any], str]] = {
     "no sizes": ({"hidden": None}, KIND),
     "history": ({"history": 2.0}, "network holds .*got"),
     "longer history": ({"history": 10**12}, "3 inputs are not 10{12} frames"),
-    "cells": ({"cells": [["rnn", 3]]}, "'cell_0_weight_in' is missing"),
+    "cells": ({"cells": [["rnn", 3]]}, "unknown cell 'rnn'; known: gru, lstm, traces"),
     "cell of no size": ({"cells": [["gru", -3]]}, "'cell_0_weight_in' is missing"),
     "cell of text": ({"cells": "gru"}, KIND),
     "no times": ({"cells": [["traces", 5, 2]]}, MISSING_TRACES),

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController
-from sideslip.agents.learned.network import (
+from sideslip.agents.learned.layers import (
     ACTIVATIONS,
-    CELL_WEIGHTS,
-    GATES,
     MovingAverages,
-    Network,
-    RecurrentCell,
 )
+from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
 
 torch = pytest.importorskip("torch")
@@ -24,14 +21,15 @@ torch.set_num_threads(1)
 sb3 = pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations  # noqa: E402
 
-from sideslip.agents.training.distill import _EpisodeBatches  # noqa: E402
-from sideslip.agents.training.student import (  # noqa: E402
+from sideslip.agents.training.config import DistillConfig  # noqa: E402
+from sideslip.agents.training.distill import (  # noqa: E402
     Demonstrations,
-    DistillConfig,
-    Scaling,
-    Student,
+    _EpisodeBatches,
+    _Student,
     _TraceLayer,
 )
+from sideslip.agents.training.export import TORCH_CELLS, convert_cells  # noqa: E402
+from sideslip.agents.training.normalise import Standardisation  # noqa: E402
 
 ID, ROWS, STEPS = "sideslip/YawVision-v0", 5, 200
 CARD = Card.from_env_id(ID)
@@ -60,18 +58,16 @@ def dense(wide: int, history: int = 1, cells: Any = (), **options: Any) -> Netwo
     )
 
 
+MODULES = {cell.kind: module for module, cell in TORCH_CELLS.items()}
+
+
 def torchs(kind: str, layers: int, wide: int = WIDE, size: int = 7) -> Any:
     torch.manual_seed(4)
-    return {"gru": torch.nn.GRU, "lstm": torch.nn.LSTM}[kind](wide, size, layers)
+    return MODULES[kind](wide, size, layers)  # type: ignore[arg-type]
 
 
-def cells_of(module: Any) -> list[RecurrentCell]:
-    kind = type(module).__name__.lower()
-    names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    return [
-        RecurrentCell(kind, *(getattr(module, f"{name}_l{i}").detach().numpy() for name in names))
-        for i in range(module.num_layers)
-    ]
+def cells_of(module: Any) -> list[Any]:
+    return list(convert_cells(module))
 
 
 def driven(network: Network, x: np.ndarray, starts: np.ndarray = STARTS) -> np.ndarray:
@@ -84,7 +80,7 @@ def driven(network: Network, x: np.ndarray, starts: np.ndarray = STARTS) -> np.n
     return np.array(actions)
 
 
-@pytest.mark.parametrize("kind", GATES)
+@pytest.mark.parametrize("kind", MODULES)
 @pytest.mark.parametrize("layers", [1, 2])
 def test_cells_are_torchs_over_whole_episodes(kind: str, layers: int) -> None:
     """In double precision to its rounding, in torch's single precision to 1e-6."""
@@ -112,17 +108,17 @@ def test_cells_are_torchs_over_whole_episodes(kind: str, layers: int) -> None:
         assert worst < bound
 
 
-@pytest.mark.parametrize("kind", GATES)
+@pytest.mark.parametrize("kind", MODULES)
 def test_the_order_of_the_gates_counts(kind: str) -> None:
     """So that the test above would see a wrong one."""
     (cell,) = cells_of(torchs(kind, 1))
     right = driven(dense(WIDE, cells=[cell]), inputs())
-    order = [1, 0, *range(2, GATES[kind])]
-    swapped = [
-        np.concatenate([np.split(getattr(cell, part), GATES[kind])[i] for i in order])
-        for part in CELL_WEIGHTS
-    ]
-    wrong = driven(dense(WIDE, cells=[RecurrentCell(kind, *swapped)]), inputs())
+    order = [1, 0, *range(2, cell.gates)]
+    swapped = {
+        name: np.concatenate([np.split(getattr(cell, name), cell.gates)[i] for i in order])
+        for name in cell.arrays
+    }
+    wrong = driven(dense(WIDE, cells=[replace(cell, **swapped)]), inputs())
     assert np.abs(wrong - right).max() > 1e-3
 
 
@@ -217,7 +213,7 @@ def test_a_file_holds_the_memory(tmp_path: Path) -> None:
     kinds = [cell.kind for cell in policy.network.cells]
     assert policy.network.history == 3 and kinds == ["lstm", "lstm"]
     assert np.array_equal(driven(policy.network, inputs()), driven(network, inputs()))
-    cells = [replace(cell, bias_in=cell.bias_in + 1.0) for cell in network.cells]
+    cells = [replace(cell, weight_in=cell.weight_in + 1.0) for cell in network.cells]
     other = replace(policy, network=replace(network, cells=cells))
     assert other.salt != policy.salt
 
@@ -275,13 +271,13 @@ def test_averages_of_what_is_not_read_are_left_out() -> None:
 def test_the_network_is_torchs(memory: dict[str, Any], cut: int) -> None:
     """Over blocks of its matrices and, where an episode is cut, with the state handed on."""
     torch.manual_seed(0)
-    student, rng = Student(5, 2, DistillConfig(hidden=(9, 4), **memory)), np.random.default_rng(1)
+    student, rng = _Student(5, 2, DistillConfig(hidden=(9, 4), **memory)), np.random.default_rng(1)
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
-    scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
+    scaling = Standardisation(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), 8.0, mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
     if student.traces:
         student.traces.fit_whitening([drives_of(x)], scaling)
-    z, net = torch.from_numpy(scaling.mix_inputs(x)), student.network(scaling)
+    z, net = torch.from_numpy(scaling.transform(x)), student.network(scaling)
     first, between = student(z[:, :cut])
     parts = [first] + ([student(z[:, cut:], between)[0]] if cut < 150 else [])
     theirs, state = torch.cat(parts, 1).detach().numpy(), np.zeros((3, net.memory))
@@ -303,9 +299,9 @@ def test_what_is_plain_goes_on_without_correlation() -> None:
     rng = np.random.default_rng(1)
     x = rng.normal(size=(40, 300, 3)).astype(np.float32)
     x[..., 0] = x[..., 0].cumsum(1) / 10.0
-    scaling = Scaling(x.mean((0, 1)), 1.0 / x.std((0, 1)), np.eye(3))
+    scaling = Standardisation(x.mean((0, 1)), 1.0 / x.std((0, 1)), 8.0, np.eye(3))
     x[0, 100:] = 1e3  # where it is over
-    student, z = Student(3, 1, DistillConfig(traces=4)), torch.from_numpy(scaling.mix_inputs(x))
+    student, z = _Student(3, 1, DistillConfig(traces=4)), torch.from_numpy(scaling.transform(x))
     layer: Any = student.traces
     there = drives_of(x).weights > 0.0
     before = layer(z)[0].detach().numpy()[there][:, :18]
@@ -329,7 +325,7 @@ def test_the_slope_reaches_the_first_step() -> None:
 def test_an_episode_is_learned_through_whole(course: dict[str, Any], steps: int) -> None:
     """By a GRU in windows."""
     x = RNG.normal(size=(3, 150, 5)).astype(np.float32)
-    scaling = Scaling(np.zeros(5), np.ones(5), np.eye(5))
+    scaling = Standardisation(np.zeros(5), np.ones(5), 8.0, np.eye(5))
     first, *_ = _EpisodeBatches([drives_of(x)], scaling, DistillConfig(batch=3, **course))
     assert first[0].shape == (3, steps, 5)
 
@@ -359,8 +355,6 @@ REFUSALS: dict[str, tuple[Any, dict[str, Any]]] = {
     "22 inputs are not 3 frames": (None, {"cells": [GRU]}),
     "cell 1 takes 66 inputs, not 7": (None, {"cells": cells_of(torchs("gru", 1, 66)) * 2}),
     "layer 0 takes 8 inputs": (None, {"cells": cells_of(torchs("gru", 1, 66, 8))}),
-    "unknown cell 'rnn'; known: gru, lstm": (GRU, {"kind": "rnn"}),
-    "arrays of a lstm cell do not fit together": (GRU, {"kind": "lstm"}),
     "arrays of a gru cell do not fit together": (GRU, {"bias_in": np.zeros(3)}),
     r"got \(\(5,\), \(5,\)\)": (TRACES, {"weight_in": np.zeros(5)}),
     r"weights \(units, inputs\) and biases \(units,\), got": (TRACES, {"bias_in": np.zeros(4)}),

@@ -25,7 +25,7 @@ from sideslip.agents.training.callbacks import (
 from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
-    WARM_START_ENTRY,
+    INITIAL_ENTRY,
     TrainingTask,
     _check_settings,
     _read_settings,
@@ -158,7 +158,7 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
 
     for name, algorithm in ALGORITHMS.items():
         entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
-        ours = {"default", WARM_START_ENTRY}
+        ours = {"default", INITIAL_ENTRY}
         assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
             _check_settings(name, entries[key])

@@ -15,22 +15,20 @@ from sideslip.agents.baselines import make_oracle
 from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.rollout import COST_FLOOR
 from sideslip.agents.training import distill as training
+from sideslip.agents.training.config import DistillConfig
 from sideslip.agents.training.distill import (
+    _UNREAD,
+    Demonstrations,
     DistillTask,
     RoundResult,
     _collect_demonstrations,
+    _compute_scaling,
     _fit_model,
+    _Student,
+    _TraceLayer,
     distill,
 )
-from sideslip.agents.training.student import (
-    _UNREAD,
-    Demonstrations,
-    DistillConfig,
-    Scaling,
-    Student,
-    _TraceLayer,
-    compute_scaling,
-)
+from sideslip.agents.training.normalise import Standardisation
 from sideslip.envs.task import ObservationEntry
 
 ID, CARS = "sideslip/YawFusion-v0", 16
@@ -71,7 +69,7 @@ def test_a_student_with_traces_mixes_them_once_by_the_first_drives(
 ) -> None:
     asked: list[tuple[Any, _TraceLayer]] = []
 
-    def whiten(self: _TraceLayer, drives: Any, scaling: Scaling) -> None:
+    def whiten(self: _TraceLayer, drives: Any, scaling: Standardisation) -> None:
         whole(self, drives, scaling)
         asked.append((drives, self))
 
@@ -83,7 +81,7 @@ def test_a_student_with_traces_mixes_them_once_by_the_first_drives(
     ((drives, traces),) = asked
     assert len(drives) == 1 and traces.mean.abs().max() > 0.0
     (cell,) = load_policy(path).network.cells
-    assert (cell.kind, cell.form) == ("traces", (0, len(policy.card.observation) + 3, 3, 5))
+    assert cell.description[:3] == ["traces", len(policy.card.observation) + 3, 3]
 
 
 def test_the_file_is_the_last_rounds_and_its_card_has_the_numbers(learned: Any) -> None:
@@ -107,21 +105,21 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
     rates = seen.privileged[..., told.index("gamma_hat")], seen.obs[..., names.index("gyro")]
     assert np.corrcoef(rates[0].ravel(), rates[1].ravel())[0, 1] > 0.9
     mean, deviation = seen.privileged.mean((0, 1)), seen.privileged.std((0, 1))
-    plain = Scaling(mean, 1.0 / np.maximum(deviation, 1e-9))
-    seen, other = (x._replace(privileged=plain.mix_inputs(x.privileged)) for x in (seen, other))
+    plain = Standardisation(mean, 1.0 / np.maximum(deviation, 1e-9), 8.0)
+    seen, other = (x._replace(privileged=plain.transform(x.privileged)) for x in (seen, other))
     course = replace(COURSE, auxiliary_weight=1.0)
     torch.manual_seed(0)
-    model = Student(len(names), 1, course, len(told))
-    scaling = compute_scaling([seen], cars.layout, ("beta_hat",))
+    model = _Student(len(names), 1, course, len(told))
+    scaling = _compute_scaling([seen], cars.layout, ("beta_hat",))
     _fit_model(model, [seen], scaling, course, 60)
-    out = model(torch.from_numpy(scaling.mix_inputs(other.obs)))[0].detach().numpy()
+    out = model(torch.from_numpy(scaling.transform(other.obs)))[0].detach().numpy()
     missed, varies = (
         x.mean((0, 1)) for x in ((out[..., 1:] - other.privileged) ** 2, other.privileged**2)
     )
     rate = told.index("gamma_hat")
     assert missed[rate] < 0.3 * varies[rate]
     assert model.network(scaling).width == 1
-    assert Student(5, 1, COURSE, 2).auxiliary_head is None
+    assert _Student(5, 1, COURSE, 2).auxiliary_head is None
 
 
 def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
@@ -130,8 +128,8 @@ def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
     weights = seen.weights.copy()
     weights[:, 1:] = 0.0
     course = replace(COURSE, cells=4, auxiliary_weight=1.0, batch=1)
-    model = Student(seen.obs.shape[2], 1, course, seen.privileged.shape[2])
-    scaling = compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
+    model = _Student(seen.obs.shape[2], 1, course, seen.privileged.shape[2])
+    scaling = _compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
     assert np.isfinite(_fit_model(model, [seen._replace(weights=weights)], scaling, course, 1))
 
 
@@ -199,7 +197,7 @@ def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None
     seen = [_collect_demonstrations(lesson(), None, range(CARS), 0.1)]
     names = [entry.name for entry in cars.layout]
     for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
-        scaling = compute_scaling(seen, cars.layout, needs)
+        scaling = _compute_scaling(seen, cars.layout, needs)
         reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
         assert reads == there if there else "gyro" in reads and not reads & set(_UNREAD)
 
@@ -213,11 +211,11 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     drives = Demonstrations(
         obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
     )
-    usual = compute_scaling([drives], layout, ("beta",))
-    deviation = Scaling(obs.mean((0, 1)), 1.0 / obs.std((0, 1)))
+    usual = _compute_scaling([drives], layout, ("beta",))
+    deviation = Standardisation(obs.mean((0, 1)), 1.0 / obs.std((0, 1)), 8.0)
     ends = np.percentile(ages, (16, 50))  # the usual age is 0, a soon one a deviation before it
     assert (ends - usual.mean[0]) * usual.scale[0] == pytest.approx([-1.0, 0.0])
-    z, plain = (x._replace(mixing=None).mix_inputs(obs)[0, :, 0] for x in (usual, deviation))
+    z, plain = (x._replace(mixing=None).transform(obs)[0, :, 0] for x in (usual, deviation))
     assert z[:20].min() == 8.0 == z[-1] and np.abs(z[20:200]).max() < 4.0
     assert np.diff(z[24:36]).min() > 0.1 > 20.0 * np.diff(plain[24:36]).max()
 
@@ -227,9 +225,9 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
 ) -> None:
     path, real = tmp_path / "student.safetensors", _fit_model
     drives = [_collect_demonstrations(lesson(), None, range(CARS), 0.0)]
-    names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
+    names, model = len(drives[0].obs[0, 0]), _Student(len(drives[0].obs[0, 0]), 1, COURSE)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
-        scaling = Scaling(np.full(names, np.nan), np.ones(names), np.eye(names))
+        scaling = Standardisation(np.full(names, np.nan), np.ones(names), 8.0, np.eye(names))
         real(model, drives, scaling, COURSE, 1)
     calls: list[Any] = []
 
@@ -255,7 +253,7 @@ def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:
     seen.obs[..., a] = rng.normal(size=seen.obs.shape[:2])
     apart = 0.1 * rng.normal(size=seen.obs.shape[:2])
     seen.obs[..., b] = seen.obs[..., a] + apart
-    z = compute_scaling([seen], cars.layout, ("beta_hat",)).mix_inputs(seen.obs)
+    z = _compute_scaling([seen], cars.layout, ("beta_hat",)).transform(seen.obs)
     shown = z[..., b] - z[..., a]
     assert 1.2 < shown.std() < 1.6  # of two that vary by 1, the square root of 2
     assert np.corrcoef(shown.ravel(), apart.ravel())[0, 1] > 0.99

@@ -123,7 +123,7 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
 
 
 def begun(task: TrainingTask, folder: Path) -> Any:
-    return Trainer(task, 1, folder, trained_agent=load_policy(GRU)).build().model
+    return Trainer(task, 1, folder, initial=load_policy(GRU)).build().model
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:

@@ -13,10 +13,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.training.callbacks import CHECKPOINT
-from sideslip.agents.training.config import TrainingTask, make_finetune_task
+from sideslip.agents.training.config import DistillConfig, TrainingTask, make_finetune_task
 from sideslip.agents.training.distill import DistillTask, distill
 from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.student import DistillConfig
 from sideslip.agents.training.trainer import Trainer, _measure_scaling
 from sideslip.agents.vec_env import make_vec_env
 from tests.agents.training.test_distill import COURSE, ID, OPTIONS
@@ -63,7 +62,7 @@ def finetuned(message: str, policy: Any, algo: str = "ppo") -> Refusal:
 
 def started(message: str, policy: Any, make: Callable[[], TrainingTask]) -> Refusal:
     """Before anybody drives."""
-    return lambda folder: Trainer(make(), 16, folder, trained_agent=policy).train(), message
+    return lambda folder: Trainer(make(), 16, folder, initial=policy).train(), message
 
 
 def scaled(message: str, *reads: str) -> Refusal:
@@ -169,7 +168,7 @@ def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
 
     def refuse(kind: Any, said: str, start: Any = zipped, of: Any = TASK, **more: Any) -> None:
         with pytest.raises(kind, match=said):
-            Trainer(of, 128, folder, trained_agent=start, **more).train()
+            Trainer(of, 128, folder, initial=start, **more).train()
         assert not (folder / CHECKPOINT).exists()
 
     refuse(PermissionError, "vecnormalize.pkl is a pickle.*--trust")

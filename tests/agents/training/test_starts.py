@@ -21,7 +21,7 @@ from sideslip.agents.rollout import COST_FLOOR, evaluate_episodes
 from sideslip.agents.training.callbacks import (
     BEST,
     CHECKPOINT,
-    WARM_START_FILE,
+    INITIAL_FILE,
     Checkpoint,
     EvalCallback,
     Evaluation,
@@ -47,7 +47,7 @@ FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
 
 
 def started(task: TrainingTask, folder: Path, policy: Policy = POLICY) -> Any:
-    return Trainer(task, 16, folder, trained_agent=policy).build()
+    return Trainer(task, 16, folder, initial=policy).build()
 
 
 def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
@@ -142,11 +142,11 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     options = car | {"scenario": {"base": base, "duration": 0.01 * length}, "lead_in": 0.0}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
     task = make_finetune_task(policy, algo=algo, **more)
-    network, training = policy.network, Trainer(task, 400, tmp_path, trained_agent=policy)
+    network, training = policy.network, Trainer(task, 400, tmp_path, initial=policy)
     if steps:
         monkeypatch.setattr(EvalCallback, "load_parameters", lambda _: None)
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-        training._state = Checkpoint({}, "", {}, steps, {}, list(scaling), [])
+        training._checkpoint = Checkpoint({}, "", {}, steps, {}, list(scaling), [])
     model: Any = training.build().model
     driver, cars = network, model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
@@ -199,14 +199,12 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     settings = make_finetune_task(POLICY).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
     task = make_finetune_task(POLICY, settings=settings, **FEW)
     options = RunOptions(eval_freq=32)
-    found = Trainer(task, 64, tmp_path, run_options=options, trained_agent=POLICY).train()
+    found = Trainer(task, 64, tmp_path, run_options=options, initial=POLICY).train()
     first = found.evaluations[0]
     assert first.of_start == pytest.approx(1.0, abs=1e-6) and found.best.of_start == min(
         each.of_start or np.inf for each in found.evaluations
     )
-    assert np.array_equal(
-        load_policy(tmp_path / WARM_START_FILE).network.scale, POLICY.network.scale
-    )
+    assert np.array_equal(load_policy(tmp_path / INITIAL_FILE).network.scale, POLICY.network.scale)
     env, seeds = task.vector_env(4), _make_evaluation_seeds(4)
     start, now = (evaluate_episodes(env, each, seeds)[0] for each in (POLICY.network, found.model))
     ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
@@ -220,13 +218,13 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["of_start"] == first.of_start
-    (tmp_path / WARM_START_FILE).rename(tmp_path / "aside")
+    (tmp_path / INITIAL_FILE).rename(tmp_path / "aside")
     with pytest.raises(FileNotFoundError, match="began with policy distill-coms-yaw, and needs it"):
         Trainer(task, 128, tmp_path, resume=True).train()
-    (tmp_path / "aside").rename(tmp_path / WARM_START_FILE)
+    (tmp_path / "aside").rename(tmp_path / INITIAL_FILE)
     (tmp_path / CHECKPOINT).unlink()  # stopped before it had one: the folder begins anew
     Trainer(dataclasses.replace(task, settings=TrainingTask().settings), 1, tmp_path).train()
-    assert not (tmp_path / WARM_START_FILE).exists()
+    assert not (tmp_path / INITIAL_FILE).exists()
 
 
 @pytest.mark.parametrize("ratio, kept", [(2.0, True), (0.5, False)])
@@ -254,7 +252,7 @@ def observations() -> Any:
 
 def begin(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     """The model before its first step."""
-    training = Trainer(TASK, 1, tmp_path / "new", trained_agent=zipped, trust=trust)
+    training = Trainer(TASK, 1, tmp_path / "new", initial=zipped, trust=trust)
     return training.build().model
 
 
@@ -287,7 +285,7 @@ def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
     assert all(torch.equal(best[name], other[name]) for name in best)
     assert float(other["features_extractor.clip"]) == CLIP
     start = tmp_path / "first" / BEST
-    done = Trainer(TASK, 128, tmp_path / "on", trained_agent=start).train()
+    done = Trainer(TASK, 128, tmp_path / "on", initial=start).train()
     assert done.model.num_timesteps == 128
     again = Trainer(TASK, 256, tmp_path / "on", resume=True).train().model
     name = "features_extractor.mean"  # the scaling is the zip's still

@@ -42,7 +42,7 @@ def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) ->
     run_zoo("train", algo, tmp_path, *file, "-n", "256", "-params", *few)
     (zipped,) = (tmp_path / zoo / "sideslip-YawVision-v1_1").glob("sideslip*.zip")
     task = TrainingTask(algo=algo, num_envs=4, n_eval_envs=4)
-    Trainer(task, 64, tmp_path / "on", trained_agent=zipped, trust=True).train()
+    Trainer(task, 64, tmp_path / "on", initial=zipped, trust=True).train()
 
 
 @pytest.mark.long
