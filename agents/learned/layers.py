@@ -62,6 +62,11 @@ class MemoryLayer:
         return self.units
 
     @property
+    def form(self) -> tuple[int, int, int]:
+        """Place of the kind in `MEMORY_LAYERS`, size and memory, for compiled code."""
+        return list(MEMORY_LAYERS).index(self.kind), self.size, self.memory
+
+    @property
     def description(self) -> list[object]:
         """Kind, units and the fields that are no arrays, for a card, JSON types only."""
         return [self.kind, self.units]

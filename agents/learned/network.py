@@ -16,15 +16,7 @@ from ...envs.numerics.jit import jit_nrt
 from ...envs.numerics.primitives import Matrix, maximum, minimum
 from ...envs.record import Array
 from ...envs.validation import check_choice
-from .layers import (
-    ACTIVATIONS,
-    MEMORY_LAYERS,
-    TANH,
-    MemoryLayer,
-    apply_activation,
-    apply_dense,
-    step_layer,
-)
+from .layers import ACTIVATIONS, TANH, MemoryLayer, apply_activation, apply_dense, step_layer
 
 SUFFIX = ".safetensors"
 Tensors = dict[str, npt.NDArray[Any]]
@@ -39,7 +31,7 @@ class PackedNetwork(NamedTuple):
     clip: float  # bound of normalised inputs, infinite for none
     inputs: int  # entries of a frame
     history: int  # frames
-    cells: npt.NDArray[np.int64]  # kind's place in `MEMORY_LAYERS`, size and memory, shape (k, 3)
+    cells: npt.NDArray[np.int64]  # `form` of each cell, shape (k, 3)
     sizes: npt.NDArray[np.int64]  # of the dense layers, inputs first
     activation: int  # place in `ACTIVATIONS`
     output: int  # place in `OUTPUTS`
@@ -186,15 +178,11 @@ class Network:
         numbers = [cell.numbers for cell in self.cells]
         numbers += [part.T.ravel() for layer in layers for part in layer]
         clip = np.inf if self.clip is None else float(self.clip)
-        kinds = list(MEMORY_LAYERS)
-        shapes = [(kinds.index(cell.kind), cell.size, cell.memory) for cell in self.cells]
-        cells = np.array(shapes, np.int64).reshape(-1, 3)
+        cells = np.array([cell.form for cell in self.cells], np.int64).reshape(-1, 3)
         sizes = np.array([self.weights[0].shape[1], *map(len, self.biases)], np.int64)
         form = self.inputs, self.history, cells, sizes
-        functions = ACTIVATIONS.index(self.activation), OUTPUTS.index(self.output)
-        return PackedNetwork(
-            self.mean, self.scale, clip, *form, *functions, np.concatenate(numbers)
-        )
+        kinds = ACTIVATIONS.index(self.activation), OUTPUTS.index(self.output)
+        return PackedNetwork(self.mean, self.scale, clip, *form, *kinds, np.concatenate(numbers))
 
     @property
     def description(self) -> dict[str, object]:

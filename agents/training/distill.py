@@ -31,7 +31,7 @@ from .export import convert_cells, mix_inputs
 from .normalise import Single, Standardisation, compute_scale, compute_whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
-from torch import nn  # isort: skip
+from torch import Tensor, nn  # isort: skip
 from torch.nn.utils.rnn import pad_sequence  # isort: skip
 
 _DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`
@@ -90,11 +90,11 @@ class RoundResult(NamedTuple):
 class _Batch(NamedTuple):
     """B episodes, or a window of T steps of them, as tensors; fields as in `Demonstrations`."""
 
-    inputs: torch.Tensor  # (B, T, k), mixed by a `Standardisation`
-    labels: torch.Tensor  # (B, T, m)
-    privileged: torch.Tensor  # (B, T, q)
-    weights: torch.Tensor  # (B, T)
-    curvatures: torch.Tensor  # (B, m, m)
+    inputs: Tensor  # (B, T, k), mixed by a `Standardisation`
+    labels: Tensor  # (B, T, m)
+    privileged: Tensor  # (B, T, q)
+    weights: Tensor  # (B, T)
+    curvatures: Tensor  # (B, m, m)
     begins: bool  # whether the episodes begin with it
 
 
@@ -177,8 +177,8 @@ class _TraceLayer(nn.Module):
     them say how a sensor changes.
     """
 
-    mean: torch.Tensor
-    mixing: torch.Tensor
+    mean: Tensor
+    mixing: Tensor
 
     def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = _TIMES) -> None:
         super().__init__()
@@ -193,9 +193,7 @@ class _TraceLayer(nn.Module):
         """Size of the output: inputs and their averages, then SiLU units and theirs."""
         return (self.inputs + self.unit.out_features) * (1 + len(self.times))
 
-    def forward(
-        self, z: torch.Tensor, state: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, z: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Compute units and averages (B, T, size) of inputs (B, T, k); episodes begin together."""
         # the state, which follows, has averages and the steps so far, (B, times, units + 1)
         u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
@@ -242,9 +240,7 @@ class _TraceLayer(nn.Module):
 
 
 @functools.cache
-def _compute_weights(
-    times: tuple[float, ...], first: int, steps: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Tensor, Tensor]:
     """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
     # They solve m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share a_t =
     # max(1 / steps so far, 1 - exp(-1 / time)): u_s has a_s prod (1 - a_r), r = s + 1, ..., t.
@@ -260,16 +256,10 @@ def _compute_weights(
 class _Student(nn.Module):
     """A GRU or moving averages, if there are any, and dense layers, on whitened observations.
 
-    Args:
-        inputs: Number of inputs.
-        width: Entries of an action.
-        config: Configuration of the student.
-        n_privileged: Outputs of the auxiliary head, which serve in training alone.
+    The outputs of its auxiliary head serve in training alone.
     """
 
-    def __init__(
-        self, inputs: int, width: int, config: DistillConfig, n_privileged: int = 0
-    ) -> None:
+    def __init__(self, inputs: int, width: int, config: DistillConfig, n_auxiliary: int) -> None:
         super().__init__()
         self.cell = nn.GRU(inputs, config.cells, batch_first=True) if config.cells else None
         self.traces = _TraceLayer(inputs, config.traces) if config.traces else None
@@ -277,12 +267,10 @@ class _Student(nn.Module):
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         head_inputs = config.cells or sizes[-2] if config.auxiliary_weight else 0
-        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if head_inputs else None
+        self.auxiliary_head = nn.Linear(head_inputs, n_auxiliary) if head_inputs else None
         self.recurrent = bool(memory_size)
 
-    def forward(
-        self, z: torch.Tensor, state: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def forward(self, z: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Compute actions and auxiliary outputs (B, T, m + q) of inputs (B, T, k); next state."""
         memory = self.cell or self.traces
         if memory is not None:

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
 from stable_baselines3.common.torch_layers import create_mlp  # isort: skip
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # isort: skip
-from torch import nn  # isort: skip
+from torch import Tensor, nn  # isort: skip
 
 _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
@@ -58,9 +58,7 @@ class GruPolicy(BasePolicy):
         # betas as in Xu et al.: a shorter memory than Adam's defaults
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
-    def forward(
-        self, observations: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, observations: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute actions (N, m) and the next state (N, cells).
 
         Args:
@@ -70,7 +68,7 @@ class GruPolicy(BasePolicy):
         _, after = self.cell(self.features_extractor(observations)[None], state[None])
         return self.layers(after[0]), after[0]
 
-    def _begin(self, count: int) -> torch.Tensor:
+    def _begin(self, count: int) -> Tensor:
         """Make the state of an episode's start, zeros of shape (count, cells)."""
         return torch.zeros(count, self.cell.hidden_size, device=self.device)
 
@@ -182,7 +180,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _update_weights(self, mean_cost: torch.Tensor) -> None:
+    def _update_weights(self, mean_cost: Tensor) -> None:
         """Update the weights by one step down the gradient of a window's cost."""
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
@@ -202,9 +200,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
 
 def _unroll_window(
-    policy: GruPolicy, cars: Any, obs: torch.Tensor, state: torch.Tensor,
+    policy: GruPolicy, cars: Any, obs: Tensor, state: Tensor,
     reward_scale: RewardScale, steps: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Drive cars for a window: mean weighted cost with its graph, last observations and state."""
     mean_cost = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):

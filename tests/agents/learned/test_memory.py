@@ -271,7 +271,8 @@ def test_averages_of_what_is_not_read_are_left_out() -> None:
 def test_the_network_is_torchs(memory: dict[str, Any], cut: int) -> None:
     """Over blocks of its matrices and, where an episode is cut, with the state handed on."""
     torch.manual_seed(0)
-    student, rng = _Student(5, 2, DistillConfig(hidden=(9, 4), **memory)), np.random.default_rng(1)
+    student = _Student(5, 2, DistillConfig(hidden=(9, 4), **memory), 0)
+    rng = np.random.default_rng(1)
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
     scaling = Standardisation(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), 8.0, mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
@@ -301,7 +302,7 @@ def test_what_is_plain_goes_on_without_correlation() -> None:
     x[..., 0] = x[..., 0].cumsum(1) / 10.0
     scaling = Standardisation(x.mean((0, 1)), 1.0 / x.std((0, 1)), 8.0, np.eye(3))
     x[0, 100:] = 1e3  # where it is over
-    student, z = _Student(3, 1, DistillConfig(traces=4)), torch.from_numpy(scaling.transform(x))
+    student, z = _Student(3, 1, DistillConfig(traces=4), 0), torch.from_numpy(scaling.transform(x))
     layer: Any = student.traces
     there = drives_of(x).weights > 0.0
     before = layer(z)[0].detach().numpy()[there][:, :18]

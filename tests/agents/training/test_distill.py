@@ -225,7 +225,7 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
 ) -> None:
     path, real = tmp_path / "student.safetensors", _fit_model
     drives = [_collect_demonstrations(lesson(), None, range(CARS), 0.0)]
-    names, model = len(drives[0].obs[0, 0]), _Student(len(drives[0].obs[0, 0]), 1, COURSE)
+    names, model = len(drives[0].obs[0, 0]), _Student(len(drives[0].obs[0, 0]), 1, COURSE, 0)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
         scaling = Standardisation(np.full(names, np.nan), np.ones(names), 8.0, np.eye(names))
         real(model, drives, scaling, COURSE, 1)
