@@ -154,13 +154,12 @@ def test_a_training_goes_on_from_its_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("stable_baselines3")
-    from sideslip.agents.training import trainer
-    from sideslip.agents.training.callbacks import CHECKPOINT, read_checkpoint
+    from sideslip.agents.training import callbacks
+    from sideslip.agents.training.trainer import Trainer
 
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
-    state = read_checkpoint(folder / CHECKPOINT)
-    monkeypatch.setattr(trainer, "__version__", state.sideslip)
-    task = trainer.read_training(folder).task
-    found = trainer.Trainer(task, state.steps, folder, resume=True).train()
+    monkeypatch.setattr(callbacks, "__version__", "0.2.0")
+    saved = callbacks.read_training(folder)
+    found = Trainer(saved.task, saved.checkpoint.steps, folder, resume=True).train()
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

@@ -9,7 +9,7 @@ import glob
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from ... import __version__
 from ...envs.io import atomic_file, from_json, write_atomic
 from ...envs.numerics import require_extra
 from ...envs.record import Array
-from ..learned.policy import Card, Policy, save_policy
+from ..learned.policy import Card, Policy, check_names_no_code, load_policy, save_policy
 from ..rollout import compute_cost_ratios, evaluate_episodes
 from ..vec_env import make_native_env
 from .config import TrainingTask
@@ -275,11 +275,14 @@ class EvalCallback(BaseCallback):
         """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
         return {name: getattr(self.model, name) for name in self.model._get_torch_save_params()[1]}
 
-    def load_parameters(self) -> None:
-        """Load the parameters and optimisers of the folder's checkpoint into the model."""
+    def load_parameters(self, groups: dict[str, Any]) -> None:
+        """Load the parameters and optimisers of the folder's checkpoint into the model.
+
+        Args:
+            groups: `Checkpoint.groups`.
+        """
         path, variables = self.folder / CHECKPOINT, self._get_variables()
         parts: dict[str, Any] = {part: {} for part in self.model.get_parameters()}
-        groups = read_checkpoint(path).groups
         parts |= {part: {"param_groups": group, "state": {}} for part, group in groups.items()}
         for name, tensor in load_file(path).items():
             part, key = name.split("/", 1)
@@ -293,12 +296,34 @@ class EvalCallback(BaseCallback):
         self.model.set_parameters(parts, device=self.model.device)
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint without the tensors; ValueError for a file that is none of this format.
+class SavedTraining(NamedTuple):
+    """A training as its folder has it."""
+
+    folder: Path
+    task: TrainingTask
+    record: RunRecord
+    checkpoint: Checkpoint
+
+    def load_initial_policy(self) -> Policy | None:
+        """Load the policy that it started from, under its own name; None for another training."""
+        name, file = self.record.begun_with, self.folder / INITIAL_FILE
+        if not name:
+            return None
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
+        return replace(load_policy(file), name=name)
+
+
+def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
+    """Read a folder's training from its checkpoint; ValueError for another version.
 
     Args:
-        path: Checkpoint.
+        folder: Folder of the training; FileNotFoundError without a checkpoint.
+        **arguments: Fields of the task that must agree with it, else ValueError.
     """
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
     try:
         with safe_open(path, "pt") as file:
             state = json.loads((file.metadata() or {}).get("checkpoint", "null"))
@@ -308,7 +333,23 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise ValueError(f"{path} is no checkpoint: its state is no JSON ({error})") from None
     if not isinstance(state, dict) or state.pop("format", 0) != _FORMAT:
         raise ValueError(f"{path} is no checkpoint of this format ({_FORMAT})")
-    return from_json(Checkpoint, state, f"{path}: the checkpoint")
+    checkpoint = from_json(Checkpoint, state, f"{path}: the checkpoint")
+    if checkpoint.sideslip != __version__:
+        text = (
+            f"{path} was made by sideslip {checkpoint.sideslip}, this is {__version__}, whose cars"
+        )
+        raise ValueError(f"{text} and costs may be others: train anew, in another folder")
+    task = from_json(TrainingTask, checkpoint.task, f"{path}: the task")
+    try:
+        check_names_no_code(task.env_id, task.estimator, task.estimator_options)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    for name, value in arguments.items():
+        if value != getattr(task, name):
+            text = f"{path} is of {name} {getattr(task, name)!r}, not {value!r}"
+            raise ValueError(f"{text}: train that in another folder")
+    record = from_json(RunRecord, checkpoint.aim, f"{path}: the aim")
+    return SavedTraining(Path(folder), task, record, checkpoint)
 
 
 def _compute_equal_weights(costs: Array) -> Array:

@@ -7,7 +7,7 @@ evaluations), and `begun_with.safetensors` where it started from a policy.
 
 import json
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -17,23 +17,13 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from ... import __version__
-from ...envs.io import from_json
 from ...envs.record import Array
 from ...envs.task import make_space
 from ..env_info import CarVectorEnv, get_layout
-from ..learned.policy import Policy, check_names_no_code, is_policy, load_policy, save_policy
+from ..learned.policy import Policy, is_policy, load_policy, save_policy
 from ..rollout import COST_FLOOR
 from ..vec_env import get_scales, make_vec_env, scale_layout
-from .callbacks import (
-    CHECKPOINT,
-    INITIAL_FILE,
-    Checkpoint,
-    EvalCallback,
-    RunOptions,
-    RunRecord,
-    read_checkpoint,
-)
+from .callbacks import CHECKPOINT, INITIAL_FILE, Checkpoint, EvalCallback, RunOptions, read_training
 from .config import TrainingTask, get_policy_form
 from .export import check_zip, load_network, load_normaliser
 from .normalise import (
@@ -61,51 +51,6 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
 _UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
-
-
-class SavedTraining(NamedTuple):
-    """A training as its folder has it."""
-
-    folder: Path
-    task: TrainingTask
-    record: RunRecord
-    checkpoint: Checkpoint
-
-    def load_initial_policy(self) -> Policy | None:
-        """Load the policy that it started from, under its own name; None for another training."""
-        name, file = self.record.begun_with, self.folder / INITIAL_FILE
-        if not name:
-            return None
-        if not file.is_file():
-            raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
-        return replace(load_policy(file), name=name)
-
-
-def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
-    """Read a folder's training from its checkpoint; ValueError for another version.
-
-    Args:
-        folder: Folder of the training; FileNotFoundError without a checkpoint.
-        **arguments: Fields of the task that must agree with it, else ValueError.
-    """
-    path = Path(folder) / CHECKPOINT
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
-    state = read_checkpoint(path)
-    if state.sideslip != __version__:
-        text = f"{path} was made by sideslip {state.sideslip}, this is {__version__}, whose cars"
-        raise ValueError(f"{text} and costs may be others: train anew, in another folder")
-    task = from_json(TrainingTask, state.task, f"{path}: the task")
-    try:
-        check_names_no_code(task.env_id, task.estimator, task.estimator_options)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    for name, value in arguments.items():
-        if value != getattr(task, name):
-            text = f"{path} is of {name} {getattr(task, name)!r}, not {value!r}"
-            raise ValueError(f"{text}: train that in another folder")
-    record = from_json(RunRecord, state.aim, f"{path}: the aim")
-    return SavedTraining(Path(folder), task, record, state)
 
 
 class _ZipTensors(NamedTuple):
@@ -281,7 +226,7 @@ class Trainer:
         model = task.make_model(scaled_env, period, callback.scaling, **further)
         callback.init_callback(model)
         if checkpoint:
-            callback.load_parameters()
+            callback.load_parameters(checkpoint.groups)
             if isinstance(model, OffPolicyAlgorithm):
                 model.learning_starts += steps  # its buffer begins empty
         elif policy:

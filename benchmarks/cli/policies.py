@@ -286,15 +286,15 @@ class _Train:
         if varied and resume:
             raise ValueError(f"--varied {varied} is for a new training: an old one keeps its tasks")
         agent, new = prepare_start(self.trained_agent, varied)
-        task = trainer.read_training(out).task if resume and out else new(**options)
+        task = callbacks.read_training(out).task if resume and out else new(**options)
         start = self.trained_agent.stem if self.trained_agent else ""
         folder = _choose_folder(task, start, out, logs)
         file = folder / callbacks.POLICY
         if self.conf_file is not None:
-            initial = trainer.read_training(folder).load_initial_policy() if resume else agent
+            initial = callbacks.read_training(folder).load_initial_policy() if resume else agent
             options["settings"] = resolve_settings(self.conf_file, task.algo, task.env_id, initial)
         if resume:
-            saved = trainer.read_training(folder, **options)
+            saved = callbacks.read_training(folder, **options)
             task, record = saved.task, saved.record
         else:
             task = new(**options)

@@ -27,6 +27,7 @@ from sideslip.agents.training.callbacks import (
     Evaluation,
     RunOptions,
     _make_evaluation_seeds,
+    read_training,
 )
 from sideslip.agents.training.config import (
     HYPERPARAMS,
@@ -35,7 +36,7 @@ from sideslip.agents.training.config import (
     resolve_settings,
 )
 from sideslip.agents.training.normalise import CLIP, RewardScale, RewardScaleWrapper
-from sideslip.agents.training.trainer import Trainer, _measure_reward_scale, read_training
+from sideslip.agents.training.trainer import Trainer, _measure_reward_scale
 from sideslip.agents.vec_env import get_scales, make_vec_env
 from sideslip.envs.device import make_device_env
 from tests.policies import GRU
@@ -144,7 +145,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     task = make_finetune_task(policy, algo=algo, **more)
     network, training = policy.network, Trainer(task, 400, tmp_path, initial=policy)
     if steps:
-        monkeypatch.setattr(EvalCallback, "load_parameters", lambda _: None)
+        monkeypatch.setattr(EvalCallback, "load_parameters", lambda *_: None)
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
         training._checkpoint = Checkpoint({}, "", {}, steps, {}, list(scaling), [])
     model: Any = training.build().model

@@ -18,10 +18,11 @@ from sideslip.agents.training.callbacks import (
     POLICY,
     _compute_equal_weights,
     _compute_scenario_weights,
+    read_training,
 )
 from sideslip.agents.training.config import TrainingTask, _read_settings
 from sideslip.agents.training.normalise import CLIP, Standardised
-from sideslip.agents.training.trainer import _measure_scaling, read_training
+from sideslip.agents.training.trainer import _measure_scaling
 
 TINY, ROLLOUT = TrainingTask(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]

@@ -36,10 +36,9 @@ from sideslip.agents.training.callbacks import (
     POLICY,
     Checkpoint,
     RunOptions,
-    read_checkpoint,
+    read_training,
 )
 from sideslip.agents.training.config import TrainingTask
-from sideslip.agents.training.trainer import read_training
 
 SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
 TINY = TrainingTask(num_envs=8, env_options=SHORT, seed=3, n_eval_envs=4)
@@ -152,7 +151,7 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
         time.sleep(wait)
         child.kill()
         assert child.communicate()[1] == b"" and child.returncode == -signal.SIGKILL
-        reached.append(read_checkpoint(path).steps)
+        reached.append(read_training(tmp_path).checkpoint.steps)
         assert reached[-1] > reached[-2]
 
 

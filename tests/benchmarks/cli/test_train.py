@@ -12,7 +12,7 @@ from sideslip.agents.learned.policy import load_policy
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import trainer
-from sideslip.agents.training.callbacks import CURVE, POLICY
+from sideslip.agents.training.callbacks import CURVE, POLICY, read_training
 from sideslip.agents.training.config import TrainingTask
 from sideslip.benchmarks.cli import policies as train_command
 from sideslip.benchmarks.cli.common import parse_options
@@ -62,10 +62,10 @@ def test_it_goes_on_with_a_folder(
     assert len((tmp_path / folder / CURVE).read_text().splitlines()) == 3
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
-    aim = trainer.read_training(folder).record
+    aim = read_training(folder).record
     assert (aim.steps, aim.eval_freq) == (768, 512) and aim.command.count("sideslip train") == 3
     assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
-    assert trainer.read_training(folder).record == aim
+    assert read_training(folder).record == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
     settings = (tmp_path / "mine.yml", "sideslip/YawGps-v0:\n  n_envs: 8\n  policy: MlpPolicy\n")
@@ -152,7 +152,7 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     assert status == 0, err
     assert "of its start's" in out and " 1.000" in out and "judged" in out
     assert asked == [(Path("on") / POLICY, "coms-zero-slip", 32)]
-    task = trainer.read_training("on").task
+    task = read_training("on").task
     known = [each.scenario for each in _list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
     words = shlex.split(load_policy(f"on/{POLICY}").card.command)[2:]
