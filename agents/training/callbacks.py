@@ -120,25 +120,26 @@ class EvalCallback(BaseCallback):
         folder: Folder of the training.
         run_options: Options of this run.
         steps: Steps of the whole training.
-        policy: Policy from which the training starts, whose costs weigh the drives.
-        state: State of a checkpoint, None for a new training.
+        initial: Policy from which the training starts, whose costs weigh the drives.
+        checkpoint: Checkpoint of a resumed training, None for a new one.
     """
 
     scaling: Standardisation  # of the model's observations, which `Trainer.build` sets
 
     def __init__(
         self, task: TrainingTask, folder: Path, run_options: RunOptions, steps: int,
-        policy: Policy | None = None, state: Checkpoint | None = None,
+        initial: Policy | None = None, checkpoint: Checkpoint | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.task, self.folder, self.run_options, self.policy = task, folder, run_options, policy
-        name, frequency = policy.name if policy else "", run_options.eval_freq
+        self.task, self.folder, self.run_options, self.initial = task, folder, run_options, initial
+        name, frequency = initial.name if initial else "", run_options.eval_freq
         self.run_record = RunRecord(steps, frequency, run_options.command, name)
         self.seeds = _make_evaluation_seeds(task.n_eval_envs)
         self.env = task.vector_env(task.n_eval_envs)
         base: Any = self.env.unwrapped
         self.period = float(base.control_period * base.dt)  # of control (s)
-        self.evaluations = [Evaluation(*row) for row in state.evaluations] if state else []
+        rows = checkpoint.evaluations if checkpoint else []
+        self.evaluations = [Evaluation(*row) for row in rows]
         self.writers: list[KVWriter] = []  # further ones of the log
         uncontrolled = self._average_scenarios(evaluate_episodes(self.env, None, self.seeds)[0])
         if uncontrolled.mean() == 0.0:
@@ -146,10 +147,10 @@ class EvalCallback(BaseCallback):
         self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
         self.weights, self.initial_costs = np.ones(1), None
-        if policy is None:
+        if initial is None:
             self.weights = _compute_scenario_weights(task)
         else:
-            self.initial_costs = evaluate_episodes(self.env, policy.network, self.seeds)[0]
+            self.initial_costs = evaluate_episodes(self.env, initial.network, self.seeds)[0]
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
@@ -220,12 +221,12 @@ class EvalCallback(BaseCallback):
         options = task.make_model_options(self.period)
         options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
         options |= {"reads": task.reads} if task.reads else {}
-        if self.policy is not None:
-            before = self.policy.card.algorithm_options
-            options |= {"begun_with": self.policy.name}
+        if self.initial is not None:
+            before = self.initial.card.algorithm_options
+            options |= {"begun_with": self.initial.name}
             options |= {"class": before["class"]} if "class" in before and mixture else {}
         options |= {"scenarios": mixture} if mixture else {}
-        if mixture and self.policy is None:
+        if mixture and self.initial is None:
             options |= {"weights": self.weights.round(3).tolist()}
         env_options = task.env_options | ({"scenario": mixture[0]} if mixture else {})
         card = Card.from_env_id(

@@ -166,7 +166,7 @@ class Trainer:
     def train(self) -> EvalCallback:
         """Train up to the number of steps; the callback has the model and its evaluations."""
         callback, file = self.build(), self._folder / INITIAL_FILE
-        policy, model, run = callback.policy, callback.model, None
+        policy, model, run = callback.initial, callback.model, None
         if self._checkpoint is None:
             file.unlink(missing_ok=True)  # of one without a checkpoint
             if policy is not None:

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController
-from sideslip.agents.learned.layers import (
-    ACTIVATIONS,
-    MovingAverages,
-)
+from sideslip.agents.learned.layers import ACTIVATIONS, MEMORY_LAYERS, MovingAverages
 from sideslip.agents.learned.network import Network
 from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
 
@@ -150,6 +147,22 @@ def remembering() -> Network:
     return dense(WIDE, 3, cells_of(torchs("lstm", 2, 3 * WIDE)), activation="silu")
 
 
+TIMES = (1.5, 30.0)
+
+
+def traces(wide: int = WIDE, **change: Any) -> MovingAverages:
+    rng = np.random.default_rng(1)
+    numbers: dict[str, Any] = {"weight_in": rng.normal(size=(5, wide))}
+    numbers |= {"bias_in": rng.normal(size=5), "n_silu": 2, "times": TIMES}
+    return MovingAverages(**numbers | change)
+
+
+def network(cell: MovingAverages) -> Network:
+    rng = np.random.default_rng(2)
+    weights, biases = [rng.normal(size=(1, cell.size))], [rng.normal(size=1)]
+    return Network(np.zeros(WIDE), np.ones(WIDE), weights, biases, cells=[cell])
+
+
 def test_a_row_of_a_batch_is_its_single_drive() -> None:
     network, x = remembering(), inputs()
     together = driven(network, x)
@@ -177,17 +190,34 @@ def test_predict_is_pure_and_a_row_with_a_nan_keeps_its_memory() -> None:
 
 
 @pytest.mark.parametrize("framewise", [True, False])
-def test_what_is_not_read_is_left_out_of_every_frame(framewise: bool) -> None:
+@pytest.mark.parametrize("made", [remembering(), network(traces())], ids=["cells", "traces"])
+def test_what_is_not_read_is_left_out_of_every_frame(made: Network, framewise: bool) -> None:
     scale = np.ones(WIDE)
     scale[[1, 5]] = 0.0
-    scale = scale if framewise else np.tile(scale, 3)
-    network = replace(remembering(), mean=np.zeros(len(scale)), scale=scale)
-    assert list(np.flatnonzero(~network.reads)) == [1, 5]
+    scale = scale if framewise else np.tile(scale, made.history)
+    whole = replace(made, mean=np.zeros(len(scale)), scale=scale)
+    assert list(np.flatnonzero(~whole.reads)) == [1, 5]
     x = inputs().astype(np.float64)
-    state, less = np.zeros((ROWS, network.memory)), network.select_inputs(network.reads)
+    state, less = np.zeros((ROWS, whole.memory)), whole.select_inputs(whole.reads)
     other = np.zeros((ROWS, less.memory))
     for obs in x[:20]:
-        assert less(obs[:, network.reads], other) == pytest.approx(network(obs, state), abs=1e-12)
+        assert less(obs[:, whole.reads], other) == pytest.approx(whole(obs, state), abs=1e-12)
+
+
+@pytest.mark.parametrize("made", [remembering(), network(traces())], ids=["cells", "traces"])
+def test_a_file_holds_the_memory(made: Network, tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    save_policy(path, made, CARD)
+    policy = load_policy(path)
+    assert policy.network.description == made.description
+    assert np.array_equal(driven(policy.network, inputs()), driven(made, inputs()))
+    cells = [replace(cell, weight_in=cell.weight_in + 1.0) for cell in made.cells]
+    assert replace(policy, network=replace(made, cells=cells)).salt != policy.salt
+
+
+def test_every_kind_is_compared() -> None:
+    """With torch's module, or with its formula."""
+    assert set(MEMORY_LAYERS) == {*MODULES, MovingAverages.kind}
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -204,34 +234,6 @@ def test_activations_are_torchs(activation: str) -> None:
     one, none = np.ones((1, 1)), np.zeros(1)
     alone = Network(none, np.ones(1), [one, one], [none, none], activation)
     assert alone(x[:, None])[:, 0] == pytest.approx(theirs, abs=1e-13)
-
-
-def test_a_file_holds_the_memory(tmp_path: Path) -> None:
-    network, path = remembering(), tmp_path / "mine.safetensors"
-    save_policy(path, network, CARD)
-    policy = load_policy(path)
-    kinds = [cell.kind for cell in policy.network.cells]
-    assert policy.network.history == 3 and kinds == ["lstm", "lstm"]
-    assert np.array_equal(driven(policy.network, inputs()), driven(network, inputs()))
-    cells = [replace(cell, weight_in=cell.weight_in + 1.0) for cell in network.cells]
-    other = replace(policy, network=replace(network, cells=cells))
-    assert other.salt != policy.salt
-
-
-TIMES = (1.5, 30.0)
-
-
-def traces(wide: int = WIDE, **change: Any) -> MovingAverages:
-    rng = np.random.default_rng(1)
-    numbers: dict[str, Any] = {"weight_in": rng.normal(size=(5, wide))}
-    numbers |= {"bias_in": rng.normal(size=5), "n_silu": 2, "times": TIMES}
-    return MovingAverages(**numbers | change)
-
-
-def network(cell: MovingAverages) -> Network:
-    rng = np.random.default_rng(2)
-    weights, biases = [rng.normal(size=(1, cell.size))], [rng.normal(size=1)]
-    return Network(np.zeros(WIDE), np.ones(WIDE), weights, biases, cells=[cell])
 
 
 def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
@@ -255,15 +257,6 @@ def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
                 assert own == pytest.approx(u[: step + 1].mean(0), abs=1e-12)
     state[1] = 0.0  # an episode begins: its first units are its means
     assert np.ptp(net(x[0], state)[1].reshape(3, 5), axis=0) == pytest.approx(0.0)
-
-
-def test_averages_of_what_is_not_read_are_left_out() -> None:
-    scale = np.ones(WIDE)
-    scale[[1, 5]] = 0.0
-    net = replace(network(traces()), scale=scale)
-    x, less = RNG.normal(size=(4, WIDE)), net.select_inputs(net.reads)
-    assert less.inputs == WIDE - 2
-    assert less(x[:, net.reads]) == pytest.approx(net(x), abs=1e-12)
 
 
 @pytest.mark.parametrize("cut", [150, 60])
@@ -329,15 +322,6 @@ def test_an_episode_is_learned_through_whole(course: dict[str, Any], steps: int)
     scaling = Standardisation(np.zeros(5), np.ones(5), 8.0, np.eye(5))
     first, *_ = _EpisodeBatches([drives_of(x)], scaling, DistillConfig(batch=3, **course))
     assert first[0].shape == (3, steps, 5)
-
-
-def test_a_file_holds_the_traces(tmp_path: Path) -> None:
-    net, path = network(traces()), tmp_path / "mine.safetensors"
-    save_policy(path, net, CARD)
-    policy, x = load_policy(path), RNG.normal(size=(4, WIDE))
-    (cell,) = policy.network.cells
-    assert isinstance(cell, MovingAverages) and (cell.n_silu, cell.times) == (2, TIMES)
-    assert np.array_equal(policy.network(x), net(x))
 
 
 def test_a_file_of_no_units_cannot_ask_for_any_memory(tmp_path: Path) -> None:
