@@ -51,9 +51,8 @@ def training(message: str, *arguments: Any, steps: int = 10, **wrong: Any) -> Re
     return lambda folder: Trainer(TrainingTask(*arguments, **wrong), steps, folder).train(), message
 
 
-def settings(message: str, algo: str, activation: str) -> Refusal:
-    kwargs = {"policy_kwargs": {"activation_fn": activation}}
-    return task(message, algo=algo, settings=SETTINGS[algo] | kwargs)
+def settings(message: str, algo: str, **kwargs: Any) -> Refusal:
+    return task(message, algo=algo, settings=SETTINGS[algo] | {"policy_kwargs": kwargs})
 
 
 def finetuned(message: str, policy: Any, algo: str = "ppo") -> Refusal:
@@ -105,9 +104,22 @@ REFUSED: dict[str, Refusal] = {
     "estimator on tensors": task(
         "gradient reads sensors alone: no estimator runs on", VISION, "gradient", "exact-kf"
     ),
-    "activation's name": settings(r"unknown activation_fn 'nn\.SiLU'", "ppo", "nn.SiLU"),
+    "activation's name": settings(
+        r"unknown activation_fn 'nn\.SiLU'", "ppo", activation_fn="nn.SiLU"
+    ),
     "activation of gradient": settings(
-        "the layers of gradient are of silu: it has no activ", "gradient", "silu"
+        "the layers of gradient are of silu: it has no activ", "gradient", activation_fn="silu"
+    ),
+    "extractor": settings(
+        "features_extractor_class is the training's own", "ppo", features_extractor_class={}
+    ),
+    "extractor's arguments": settings(
+        "features_extractor_kwargs is the training's own", "ppo", features_extractor_kwargs={}
+    ),
+    "scenario beside a mixture": task(
+        r"are \['gust'\], and env_options have the scenario 'moose'",
+        scenarios=["gust"],
+        env_options={"scenario": "moose"},
     ),
     "mixture's name": mixture("scenario 1 of the mixture: unknown scenario 'moon'", SLALOM, "moon"),
     "mixture's type": mixture("scenario 0 of the mixture: a scenario is a name", 7),

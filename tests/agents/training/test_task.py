@@ -20,7 +20,7 @@ from sideslip.agents.training.callbacks import (
     _compute_scenario_weights,
     read_training,
 )
-from sideslip.agents.training.config import TrainingTask, _read_settings
+from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.normalise import CLIP, Standardised
 from sideslip.agents.training.trainer import _measure_scaling
 
@@ -162,17 +162,3 @@ def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
     task = TrainingTask(env_options=options)
     names = [entry.name for entry in task.vector_env(1).unwrapped.layout]  # type: ignore[attr-defined]
     assert _measure_scaling(task).scale[names.index("steer_command")] > 0.0
-
-
-def test_a_scenario_beside_a_mixture_is_not_dropped_in_silence() -> None:
-    with pytest.raises(
-        ValueError, match=r"are \['gust'\], and env_options have the scenario 'moose'"
-    ):
-        TrainingTask(scenarios=["gust"], env_options={"scenario": "moose"})
-
-
-@pytest.mark.parametrize("name", ["features_extractor_class", "features_extractor_kwargs"])
-def test_a_features_extractor_in_settings_is_not_dropped_in_silence(name: str) -> None:
-    settings = _read_settings("ppo", "default")
-    with pytest.raises(ValueError, match=f"{name} is the training's own"):
-        TrainingTask(settings=settings | {"policy_kwargs": {name: {"clip": 1.0}}})
