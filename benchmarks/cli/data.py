@@ -33,9 +33,8 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ...envs.sensors.camera.images import Image, Pinhole
+    from ...envs.sensors.camera.images import Film, Image, Pinhole
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
-    from ...envs.sensors.camera.pictures import Film
     from ...estimators.wires import SignalCalibration
 
 _MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
@@ -231,7 +230,8 @@ class _Lane:
         os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS))  # read when loaded
         with require_extra("vision", "the lane finder needs {}"):
             import cv2
-        from ...envs.sensors.camera.pictures import PICTURES, Film, draw_lane, read_picture
+        from ...envs.sensors.camera.images import PICTURES, Film, read_picture
+        from ...envs.sensors.camera.lane_finder import draw_lane
 
         source, out = self.source, self.out
         if (source is None) == (self.calibrate is None):
@@ -270,7 +270,7 @@ class _Lane:
 
     def _calibrate_camera(self) -> None:
         """Write the intrinsics that the chessboards of a folder's pictures give."""
-        from ...envs.sensors.camera.pictures import PICTURES, calibrate_camera
+        from ...envs.sensors.camera.images import PICTURES, calibrate_camera
 
         folder, path = self.calibrate, self.json or Path("intrinsics.json")
         assert folder is not None
@@ -286,15 +286,13 @@ class _Lane:
 
     def _make_finder(self, pictures: "list[Image]", source: Path) -> "LaneFinder":
         """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""
-        from ...envs.sensors.camera import pictures as calibration
-        from ...envs.sensors.camera.images import Pinhole
-        from ...envs.sensors.camera.lane_finder import LaneFinder
-        from ...envs.sensors.slow import FieldOfView
+        from ...envs.sensors.camera.images import Pinhole, make_default_camera
+        from ...envs.sensors.camera.lane_finder import estimate_mounting, make_lane_finder
 
         file, lane_width, known = self.intrinsics, self.lane_width, dict[str, object]()
         height, width = pictures[0].shape[:2]
         if file is None:
-            camera = calibration.make_default_camera((width, height))
+            camera = make_default_camera((width, height))
         else:
             try:
                 camera, known = Pinhole.read(file), read_document(file, "camera")
@@ -307,22 +305,21 @@ class _Lane:
         failed = None
         for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
             try:
-                camera = calibration.estimate_mounting(camera, picture, lane_width)
+                camera = estimate_mounting(camera, picture, lane_width)
                 break
             except ValueError as error:
                 failed = error
         else:
             if failed is not None:
                 raise ValueError(f"{source}: {failed}")
-        view = FieldOfView(calibration.HEADING, 0.5 * lane_width)
-        return LaneFinder(camera, lane_width, calibration.NEAR, calibration.FAR, view=view)
+        return make_lane_finder(camera, lane_width)
 
 
 def _process_film(film: "Film", finder: "LaneFinder", out: Path | None) -> list["Lane"]:
     """Find a film's lanes, and draw them."""
     import cv2
 
-    from ...envs.sensors.camera.pictures import draw_lane
+    from ...envs.sensors.camera.lane_finder import draw_lane
 
     with TemporaryDirectory() as folder, use_shared_bar(_console, "lane", "pictures") as bar:
         pictures = bar.track(film, film.frame_count or None, task_id=bar.task_ids[0])

@@ -1,15 +1,17 @@
-"""The pinhole camera on a car, and the pictures of the road that it takes; needs `vision`.
+"""The pinhole camera on a car: its calibration, pictures from files, and those of rendered roads.
 
-Car axes: X forward, Y left, Z up, from the road below the centre of gravity. A picture has
+Car axes: X forward, Y left, Z up, from the road below the centre of gravity. A rendered picture has
 markings, bends, roll and pitch, shadow, wear, blur and noise; each pixel has the road's brightness
-averaged over its footprint.
+averaged over its footprint. Needs the extra `vision`.
 """
 
 import dataclasses
 import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import cos, radians, sin
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -26,6 +28,8 @@ _Flat = npt.NDArray[np.float32]
 _MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))
 WORKING_WIDTH = 1280  # px, of a picture in which a lane is looked for
 _MEASURED = ("rms_px", "boards")  # further entries of a calibration file
+_MIN_BOARDS = 3
+PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 @dataclass(frozen=True)
@@ -66,10 +70,9 @@ class Pinhole:
 
     @classmethod
     def read(cls, path: "str | os.PathLike[str]") -> "Pinhole":
-        """Read a camera from a TOML or JSON file; ValueError for a field missing or out of place.
+        """Read a camera from a TOML or JSON file that has at least K, dist and size.
 
-        Args:
-            path: Path of the file, which has at least K, dist and size.
+        Raises ValueError for a field missing or out of place.
         """
         values = read_document(path, "camera")
         if missing := {"K", "dist", "size"} - values.keys():
@@ -117,14 +120,111 @@ class Pinhole:
 
 
 def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Resample a picture to a width of `WORKING_WIDTH`, in its proportions.
-
-    Args:
-        picture: Bytes, shape (height, width) or (height, width, 3).
-    """
+    """Resample a picture to a width of `WORKING_WIDTH`, in its proportions."""
     size = WORKING_WIDTH, round(picture.shape[0] * WORKING_WIDTH / picture.shape[1])
     method = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(picture, size, interpolation=method), np.uint8)
+
+
+def make_default_camera(size: tuple[int, int]) -> Pinhole:
+    """Make a camera of unknown properties: 58 degrees wide, without distortion, level.
+
+    Args:
+        size: Width and height of its pictures (px).
+    """
+    width, height = size
+    K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
+    return Pinhole(K=K, dist=(0.0,) * 5, size=size, tilt=0.0, ahead=0.0)
+
+
+def calibrate_camera(
+    paths: Sequence[Path], corners: tuple[int, int] = (9, 6)
+) -> tuple[Pinhole, float]:
+    """Compute a camera's intrinsics and corners' RMS error (px) from photographs of a chessboard.
+
+    Tilt and height are defaults. Raises ValueError if fewer than three show a board, or the
+    photographs have different sizes.
+
+    Args:
+        paths: Files of the photographs; those without a board are skipped.
+        corners: Inner corners of the board along its two sides.
+    """
+    board = np.zeros((corners[0] * corners[1], 3), np.float32)
+    board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
+    corner_sets: list[Any] = []
+    sizes: set[tuple[int, int]] = set()
+    for path in paths:
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if grey is None:
+            continue
+        is_found, places = cv2.findChessboardCorners(grey, corners)
+        if is_found:
+            stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
+            corner_sets.append(cv2.cornerSubPix(grey, places, (8, 8), (-1, -1), stop))
+            sizes.add((grey.shape[1], grey.shape[0]))
+    if (count := len(corner_sets)) < _MIN_BOARDS:
+        raise ValueError(
+            f"{count} of {len(paths)} files show a chessboard of {corners[0]} x {corners[1]} inner "
+            f"corners; expected {_MIN_BOARDS} or more"
+        )
+    if len(sizes) > 1:
+        raise ValueError(f"the boards' photographs have different sizes: {sorted(sizes)}")
+    (size,), start = sizes, cast(Any, None)
+    error, K, dist, *_ = cv2.calibrateCamera([board] * count, corner_sets, size, start, start)
+    return Pinhole(K=tuple(map(tuple, K)), dist=tuple(dist.ravel()[:5]), size=size), float(error)
+
+
+def read_picture(path: "str | os.PathLike[str]") -> Image:
+    """Read a picture from a file, (height, width, 3) bytes of blue, green, red.
+
+    Raises FileNotFoundError without the file, ValueError for a broken one.
+    """
+    _check_file(path)
+    data = np.fromfile(path, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if picture is None:
+        raise ValueError(f"{path}: this is no picture that can be read")
+    return np.asarray(picture, np.uint8)
+
+
+class Film:
+    """A film's frames; FileNotFoundError without the file, ValueError without a first frame."""
+
+    def __init__(self, path: "str | os.PathLike[str]") -> None:
+        _check_file(path)
+        self._reader = cv2.VideoCapture(str(path))
+        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)  # of the header
+        self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0  # frames a second
+        if (first := self._read_frame()) is None:
+            raise ValueError(f"{path}: this is no film that can be read")
+        self._buffer = [first]
+
+    def _read_frame(self) -> Image | None:
+        """The next frame of the file; None where it, or its undamaged part, ends."""
+        has_frame, frame = self._reader.read()
+        return np.asarray(frame, np.uint8) if has_frame else None
+
+    def read_head(self, count: int) -> list[Image]:
+        """Read the first frames, at most `count`, which iteration returns again.
+
+        Args:
+            count: Largest number of frames.
+        """
+        while len(self._buffer) < count and (frame := self._read_frame()) is not None:
+            self._buffer.append(frame)
+        return list(self._buffer)
+
+    def __iter__(self) -> Iterator[Image]:
+        """Iterate over the frames, once, until the file or its undamaged part ends."""
+        while self.read_head(1):
+            yield self._buffer.pop(0)
+
+
+def _check_file(path: "str | os.PathLike[str]") -> None:
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: expected a picture or a film, found a folder")
 
 
 _ASPHALT, _PAINT, _GRASS, _SKY = 85.0, 215.0, 60.0, 200.0  # grey levels

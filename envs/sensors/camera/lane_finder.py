@@ -3,10 +3,13 @@
 The road is resampled to rows of equal steps across it; a Laplacian of a Gaussian has its ridges on
 the markings. Random consensus finds two parabolas Y = c + b X + a X^2 / 2, from which arcs of
 circles at half a lane's width are fitted by least squares, together with the body's pitch and roll
-(about zero, with a prior). Needs `vision`.
+(about zero, with a prior). A camera's tilt follows from the vanishing point of a straight lane's
+markings, its height from how they spread below it over a lane of known width. Needs `vision`.
 """
 
+import dataclasses
 import itertools
+from math import atan, cos
 from typing import Any, NamedTuple
 
 import cv2
@@ -230,11 +233,7 @@ class LaneFinder:
         self.fit: _LaneFit | None = None  # of the newest picture, for drawing
 
     def find(self, picture: Image) -> Lane:
-        """Find the lane in a picture, all 0 where there is none; ValueError for another size.
-
-        Args:
-            picture: Bytes, grey (height, width) or blue, green, red (height, width, 3).
-        """
+        """Find the lane in a picture, all 0 where there is none; ValueError for another size."""
         size = picture.shape[1::-1]
         if size != self.camera.size or picture.dtype != np.uint8:
             got = f"{size} in {picture.dtype}"
@@ -314,3 +313,118 @@ class LaneFinder:
             _, d = _project_to_lane(x, level, psi, offset, kappa)
             y = y - (d - 0.5 * side * self._width) / np.cos(psi - kappa * x)
         return y
+
+
+def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
+    """Draw the markings in a finder's newest picture onto a copy in colour, (height, width, 3).
+
+    Args:
+        picture: Picture in grey or colour, shape (height, width) or (height, width, 3).
+        finder: Finder whose newest picture this is.
+        lane: Result of the finder.
+    """
+    shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
+    thick = max(shown.shape[1] // 400, 1)
+    if finder.fit is not None:
+        places = [finder.locate_marking(finder.fit, side) for side in (1, -1)]
+        edges = [finder.camera.project_points(finder.rows_ahead, y) for y in places]
+        left, right = (np.round(edge[np.isfinite(edge[:, 0])]).astype(np.int32) for edge in edges)
+        filled = shown.copy()
+        cv2.fillPoly(filled, [np.concatenate([left, right[::-1]])], (80, 160, 0))
+        shown = cv2.addWeighted(filled, 0.3, shown, 0.7, 0.0)
+        for edge, colour in ((left, (0, 120, 255)), (right, (255, 160, 0))):
+            cv2.polylines(shown, [edge], False, colour, 2 * thick, cv2.LINE_AA)
+    size, font = 0.3 * thick, cv2.FONT_HERSHEY_SIMPLEX
+    place = int(30 * size), int(50 * size)
+    for grey, width in ((0, 3 * thick), (255, thick)):
+        style = font, size, (grey, grey, grey), width, cv2.LINE_AA
+        cv2.putText(shown, lane.describe(), place, *style)
+    return np.asarray(shown, np.uint8)
+
+
+_MAX_PAIRS, _MIN_POINTS = 4000, 20  # pairs of points, and points
+_TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
+_LINE_TOLERANCE = 0.004  # distance of a point from its line, of the focal length
+_SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
+_TILTS, _HEIGHTS = (-0.14, 0.45), (0.8, 3.0)  # rad, m
+_NEAR, _FAR, _HEADING = 6.0, 30.0, 0.12  # m, m, rad: beyond a bonnet, where markings are wide
+_STRAIGHT = 0.003, 0.01, 0.05  # 1/m, rad, rad: curvature, pitch and roll of the lane that shows it
+
+
+def make_lane_finder(camera: Pinhole, lane_width: float) -> LaneFinder:
+    """Make a finder of the car's own lane, beyond its bonnet."""
+    view = FieldOfView(_HEADING, 0.5 * lane_width)
+    return LaneFinder(camera, lane_width, _NEAR, _FAR, view=view)
+
+
+def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
+    """Estimate the tilt and the height of a camera from a picture of a straight lane.
+
+    Those that the camera has are not used. Raises ValueError if two markings are not found, or fit
+    no straight lane from a car's height.
+    """
+    if (pair := _find_pair(*_find_ridges(camera, picture))) is None:
+        raise ValueError("no lane: no pair of markings was found; pass the camera tilt and height")
+    (a, b), (c, d) = pair  # across = a + b down, left and right
+    down = (a - c) / (d - b)
+    tilt = atan(-down)
+    height = lane_width * cos(tilt) / (d - b)
+    mounted_camera = dataclasses.replace(camera, tilt=tilt, height=height)
+    finder = make_lane_finder(mounted_camera, lane_width)
+    finder.find(picture)
+    straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
+    if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
+        what = f"for a camera {height:.2f} m high and tilted by {tilt:.3f} rad"
+        raise ValueError(f"no lane: the best markings fit no straight lane {what}; pass both")
+    return mounted_camera
+
+
+def _find_ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
+    """Bright ridges across the rows: points (n, 2) on the plane one unit ahead, weights (n,)."""
+    grey = resample(picture if picture.ndim == 2 else picture.max(2))
+    rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
+    smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0)
+    light = -16.0 * cv2.Laplacian(smooth, cv2.CV_32F)
+    middle = light[:, 1:-1]
+    level = max(8.0, 4.0 * 1.4826 * float(np.median(np.abs(middle))))
+    is_ridge = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
+    row, column = np.nonzero(is_ridge[::2])
+    pixels = np.stack([column + 1.5, 2.0 * row + rows.start + 0.5], 1)
+    pixels = pixels * camera.size[0] / WORKING_WIDTH - 0.5
+    weight = np.minimum(middle[::2][row, column], 40.0).astype(float)
+    return camera.undistort(pixels) if len(pixels) else pixels, weight
+
+
+def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
+    """(left, right) markings by random consensus: each (2,), a and b of across = a + b down."""
+    if len(points) < _MIN_POINTS:
+        return None
+    across, down = points.T
+    rng = np.random.Generator(np.random.SFC64(len(points)))
+    sums = np.cumsum(weight)
+    i, j = np.searchsorted(sums, rng.random((2, _MAX_PAIRS)) * sums[-1]).clip(max=len(points) - 1)
+    with np.errstate(all="ignore"):
+        b = (across[j] - across[i]) / (down[j] - down[i])
+    is_marking = (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
+    is_marking &= np.abs(down[j] - down[i]) > 0.05
+    b, i = b[is_marking, None], i[is_marking]
+    a = across[i, None] - b * down[i, None]
+    support = (np.abs(across - a - b * down) < _LINE_TOLERANCE * (1.0 + np.abs(b))) @ weight
+    a, b = a[:, 0], b[:, 0]
+    left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
+    if not (len(left) and len(right)):
+        return None
+    spread = b[right] - b[left, None]  # a lane's: a wider pair holds another lane too
+    support_l, support_r = support[left, None], support[right]
+    score = np.minimum(support_l, support_r) + 0.25 * (support_l + support_r)
+    tilts = np.arctan((a[right] - a[left, None]) / spread)
+    score *= ((tilts > _TILTS[0]) & (tilts < _TILTS[1])) / (1.0 + 0.1 * spread)
+    best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
+    lines = []
+    for k in (left[best_left], right[best_right]):
+        start, slope = a[k], b[k]
+        for _ in range(3):
+            near = np.abs(across - start - slope * down) < _LINE_TOLERANCE * (1.0 + abs(slope))
+            slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
+        lines.append(np.array([start, slope]))
+    return lines[0], lines[1]

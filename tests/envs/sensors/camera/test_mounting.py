@@ -10,14 +10,16 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.sensors.camera.images import Image, Pinhole, RoadRenderer, RoadScene
-from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder
-from sideslip.envs.sensors.camera.pictures import (
+from sideslip.envs.sensors.camera.images import (
+    Image,
+    Pinhole,
+    RoadRenderer,
+    RoadScene,
     calibrate_camera,
-    estimate_mounting,
     make_default_camera,
     read_picture,
 )
+from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder, estimate_mounting
 from sideslip.envs.vehicle.dynamics import RoadParams
 
 ROOT = Path(__file__).resolve().parents[4]
