@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from .sensors.link import SlowSensor
 from .sensors.slow import SLOW_NAMES, VALUES
 
 Array = npt.NDArray[np.float64]
+MOVING_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 
 
 class Fast(NamedTuple):
@@ -123,3 +125,28 @@ class Log:
     def time(self) -> Array:
         """Time of each row (s), shape (n,)."""
         return np.asarray(self.record.ticks * self.record.dt, np.float64)
+
+    @property
+    def heading(self) -> Array:
+        """The integral of the logged yaw rate (rad), 0 at the first row, shape (n,)."""
+        gamma = self.record.fast[:, FAST.gyro]
+        steps = 0.5 * (gamma[1:] + gamma[:-1]) * self.record.dt
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def speed(self) -> Array:
+        """The mean speed of the front wheels (m/s), shape (n,)."""
+        fast = self.record.fast
+        return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
+
+    @property
+    def is_moving(self) -> npt.NDArray[np.bool_]:
+        """Whether the car is fast enough to judge, shape (n,)."""
+        return np.asarray(self.speed > MOVING_SPEED)
+
+    @property
+    def is_backward(self) -> npt.NDArray[np.bool_]:
+        """Whether it drives backward: the speed is negative, or the truth about half a turn."""
+        beta = self.truth.get("beta", np.zeros(len(self.time)))
+        turn = np.abs(np.nan_to_num(beta)) / math.pi
+        return np.asarray((self.speed < 0.0) | ((turn > 0.75) & (turn < 1.01)))

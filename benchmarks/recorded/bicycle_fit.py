@@ -17,7 +17,7 @@ from scipy.stats import t as student
 
 from ...envs.engine.config import make_car
 from ...envs.numerics.jit import jit
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, MOVING_SPEED, PACKET, Array, Log
 from ...envs.vehicle import dynamics
 from ...envs.vehicle.dynamics import CarParams, Motion
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
@@ -29,13 +29,11 @@ from ...envs.vehicle.tyres import (
     TyreInputs,
     compute_tyre_load,
 )
-from .motion import LoggedMotion
 from .quality import find_saturated
 
 _STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 _BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
 _REACH = _BURN + _WINDOW + 2.0 * _MARGIN  # s, of the rows from a window's start on
-_MIN_SPEED = 4.0  # m/s, in a window
 _ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
 _STRETCHES = 40  # at most, of the log, which the intervals take for independent
 
@@ -113,7 +111,7 @@ def _compute_courses(log: Log, every: int, count: int) -> Array:
     packets = log.record.select_packets("gps")
     fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
     places = fixes[:, PACKET.captured] - log.record.first
-    turned = np.interp(places, np.arange(len(log.time)), LoggedMotion(log).heading)
+    turned = np.interp(places, np.arange(len(log.time)), log.heading)
     near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
     courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
     return courses
@@ -143,10 +141,10 @@ class Windows:
         every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
         before, after = (round(seconds / (every * dt)) for seconds in (_MARGIN, _REACH))
         for log in logs:
-            fast, motion = log.record.fast.T, LoggedMotion(log)
+            fast = log.record.fast.T
             rows = np.stack([
-                fast[FAST.gyro], fast[FAST.accel_y], motion.speed, fast[FAST.steer],
-                fast[FAST.torque_left], fast[FAST.torque_right], motion.heading,
+                fast[FAST.gyro], fast[FAST.accel_y], log.speed, fast[FAST.steer],
+                fast[FAST.torque_left], fast[FAST.torque_right], log.heading,
                 np.zeros(len(log.time)),
             ])  # fmt: skip
             rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
@@ -157,7 +155,7 @@ class Windows:
             rows[7] = _compute_courses(log, every, rows.shape[1])
             for start in range(before, rows.shape[1] - after, round(_WINDOW / (every * dt))):
                 piece = slice(start, start + after)
-                if not bad[piece].any() and rows[2, piece].min() >= _MIN_SPEED:
+                if not bad[piece].any() and rows[2, piece].min() >= MOVING_SPEED:
                     starts.append(first + start)
             first += rows.shape[1]
             pieces.append(rows)

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, MOVING_SPEED, PACKET, Array, Log
 from ...envs.recordings.dialect import SENSORS, SLOW_QUANTITIES, TRUTH, find_sampling
 from ...envs.recordings.log_file import MAX_HOLE, NEEDED
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.filters import FILTERS
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from . import quality
-from .motion import COURSE, MIN_SPEED, FixDifferences, LoggedMotion, estimate_slips
 from .quality import BLOCKER, FACTOR, MIN_TURNING, OK, WARNING, LogFinding
+from .sensor_noise import COURSE, FixDifferences, estimate_slips
 
 _ALLOWED = dict(FILTERS["joint"].options)  # standard deviations of what `joint` finds by itself
 _DEGREES = 180.0 / math.pi
@@ -82,7 +82,7 @@ class InspectedDrive:
         """Moving parts with the model's sideslip for truth; none where columns contradict."""
         if any(finding.level == BLOCKER for finding in self.contradictions):
             return []
-        parts = [x for x in self.logs if LoggedMotion(x).is_moving.sum() * x.record.dt > 2.0]
+        parts = [x for x in self.logs if x.is_moving.sum() * x.record.dt > 2.0]
         slips = estimate_slips(parts, self.car, AS_LOGGED) if parts else []
         pairs = zip(parts, slips, strict=True)
         return [replace(log, truth={"beta": slip}) for log, slip in pairs]
@@ -117,8 +117,8 @@ def _divide_speeds(logs: Sequence[Log]) -> float:
     for log in (log for log in logs if "gps" in log.slow):
         fixes = log.record.select_packets("gps")
         rows = (fixes[:, PACKET.captured] - log.record.first).astype(int)
-        inside = (rows >= 0) & (rows < len(log.time)) & (fixes[:, PACKET.value + 1] > MIN_SPEED)
-        ratios.append(LoggedMotion(log).speed[rows[inside]] / fixes[inside, PACKET.value + 1])
+        inside = (rows >= 0) & (rows < len(log.time)) & (fixes[:, PACKET.value + 1] > MOVING_SPEED)
+        ratios.append(log.speed[rows[inside]] / fixes[inside, PACKET.value + 1])
     merged = np.concatenate(ratios)
     return float(np.median(merged)) if len(merged) >= 20 else math.nan
 
@@ -181,7 +181,7 @@ def _check_sampling(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 def _check_stuck(drive: InspectedDrive) -> Iterator[LogFinding]:
     for log in drive.logs:
-        fast, speed, dt = log.record.fast, LoggedMotion(log).speed, log.record.dt
+        fast, speed, dt = log.record.fast, log.speed, log.record.dt
         turning, pulled = speed * fast[:, FAST.gyro], np.cumsum(fast[:, FAST.accel_x]) * dt
         others = {"gyro": fast[:, FAST.accel_y], "accel_y": turning, "steer": turning}
         width = max(round(0.2 / dt), 1)
@@ -192,7 +192,7 @@ def _check_stuck(drive: InspectedDrive) -> Iterator[LogFinding]:
             ends = np.flatnonzero(np.diff(x, prepend=math.nan, append=math.nan) != 0.0)
             start, stop = max(itertools.pairwise(ends), key=lambda x: x[1] - x[0])
             after = other[start + round(_STUCK / dt) : stop]  # a step of steering needs a second
-            usable = len(after) > width and speed[start:stop].mean() > MIN_SPEED
+            usable = len(after) > width and speed[start:stop].mean() > MOVING_SPEED
             smooth = np.convolve(after, np.ones(width) / width, "valid") if usable else np.zeros(1)
             moved, size = np.ptp(smooth), 0.0 if other is pulled else np.abs(smooth).max()
             text = f"no change for {(stop - start) * dt:.3g} s, while others show {moved:.2g} m/s2"
@@ -228,7 +228,7 @@ def _check_scale(drive: InspectedDrive) -> Iterator[LogFinding]:
 def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
     rest = [np.zeros(0)]
     for log in drive.logs:
-        still = np.abs(LoggedMotion(log).speed) < _STANDING
+        still = np.abs(log.speed) < _STANDING
         rest.append(log.record.fast[still, FAST.gyro])
     gyro, bias, where = np.concatenate(rest), 0.0, "at rest"
     if drive.logs and len(gyro) * drive.logs[0].record.dt > _REST:
@@ -295,11 +295,10 @@ def _check_resolution(drive: InspectedDrive) -> Iterator[LogFinding]:
 
 def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:
     if drive.logs:
-        motions = [(log.record.fast, LoggedMotion(log)) for log in drive.logs]
-        turning = [(x.speed * fast[:, FAST.gyro])[x.is_moving] for fast, x in motions]
+        turning = [(x.speed * x.record.fast[:, FAST.gyro])[x.is_moving] for x in drive.logs]
         merged = np.concatenate(turning)
         size = float(np.std(merged)) if len(merged) else 0.0
-        text = f"speed x yaw rate has {size:.2g} m/s2 RMS above {MIN_SPEED:g} m/s"
+        text = f"speed x yaw rate has {size:.2g} m/s2 RMS above {MOVING_SPEED:g} m/s"
         cure = f"turn: {MIN_TURNING:g} m/s2 and more show tyres and signs"
         yield _judge("excitation", "yaw_rate", size < MIN_TURNING, text, cure)
 

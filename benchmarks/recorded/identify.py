@@ -19,9 +19,9 @@ from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import Estimate
 from ..report.study import format_verdict
-from . import motion, quality
+from . import quality, sensor_noise
 from .bicycle_fit import PRIOR, BicycleFit, Theta, Windows, fit
-from .motion import Finding, LoggedMotion
+from .sensor_noise import Finding
 
 TYRES = ("linear", "fiala")
 _MIN_WINDOWS = 6
@@ -89,10 +89,10 @@ def identify(
         sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
-    slips = motion.estimate_slips(logs, result.car, result.wires)
-    both = (motion.estimate_slips(logs, car, wires), slips)
+    slips = sensor_noise.estimate_slips(logs, result.car, result.wires)
+    both = (sensor_noise.estimate_slips(logs, car, wires), slips)
     result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
-    findings, noise, latency = motion.make_sensor_findings(logs, slips)
+    findings, noise, latency = sensor_noise.make_sensor_findings(logs, slips)
     result.findings += findings
     result.wires = result.wires._replace(noise=noise, latency={**result.wires.latency, **latency})
     return result
@@ -180,14 +180,14 @@ def _fit_latencies(w: Windows, base: BicycleFit) -> tuple[list[Finding], Bicycle
     free = fit(w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.halves[name], float(getattr(free.theta, name))
-        is_determined, remark = half < motion.LATE_WITHIN, "within its interval of 0"
+        is_determined, remark = half < sensor_noise.LATE_WITHIN, "within its interval of 0"
         if is_determined and abs(value) > half:
             single_fit = fit(w, base.theta, (*base.free, name), base.scale)
             share = np.linalg.norm(_evaluate_folds(w, single_fit) / base.scale) / usual
             pays += [name] if share < _MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
-        text = remark if is_determined else motion.WIDE
+        text = remark if is_determined else sensor_noise.WIDE
         rows.append(Finding(label, 0.0, value, half, "s", is_determined, text))
     best = fit(w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
@@ -215,7 +215,7 @@ def _make_car_findings(
         at, shifted = float(getattr(best.theta, name)), float(getattr(free.theta, name))
         half = math.hypot(best.halves.get(name, math.inf), shifted - at)
         is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
-        remark = "" if is_determined else motion.WIDE
+        remark = "" if is_determined else sensor_noise.WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
         elif label == "steering sign":
@@ -231,7 +231,7 @@ def _make_car_findings(
 def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     """RMS of the sideslip's error (rad) where logs have the truth; NaN where none has."""
     errors = [
-        (slip - log.truth.get("beta", math.nan))[LoggedMotion(log).is_moving]
+        (slip - log.truth.get("beta", math.nan))[log.is_moving]
         for log, slip in zip(logs, slips, strict=True)
     ]
     known = np.concatenate(errors)

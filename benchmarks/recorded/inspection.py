@@ -22,7 +22,6 @@ from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import Column, ResultTable, Suite
 from ..report.study import MAX_NIS, describe_innovations, format_verdict
 from .checks import CHECKS, InspectedDrive
-from .motion import LoggedMotion
 from .quality import BLOCKER, LEVELS, OK, WARNING, LogFinding, estimate_resolution
 
 if TYPE_CHECKING:
@@ -112,7 +111,7 @@ def _predict(log: Log, car: Vehicle) -> Prediction:
     filter_ = call_quietly(make_estimator, FILTER, vehicle=car, **facts)
     estimates = filter_.run(log)
     deviation = estimates.std[:, estimates.names.index("beta")]
-    moving = LoggedMotion(log).is_moving & (log.time >= log.time[0] + SETTLED)
+    moving = log.is_moving & (log.time >= log.time[0] + SETTLED)
     usual = float(np.median(deviation[moving])) if moving.any() else math.nan
     used = np.isfinite(estimates.nis)
     sensors = [SLOW_NAMES[int(i)] for i in log.record.packets[used, PACKET.sensor]]

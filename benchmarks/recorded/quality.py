@@ -13,7 +13,6 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import WARNING_PREFIX
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.wires import AS_LOGGED, SignalCalibration
-from .motion import LoggedMotion
 
 BLOCKER, WARNING, OK = LEVELS = ("BLOCKER", "WARNING", "OK")
 """Levels: no estimate is right before it is cured; an estimate is worse; nothing to do."""
@@ -76,13 +75,13 @@ def _get_columns(log: Log) -> dict[str, Array]:
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
     columns = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
     columns |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
-    return {"speed": LoggedMotion(log).speed, **columns}
+    return {"speed": log.speed, **columns}
 
 
 def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
     """Mask of a column's rows beside a jump that no car makes, or between two."""
-    x, motion = _get_columns(log)[name], LoggedMotion(log)
-    known = np.isfinite(x) & (motion.is_moving | (name == "speed")) & ~motion.is_backward
+    x = _get_columns(log)[name]
+    known = np.isfinite(x) & (log.is_moving | (name == "speed")) & ~log.is_backward
     if known.sum() < _FEW:
         return np.zeros(len(x), np.bool_)
     x = np.interp(log.time, log.time[known], x[known])
@@ -106,9 +105,9 @@ def smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
     """
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
-        dt, raw, motion = log.record.dt, _get_columns(log), LoggedMotion(log)
+        dt, raw = log.record.dt, _get_columns(log)
         width, none = max(round(_SMOOTH / dt), 1), np.zeros(len(log.time))
-        bad = ~motion.is_moving | motion.is_backward
+        bad = ~log.is_moving | log.is_backward
         for name in _JUMPS.keys() & raw.keys():
             bad |= _find_jumps(log, name) | ~np.isfinite(raw[name])
         used = uniform_filter1d(bad.astype(float), width + 2, mode="nearest") < 1e-9
@@ -223,11 +222,11 @@ def find_swapped(logs: Sequence[Log]) -> str:
 
 def _describe_zeros(logs: Sequence[Log], name: str) -> list[LogFinding]:
     """A finding if a column is filled with zeros where the car turns."""
-    x, moves = [np.zeros(0)], sum(LoggedMotion(log).is_moving.sum() for log in logs)
+    x, moves = [np.zeros(0)], sum(log.is_moving.sum() for log in logs)
     for log in (log for log in logs if name in _get_columns(log)):
         columns = _get_columns(log)
         turns = np.hypot(columns["speed"] * columns["gyro"], columns.get("accel_y", 0.0)) > 1.0
-        x.append(columns[name][turns & LoggedMotion(log).is_moving])
+        x.append(columns[name][turns & log.is_moving])
     values, counts = np.unique(np.concatenate(x), return_counts=True)
     zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
     if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
@@ -249,17 +248,17 @@ def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
     """
     parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
-        fixes, motion = log.record.select_packets("gps"), LoggedMotion(log)
+        fixes = log.record.select_packets("gps")
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
-        good[good] &= (motion.is_moving & ~motion.is_backward)[place[good]]
+        good[good] &= (log.is_moving & ~log.is_backward)[place[good]]
         place, course = place[good], fixes[good, PACKET.value]
         if len(place) < 2:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
         n = max(math.ceil(lag / (usual * log.record.dt) - 1e-9), 1)
         slip = log.truth.get("beta", np.zeros(len(log.time)))
-        columns = np.stack([np.unwrap(course), motion.heading[place], slip[place]])
+        columns = np.stack([np.unwrap(course), log.heading[place], slip[place]])
         steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
         parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
     return np.concatenate(parts, axis=1)

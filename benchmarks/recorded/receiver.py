@@ -74,7 +74,6 @@ class _Signal(NamedTuple):
     """A filtered quantity of a receiver's fixes."""
 
     name: str
-    unit: str  # of the values
     axes: int  # number of axes; two are real and imaginary part
     z: npt.NDArray[np.complex128]  # values, shape (n,)
     base_size: Array  # size of the noise beside HDOP, shape (n,)
@@ -99,12 +98,12 @@ def _make_signals(track: _Track) -> list[_Signal]:
     """Make position and course, scored where the car moves; ValueError for too few fixes."""
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     positions = np.asarray(track.east + 1j * track.north, np.complex128)
-    position = _Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
+    position = _Signal("position", 2, positions, np.ones(len(positions)), 20.0, track, moving)
     has_course = (track.speed >= COURSE_SPEED) & np.isfinite(track.course)
     part = _Track(track.origin, *(column[has_course] for column in track[1:]))
     all_fixes: Mask = np.ones(len(part.t), bool)
     angle = np.asarray(part.course, np.complex128)
-    course = _Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
+    course = _Signal("course", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
     scored = []
     for signal in (position, course):
         known = signal.scored & np.isfinite(_predict_fixes(signal, signal.base_size**2, 1.0)[0])
@@ -265,7 +264,7 @@ def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
 def _add_table(
     suite: Suite, replay: ReceiverReplay, signal: _Signal, results: Mapping[str, _NoiseLawResult]
 ) -> None:
-    scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
+    scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, "m")
     records = []
     for law, result in results.items():
         rms = np.sqrt(np.mean(result.error**2))

@@ -28,8 +28,8 @@ from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import Estimate, compute_honesty
 from ..report.study import describe_innovations, describe_leader, format_verdict
 from .identify import identify_file
-from .motion import GYRO_ONLY, LoggedMotion
 from .quality import TRUTH, sort_remarks
+from .sensor_noise import GYRO_ONLY
 
 _BOTH, _GPS = ("gps", "camera"), ("gps",)
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -88,7 +88,7 @@ def _emulate_course(log: Log, settings: Settings, seed: int) -> Log:
     course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
     ticks that are whole periods, none where the truth is unknown.
     """
-    record, motion, beta = log.record, LoggedMotion(log), log.truth["beta"]
+    record, beta = log.record, log.truth["beta"]
     if settings.course_rate * record.dt > 1.0 + 1e-6:
         raise ValueError(
             f"a course at {settings.course_rate:g} Hz needs a log at least as fast; "
@@ -97,11 +97,11 @@ def _emulate_course(log: Log, settings: Settings, seed: int) -> Log:
     rows, late = round(1.0 / (settings.course_rate * record.dt)), round(settings.delay / record.dt)
     captured = np.arange(-record.first % rows, len(beta), rows)
     noise = np.random.default_rng(seed).standard_normal(len(captured))
-    exact = (beta + motion.heading)[captured] + math.radians(settings.bias_deg)
+    exact = (beta + log.heading)[captured] + math.radians(settings.bias_deg)
     course = np.full(len(beta), np.nan)
     course[captured] = exact + math.radians(settings.course_noise_deg) * noise
     course[max(len(beta) - late, 0) :] = np.nan  # these would arrive after the end
-    values = {"time": log.time, "speed_x": motion.speed, "course": course}
+    values = {"time": log.time, "speed_x": log.speed, "course": course}
     values["gps_latency"] = np.full(len(beta), late * record.dt)
     packets, _ = make_packets(values, record.first, record.dt)
     gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
@@ -126,7 +126,7 @@ class ReplayResult:
     """Errors of one vehicle's estimators on one drive, by estimator."""
 
     # by seed: mean squared error (rad2), NEES, fraction of errors in the 95 % interval, mean log
-    # score, shape (seeds, 4); empty without truth
+    # score, shape (seeds, 4), the best median log score first; empty without truth
     scores: dict[str, Array] = field(default_factory=dict)
     nis: dict[str, float] = field(default_factory=dict)  # mean, a value of a packet; first seed
     traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
@@ -147,12 +147,6 @@ class ReplayResult:
         """
         return _compute_range(np.sqrt(self.scores[name][:, 0] / self.scores[other][:, 0]))
 
-    def rank_by_score(self) -> dict[str, float]:
-        """Rank by the median log score, best first: medians of the share that intervals hold."""
-        medians = {name: np.median(rows, axis=0) for name, rows in self.scores.items()}
-        ranked = sorted(medians, key=lambda name: -float(medians[name][3]))
-        return {name: float(medians[name][2]) for name in ranked}
-
 
 def _compute_range(values: Array) -> Estimate:
     return Estimate(*(float(function(values)) for function in (np.median, np.min, np.max)))
@@ -161,7 +155,7 @@ def _compute_range(values: Array) -> Estimate:
 def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
     """Run every wanted estimator that the drives' slow sensors serve over every drive."""
     log, result = drives[0], ReplayResult()
-    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~LoggedMotion(log).is_backward
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~log.is_backward
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
         text = f"the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
@@ -201,6 +195,8 @@ def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings)
                 numbers.append((np.mean(wrong**2), *honesty))
         if truth is not None:
             result.scores[name] = np.array(numbers)
+    ranked = sorted(result.scores.items(), key=lambda item: -float(np.median(item[1][:, 3])))
+    result.scores = dict(ranked)
     return result
 
 
@@ -317,7 +313,8 @@ def _compose_verdict(result: ReplayResult, emulated: bool) -> str:
             describe_innovations(result.nis),
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
         )
-    best, share = next(iter(result.rank_by_score().items()))
+    best, scores = next(iter(result.scores.items()))
+    share = float(np.median(scores[:, 2]))
     rmse = {name: DEGREES * errors.value for name, errors in result.rmse.items()}
     first, *rest = rmse
     over = {name: result.compare(first, name) for name in rest}
@@ -356,7 +353,7 @@ def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings
         text.append(f"{settings.gyro_bias_degps:g} deg/s are added to the gyro.")
     if "beta" in log.truth:
         text.append(f"Errors count from {SETTLED:g} s on.")
-        if count := int(LoggedMotion(log).is_backward.sum()):
+        if count := int(log.is_backward.sum()):
             text.append(f"{count} rows are driven backward, and not scored.")
     else:
         text.append("The log has no sideslip truth, so nothing is scored.")
@@ -384,7 +381,7 @@ def _add_rows(
         records[name] = record
     where = {"scenario": scenario, "salt": f"seed {how.seed}", "spec": spec}
     suite.add_rows(records.values(), env_version=f"replay {__version__}", **where)
-    return [records[name] for name in result.rank_by_score() or records]
+    return [records[name] for name in result.scores or records]
 
 
 def _make_table(

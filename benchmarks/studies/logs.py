@@ -18,7 +18,6 @@ from ...estimators.wires import apply_wires, read_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import HONESTY, Column, ResultTable, Suite
 from ..harness.stats import compute_honesty
-from ..recorded.motion import LoggedMotion
 from ..report.study import Request, Study, format_verdict
 
 _FILE = Path(__file__).with_suffix(".toml")
@@ -63,9 +62,9 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def _find_scored(log: Log) -> npt.NDArray[np.bool_]:
-    truth, motion = log.truth.get("beta", np.full(len(log.time), np.nan)), LoggedMotion(log)
+    truth = log.truth.get("beta", np.full(len(log.time), np.nan))
     is_settled = log.time >= log.time[0] + SETTLED - 1e-9
-    return np.asarray(is_settled & motion.is_moving & ~motion.is_backward & np.isfinite(truth))
+    return np.asarray(is_settled & log.is_moving & ~log.is_backward & np.isfinite(truth))
 
 
 def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:

@@ -14,7 +14,6 @@ import pytest
 from rich.console import Console
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.recorded.motion import LoggedMotion
 from sideslip.benchmarks.recorded.quality import (
     COMPASS,
     TRUTH,
@@ -105,7 +104,7 @@ def filled(log: Log, value: float) -> Log:
     fixes = log.record.packets
     courses = np.full(len(log.time), value)
     courses[(fixes[:, PACKET.captured] - log.record.first).astype(int)] = fixes[:, PACKET.value]
-    values = {"time": log.time, "speed_x": LoggedMotion(log).speed, "course": courses}
+    values = {"time": log.time, "speed_x": log.speed, "course": courses}
     packets, _ = make_packets(values, log.record.first, log.record.dt)
     return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
 
@@ -113,7 +112,7 @@ def filled(log: Log, value: float) -> Log:
 def of_heading(log: Log) -> Log:
     noise = np.random.default_rng(0).normal(0.0, 0.002, len(log.record.packets))
     rows = (log.record.packets[:, PACKET.captured] - log.record.first).astype(int)
-    return changed(log, course=lambda x: LoggedMotion(log).heading[rows] + noise)
+    return changed(log, course=lambda x: log.heading[rows] + noise)
 
 
 def make_warnings(logs: list[Log], car: Vehicle) -> list[str]:
@@ -226,7 +225,7 @@ def test_rows_driven_backward_are_not_scored(tmp_path: Path, signed: bool) -> No
     (row,) = (r for r in suite.rows if r.metric == "rmse")
     assert row.value < 1.0 * DEG
     assert "450 rows are driven backward, and not scored" in suite.text
-    assert not LoggedMotion(clean()).is_backward.any()
+    assert not clean().is_backward.any()
 
 
 def test_warnings_stand_over_the_verdict(tmp_path: Path) -> None:

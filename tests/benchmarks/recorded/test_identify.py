@@ -18,8 +18,8 @@ from sideslip.benchmarks.recorded.identify import (
     _split_blocks,
     identify,
 )
-from sideslip.benchmarks.recorded.motion import Finding, _estimate_white_noise, _jackknife
 from sideslip.benchmarks.recorded.quality import find_contradictions, find_saturated, find_swapped
+from sideslip.benchmarks.recorded.sensor_noise import Finding, _estimate_white_noise, _jackknife
 from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.studies.logs import STUDY
 from sideslip.envs.record import FAST, Array, Log

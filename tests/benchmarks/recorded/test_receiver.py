@@ -59,7 +59,7 @@ def log_of(epochs: list[Epoch], path: Path) -> Path:
 def position_of(track: receiver._Track) -> receiver._Signal:
     n = len(track.t)
     where = np.asarray(track.east + 1j * track.north, np.complex128)
-    return receiver._Signal("position", "m", 2, where, np.ones(n), 20.0, track, np.ones(n, bool))
+    return receiver._Signal("position", 2, where, np.ones(n), 20.0, track, np.ones(n, bool))
 
 
 def test_predictions_are_gaussian_conditioning() -> None:

@@ -10,7 +10,6 @@ import pytest
 from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
-from sideslip.benchmarks.recorded.motion import GYRO_ONLY, LoggedMotion
 from sideslip.benchmarks.recorded.replay import (
     ESTIMATORS,
     Settings,
@@ -19,6 +18,7 @@ from sideslip.benchmarks.recorded.replay import (
     replay,
     replay_file,
 )
+from sideslip.benchmarks.recorded.sensor_noise import GYRO_ONLY
 from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators import make_estimator
@@ -135,7 +135,7 @@ def test_a_log_without_truth_or_slow_sensors_says_what_is_left_out(tmp_path: Pat
 def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
     course = np.full(ROWS, np.nan)
     plain = read_log(saved(tmp_path))
-    heading = plain.truth["beta"] + LoggedMotion(plain).heading + 0.7  # another zero of heading
+    heading = plain.truth["beta"] + plain.heading + 0.7  # another zero of heading
     course[::20] = heading[::20]
     log = read_log(saved(tmp_path, course_rad=course))
     suite = replay(log, PASSENGER_CAR, figures=False)
@@ -256,7 +256,7 @@ def test_the_noise_has_its_seed_and_size(log: Log) -> None:
     how = Settings(course_rate=100.0, course_noise_deg=0.5)
     one, same, other = (_emulate_course(log, how, seed).record.packets for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
-    noise = one[:, PACKET.value] - (log.truth["beta"] + LoggedMotion(log).heading)
+    noise = one[:, PACKET.value] - (log.truth["beta"] + log.heading)
     assert np.std(noise) == pytest.approx(0.5 * DEG, rel=0.1)
     assert not np.array_equal(one, other)
 

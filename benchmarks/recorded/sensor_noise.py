@@ -1,11 +1,10 @@
-"""Motion, and noise and latency of sensors, in a drive; intervals are jackknives over blocks."""
+"""Noise and latency of the sensors in a recorded drive; intervals are jackknives over blocks."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import Vehicle
@@ -16,42 +15,10 @@ from ..harness.stats import margin_of_error
 GYRO_ONLY = "bicycle-kf"
 BLOCKS = 20  # of a log, which the intervals take for independent
 COURSE, SPEED = range(2)  # places in a GPS's values
-MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 WIDE = "its interval is too wide"
 _LATE = (-0.2, 1.2)  # s, of the GPS
 LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
-
-
-class LoggedMotion(NamedTuple):
-    """What a recorded drive says of the car's motion, shape (rows,) each."""
-
-    log: Log
-
-    @property
-    def heading(self) -> Array:
-        """The integral of the logged yaw rate (rad), 0 at the first row."""
-        gamma = self.log.record.fast[:, FAST.gyro]
-        steps = 0.5 * (gamma[1:] + gamma[:-1]) * self.log.record.dt
-        return np.concatenate([[0.0], np.cumsum(steps)])
-
-    @property
-    def speed(self) -> Array:
-        """The mean speed of the front wheels (m/s)."""
-        fast = self.log.record.fast
-        return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
-
-    @property
-    def is_moving(self) -> npt.NDArray[np.bool_]:
-        """Whether it is fast enough to judge."""
-        return np.asarray(self.speed > MIN_SPEED)
-
-    @property
-    def is_backward(self) -> npt.NDArray[np.bool_]:
-        """Whether it is driven backward: the speed is negative, or the truth about half a turn."""
-        beta = self.log.truth.get("beta", np.zeros(len(self.log.time)))
-        turn = np.abs(np.nan_to_num(beta)) / math.pi
-        return np.asarray((self.speed < 0.0) | ((turn > 0.75) & (turn < 1.01)))
 
 
 def estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
@@ -91,8 +58,8 @@ class FixDifferences(NamedTuple):
         """
         blocks = []
         for i, log in enumerate(logs):
-            motion, packets = LoggedMotion(log), log.record.select_packets("gps")
-            signal = motion.heading if value == COURSE else motion.speed
+            packets = log.record.select_packets("gps")
+            signal = log.heading if value == COURSE else log.speed
             part = np.zeros(len(signal)) if slips is None else slips[i]
             packets = packets[packets[:, PACKET.quality] > 0.0]
             if len(packets) <= BLOCKS:
