@@ -334,15 +334,13 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
     for label in channels:
         topic, _, name = label.partition(":")
         fields.setdefault(topic, []).append(name)
-    decoders: dict[int, Callable[[bytes], Any]] = {}
     with Reader(path) as reader:
         topics = sorted({connection.topic for connection in reader.connections})
         if missing := [topic for topic in fields if topic not in topics]:
             raise ValueError(f"no topic {missing[0]!r}; the bag has {join_names(topics)}")
         used = [connection for connection in reader.connections if connection.topic in fields]
+        decoders = {connection.id: _make_decoder(connection) for connection in used}
         for connection, logged, data in reader.messages(used) if used else ():
-            if connection.id not in decoders:
-                decoders[connection.id] = _make_decoder(connection)
             message = decoders[connection.id](data)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             captured = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec

@@ -141,7 +141,6 @@ def _split_line(line: str, separator: str) -> list[str]:
     return list(map(str.strip, entries))
 
 
-Mask = npt.NDArray[np.bool_]
 Quantities = dict[str, Array]
 """Quantities of a log by name, in SI units, angles in rad, shape (n,) each; NaN where unknown."""
 SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sample is
