@@ -7,7 +7,8 @@ import gymnasium as gym
 import numpy as np
 
 from sideslip.agents.rollout import rollout
-from sideslip.envs.record import FAST, PACKET, Array, Log
+from sideslip.benchmarks.harness.drives import draw_steering
+from sideslip.envs.record import FAST, PACKET, Log
 from sideslip.envs.vehicle.parameters import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
 
 from .simulated import decimated
@@ -17,33 +18,12 @@ NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0407}
 
 
 class DrawnCar(NamedTuple):
-    """A car and its logs: one to identify from, one held out.
-
-    ratio: I/(m l_f l_r) of the car. kind: which sensors the first log has. late: s, of the GPS.
-    """
+    """A car and its logs: one to identify from, one held out; late: s, of the GPS."""
 
     car: Vehicle
     log: Log
     held_out: Log
-    ratio: float
-    kind: str
     late: float
-
-
-def steering_trace(rng: np.random.Generator, duration: float, amplitude: float) -> Array:
-    """Sines, and steps that are held, with ramps of 0.25 s between them, in rad at the wheels."""
-    t = np.arange(round(duration / STEP)) * STEP
-    angle = np.zeros(len(t))
-    for _ in range(3):
-        size, frequency, phase = rng.uniform((0.1, 0.08, 0.0), (0.5, 0.9, 6.28))
-        angle += amplitude * size * np.sin(2.0 * np.pi * frequency * t + phase)
-    held, k = np.zeros(len(t)), 0
-    while k < len(t):
-        rows = round(rng.uniform(0.8, 3.0) / STEP)
-        held[k : k + rows] = amplitude * rng.choice([0.0, 0.0, rng.uniform(-0.8, 0.8)])
-        k += rows
-    smooth = np.convolve(held, np.ones(25) / 25.0, "same")
-    return np.asarray((angle + smooth) * np.minimum(1.0, t / 0.5))
 
 
 def scenario_of(car: Vehicle) -> dict[str, Any]:
@@ -110,15 +90,12 @@ def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float
         "gyro_bias": rng.uniform(-0.005, 0.005), "gps_latency": round(rng.uniform(0.1, 0.3), 2),
         "noise": {name: noisy * size for name, size in NOISE.items()},
     }  # fmt: skip
-    kind = ("all", "no accel_y", "no course", "gyro alone")[seed % 4]
     logs = []
     for drive, lasts in enumerate((duration, held_out)):
         changes: dict[str, Any] = {"speed": speed * rng.uniform(0.85, 1.1)} if drive else {}
         size = rng.uniform(0.5, 1.2) * 0.05 * min(1.0, (16.0 / speed) ** 1.2)
-        trace = steering_trace(rng, lasts, size)
+        trace = draw_steering(rng, size, lasts)
         changes |= {"trace": tuple(trace), "duration": lasts}
         logs.append(simulate(scenario | changes, 2 * seed + drive))
-    log = without(
-        logs[0], kind in ("no accel_y", "gyro alone"), kind in ("no course", "gyro alone")
-    )
-    return DrawnCar(car, log, logs[1], ratio, kind, scenario["gps_latency"])
+    log = without(logs[0], accel=seed % 2 == 1, course=seed % 4 >= 2)
+    return DrawnCar(car, log, logs[1], scenario["gps_latency"])

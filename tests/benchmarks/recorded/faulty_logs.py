@@ -82,42 +82,22 @@ def _add_rest(frame: pd.DataFrame, bias: float, rng: np.random.Generator) -> pd.
     return pd.concat([start, later], ignore_index=True)
 
 
-def _times(name: str, low: float, high: float) -> Fault:
-    """A column times a factor."""
-    return lambda x, rng: x.assign(**{name: x[name] * rng.uniform(low, high)})
+def _of(name: str, change: Callable[[Array, np.random.Generator], Array]) -> Fault:
+    """A fault that changes the values of one column."""
+    return lambda x, rng: x.assign(**{name: change(x[name].to_numpy(), rng)})
 
 
-def _scaled(name: str, low: float, high: float) -> Fault:
-    """A column times 1 + so much, or divided by it."""
-    return lambda x, rng: x.assign(
-        **{name: x[name] * (1.0 + rng.uniform(low, high)) ** rng.choice([-1, 1])}
-    )
+def _hold(x: Array, rng: np.random.Generator) -> Array:
+    """Repeat every fifth to twentieth value."""
+    rows = np.arange(len(x))
+    return x[rows - rows % rng.integers(5, 21)]
 
 
-def _added(name: str, low: float, high: float) -> Fault:
-    return lambda x, rng: x.assign(**{name: x[name] + rng.uniform(low, high) * rng.choice([-1, 1])})
-
-
-def _held(name: str) -> Fault:
-    """A column that repeats every fifth to twentieth value."""
-
-    def change(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-        rows = np.arange(len(x))
-        return x.assign(**{name: x[name].to_numpy()[rows - rows % rng.integers(5, 21)]})
-
-    return change
-
-
-def _interpolated(name: str) -> Fault:
-    """A column with lines between every tenth to fiftieth value, or between its samples."""
-
-    def change(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-        values, rows = x[name].to_numpy(), np.arange(len(x))
-        known = np.flatnonzero(np.isfinite(values))
-        known = known[:: int(rng.integers(10, 51))] if len(known) == len(rows) else known
-        return x.assign(**{name: np.interp(rows, known, np.unwrap(values[known]))})
-
-    return change
+def _interpolate(x: Array, rng: np.random.Generator) -> Array:
+    """Draw lines between every tenth to fiftieth value, or between samples."""
+    rows, known = np.arange(len(x)), np.flatnonzero(np.isfinite(x))
+    known = known[:: int(rng.integers(10, 51))] if len(known) == len(rows) else known
+    return np.interp(rows, known, np.unwrap(x[known]))
 
 
 def _gap(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
@@ -152,32 +132,37 @@ def _drift(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     return shift_fixes(x, rate * (np.arange(len(x)) - 0.5 * len(x)) * DT)
 
 
-def _clipped(name: str) -> Fault:
-    def change(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-        limit = rng.uniform(0.4, 0.7) * np.percentile(np.abs(x[name]), 99)
-        return x.assign(**{name: np.clip(x[name], -limit, limit)})
+def _clip(x: Array, rng: np.random.Generator) -> Array:
+    limit = rng.uniform(0.4, 0.7) * np.percentile(np.abs(x), 99)
+    return np.clip(x, -limit, limit)
 
-    return change
+
+def _stop(x: Array, rng: np.random.Generator) -> Array:
+    """Hold a value for the rest of the drive."""
+    start = int(rng.uniform(0.3, 0.6) * len(x))
+    return np.where(np.arange(len(x)) < start, x, x[start])
+
+
+def _times(name: str, low: float, high: float) -> Fault:
+    """A column times a factor."""
+    return _of(name, lambda x, rng: x * rng.uniform(low, high))
+
+
+def _scaled(name: str, low: float, high: float) -> Fault:
+    """A column times 1 + so much, or divided by it."""
+    return _of(name, lambda x, rng: x * (1.0 + rng.uniform(low, high)) ** rng.choice([-1, 1]))
+
+
+def _added(name: str, low: float, high: float) -> Fault:
+    return _of(name, lambda x, rng: x + rng.uniform(low, high) * rng.choice([-1, 1]))
 
 
 def _rounded(name: str, low: float, high: float) -> Fault:
-    def change(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    def change(x: Array, rng: np.random.Generator) -> Array:
         step = rng.uniform(low, high)
-        return x.assign(**{name: step * np.rint(x[name] / step)})
+        return np.asarray(step * np.rint(x / step))
 
-    return change
-
-
-def _stuck(name: str) -> Fault:
-    """A column that stops for the rest of the drive."""
-
-    def change(x: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-        values = x[name].to_numpy().copy()
-        start = int(rng.uniform(0.3, 0.6) * len(x))
-        values[start:] = values[start]
-        return x.assign(**{name: values})
-
-    return change
+    return _of(name, change)
 
 
 def _swapped(one: str, other: str) -> Fault:
@@ -221,11 +206,11 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {  # the fault, the check that finds
     "scale of yaw rate": (_scaled("yaw_rate_radps", 0.15, 0.5), "scale unit", "yaw_rate"),
     "scale of acceleration": (_scaled("accel_y_mps2", 0.3, 0.6), "scale unit", "accel_y"),
     "scale of speed": (_scaled("speed_x_mps", 0.08, 0.4), "scale unit", "speed_x"),
-    "held steering": (_held("steer_rad"), "held", "steer"),
-    "held yaw rate": (_held("yaw_rate_radps"), "held", "yaw_rate"),
+    "held steering": (_of("steer_rad", _hold), "held", "steer"),
+    "held yaw rate": (_of("yaw_rate_radps", _hold), "held", "yaw_rate"),
     "held course": (lambda x, rng: x.ffill().bfill(), "held", "course"),
-    "interpolated speed": (_interpolated("speed_x_mps"), "interpolated", "speed_x"),
-    "interpolated course": (_interpolated("course_rad"), "interpolated", "course"),
+    "interpolated speed": (_of("speed_x_mps", _interpolate), "interpolated", "speed_x"),
+    "interpolated course": (_of("course_rad", _interpolate), "interpolated", "course"),
     "gap": (_gap, "gaps", "time"),
     "outage": (_outage, "gaps", "course"),
     "clock drift": (_drift, "drift", "course"),
@@ -233,13 +218,13 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {  # the fault, the check that finds
     "bias of yaw rate": (_added("yaw_rate_radps", 0.8 / DEG, 3.0 / DEG), "bias", "yaw_rate"),
     "bias of acceleration": (_added("accel_y_mps2", 1.4, 4.0), "bias", "accel_y"),
     "offset of steering": (_added("steer_rad", 1.1 / DEG, 3.0 / DEG), "bias", "steer"),
-    "saturated yaw rate": (_clipped("yaw_rate_radps"), "saturation", "yaw_rate"),
-    "saturated acceleration": (_clipped("accel_y_mps2"), "saturation", "accel_y"),
+    "saturated yaw rate": (_of("yaw_rate_radps", _clip), "saturation", "yaw_rate"),
+    "saturated acceleration": (_of("accel_y_mps2", _clip), "saturation", "accel_y"),
     "coarse yaw rate": (_rounded("yaw_rate_radps", 0.5 / DEG, 2.0 / DEG), "resolution", "yaw_rate"),
     "coarse steering": (_rounded("steer_rad", 0.45 / DEG, 0.8 / DEG), "resolution", "steer"),
-    "stuck yaw rate": (_stuck("yaw_rate_radps"), "stuck", "yaw_rate"),
-    "stuck steering": (_stuck("steer_rad"), "stuck", "steer"),
-    "stuck acceleration": (_stuck("accel_y_mps2"), "stuck", "accel_y"),
+    "stuck yaw rate": (_of("yaw_rate_radps", _stop), "stuck", "yaw_rate"),
+    "stuck steering": (_of("steer_rad", _stop), "stuck", "steer"),
+    "stuck acceleration": (_of("accel_y_mps2", _stop), "stuck", "accel_y"),
     "constant course": (_times("course_rad", 0.0, 0.0), "stuck unrelated held", "course"),
     "steering and yaw rate": (_swapped("steer_rad", "yaw_rate_radps"), "swapped", "steer"),
     "accelerations": (_swapped("accel_x_mps2", "accel_y_mps2"), "swapped", "accel_x"),

@@ -13,6 +13,7 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
+from sideslip.benchmarks.harness.drives import draw_steering
 from sideslip.benchmarks.recorded import identify as identification
 from sideslip.benchmarks.recorded.bicycle_fit import (
     BicycleFit,
@@ -27,7 +28,7 @@ from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 from sideslip.estimators.wires import SignalCalibration, apply_wires
 
-from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, steering_trace, without
+from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, without
 from .simulated import as_table
 from .slalom import columns, saved
 
@@ -44,7 +45,7 @@ def share(car: Vehicle) -> float:
 
 def driven(car: Vehicle, quieter: float = 0.2) -> Log:
     """Mild random steering with sensors and disturbances that are quieter than usual."""
-    trace = steering_trace(np.random.default_rng(3), 60.0, 0.02)
+    trace = draw_steering(np.random.default_rng(3), 0.02, 60.0)
     changes = {
         "speed": 20.0, "surge": 0.7, "duration": 60.0, "trace": tuple(trace), "gps_latency": 0.2,
         "noise": {name: quieter * sd for name, sd in NOISE.items()},

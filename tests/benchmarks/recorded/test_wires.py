@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,14 +12,12 @@ from typer.testing import CliRunner
 from sideslip.benchmarks.cli.data import _parse_estimator_options
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.harness.stats import compute_honesty
-from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.benchmarks.report.study import describe_innovations
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators.wires import SignalCalibration, apply_wires, read_wires, write_vehicle
 
 from .simulated import as_table, drive
-from .slalom import columns, saved
 
 
 def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
@@ -93,15 +90,6 @@ def test_identify_writes_what_replay_reads(tmp_path: Path) -> None:
         assert "WARNING" not in run.output
     run = CliRunner().invoke(app, ["replay", str(path), "--vehicle", "passenger-car", *more])
     assert "WARNING: steering and yaw rate differ in sign" in " ".join(run.output.split())
-
-
-def test_parts_are_replayed_by_themselves(tmp_path: Path) -> None:
-    time = columns()["time_s"] + 3.0 * (np.arange(1001) >= 500)
-    path = saved(tmp_path, time_s=time)
-    settings: dict[str, Any] = {"estimators": ["multirate-kf"], "seeds": 1, "figures": False}
-    suite = replay_file(path, PASSENGER_CAR, **settings)
-    assert "2 parts, between which rows are missing." in suite.text
-    assert {row.scenario.partition(":")[0][-6:] for row in suite.rows} == {"part 1", "part 2"}
 
 
 def test_options_of_estimators() -> None:

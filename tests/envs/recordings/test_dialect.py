@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sideslip.envs.record import FAST, Log
+from sideslip.envs.record import Log
 from sideslip.envs.recordings.dialect import _UNITS, find_unit, to_degrees, to_metres
 from sideslip.envs.recordings.log_file import read_parts
 from sideslip.envs.recordings.tables import COLUMNS, read_quantities
@@ -158,13 +158,6 @@ def test_a_compass_course_is_read_as_one(tmp_path: Path) -> None:
     expected = (90.0 - table["heading"][::20]) * DEG
     np.testing.assert_allclose(np.sin(course), np.sin(expected), atol=1e-12)
     np.testing.assert_allclose(np.cos(course), np.cos(expected), atol=1e-12)
-
-
-def test_a_missing_column_is_told_with_the_option_that_names_it(tmp_path: Path) -> None:
-    path = saved(drive(300).rename(columns={"steer_rad": "Delta"}), tmp_path)
-    with pytest.raises(ValueError, match=r"no column steer_rad; .*--map steer_rad=COLUMN"):
-        read_log(path)
-    assert read_log(path, {"steer_rad": "DELTA"}).record.fast[:, FAST.steer].any()
 
 
 def test_degrees_agree_with_the_earths_own_measures() -> None:

@@ -69,14 +69,6 @@ def test_the_fastest_group_has_the_rows(tmp_path: Path) -> None:
     assert "Interpolated in the rows of yaw_rate" in remarks[0]
 
 
-def test_one_group_that_holds_its_course(tmp_path: Path) -> None:
-    held = signal("course_deg", TIME, np.repeat(np.append(np.zeros(10), COURSE), 20))
-    (log,), remarks = read_parts(written(tmp_path, [*fast(), held]))
-    captured = log.record.select_packets("gps")[:, PACKET.captured] - 300
-    np.testing.assert_array_equal(captured, ROWS)
-    assert "course is held" in remarks[0]
-
-
 def test_what_is_not_valid_is_unknown_and_text_is_ignored(tmp_path: Path) -> None:
     bad = np.arange(len(ROWS)) % 7 == 0
     course = signal("course_deg", TIME[ROWS], np.where(bad, 99.0, COURSE), invalidation_bits=bad)

@@ -104,14 +104,6 @@ def test_a_peer_that_closes_is_called_again_and_nothing_whole_is_lost() -> None:
     assert len(epochs) == len(SECONDS) and source.losses == 1
 
 
-def test_a_peer_that_only_closes_is_given_up() -> None:
-    with peer(lambda connection: None, 4) as text:
-        source = make_source(text, tries=3, wait=0.01)
-        with pytest.raises(ConnectionError, match="not back after 3 tries"):
-            list(source)
-    assert 1 <= source.losses <= 4
-
-
 def test_a_line_is_opened_again_so_many_times_and_no_more() -> None:
     opened = []
 

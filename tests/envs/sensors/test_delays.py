@@ -43,14 +43,23 @@ def delays(found: np.ndarray) -> list[float]:
 @pytest.mark.plain
 @pytest.mark.smoke
 @pytest.mark.parametrize("n", [1, 10, 33])
-def test_camera_of_33_ms_is_30_ms_late(n: int) -> None:
-    found = received(control_period=n)
-    frames = np.arange(len(found))
-    assert len(found) == len(range(0, 2000 // n * n - 30 + 1, 33))
-    assert found[:, CAPTURED].tolist() == (33 * frames).tolist()
-    assert found[:, SEQUENCE].tolist() == frames.tolist()
-    assert set(delays(found)) == {30.0}
-    assert set(found[:, PACKET.sensor]) == {CAMERA}
+@pytest.mark.parametrize(
+    ("sensors", "changes", "period", "late"),
+    [
+        ("vision", {}, 33, 30),
+        ("gps", {}, 200, 0),  # from tick 0 on
+        ("gps", {"gps": {"delays": [0.3]}}, 200, 300),  # longer than the period
+    ],
+)
+def test_a_packet_is_as_late_as_is_said(
+    n: int, sensors: str, changes: dict[str, Any], period: int, late: int
+) -> None:
+    found = received(sensors, control_period=n, **changes)
+    captured = range(0, 2000 // n * n - late + 1, period)
+    assert found[:, CAPTURED].tolist() == list(captured)
+    assert found[:, SEQUENCE].tolist() == list(range(len(captured)))
+    assert set(delays(found)) == {float(late)}
+    assert set(found[:, PACKET.sensor]) == {CAMERA if sensors == "vision" else GPS}
 
 
 @pytest.mark.plain
@@ -69,24 +78,6 @@ def test_a_jitter_reaches_both_its_ends_and_favours_nothing() -> None:
     assert set(late) == {float(ticks) for ticks in range(10, 31)}
     counts = np.unique(late, return_counts=True)[1]
     assert stats.chisquare(counts).pvalue > 1e-3  # one fixed seed: passed once and for all
-
-
-@pytest.mark.plain
-def test_no_delay_arrives_at_its_capture_even_at_tick_0() -> None:
-    env = StabilityEnv("gps", scenario=ENDLESS)
-    env.reset(seed=0)
-    assert env.record.packets[:, [CAPTURED, ARRIVED]].tolist() == [[0.0, 0.0]]
-    found = received("gps")
-    assert found[:, CAPTURED].tolist() == list(range(0, 2001, 200))
-    assert set(delays(found)) == {0.0}
-    assert set(found[:, PACKET.sensor]) == {GPS}
-
-
-@pytest.mark.plain
-def test_gps_latency_of_300_ms_outlasts_the_period() -> None:
-    found = received("gps", gps={"delays": [0.3]})
-    assert found[:, CAPTURED].tolist() == list(range(0, 1701, 200))
-    assert set(delays(found)) == {300.0}
 
 
 @pytest.mark.plain

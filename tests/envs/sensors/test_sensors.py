@@ -87,11 +87,11 @@ def sample_camera(motion: Motion, road: RoadParams) -> Any:
 @pytest.mark.plain
 def test_camera_sample_is_tie_vision_4_with_curvature() -> None:
     motion = Motion(7.0, 0.2, 0.1, 0.5, 30.0, 4.0, 31.0, 1.5, 0.44)
-    for kappa, bend in ((0.0, 0.0), (0.02, 0.02)):
+    for kappa in (0.0, 0.02):
         psi, y_l = sample_camera(motion, RoadParams(kappa, 0.0, 1.0))
         assert psi == pytest.approx(0.06, abs=1e-15)
         # y_l = y_cg + l_pre psi - kappa l_pre^2 / 2
-        assert y_l == pytest.approx(1.5 + 5.135 * 0.06 - bend * 5.135**2 / 2.0, abs=1e-14)
+        assert y_l == pytest.approx(1.5 + 5.135 * 0.06 - kappa * 5.135**2 / 2.0, abs=1e-14)
 
 
 @pytest.mark.plain
