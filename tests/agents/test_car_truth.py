@@ -58,12 +58,10 @@ def test_calibrated_readings_are_those_of_sensors_that_do_not_err() -> None:
 
 def test_what_is_constant_of_a_sensor_costs_an_oracle_nothing() -> None:
     errors = {"camera_yaw": 0.005, "gyro_scale": 0.99, "accel_roll": 0.02, "map_lag": 0.2}
-    costs = [
-        evaluate_episodes(
-            *make_oracle("oracle-parameters-lqr", FUSION, 4, world=world, **SLALOM), range(4)
-        )[0]
-        for world in (errors, "ideal")
-    ]
+    costs = []
+    for world in (errors, "ideal"):
+        driver = make_oracle("oracle-parameters-lqr", FUSION, 4, world=world, **SLALOM)
+        costs.append(evaluate_episodes(*driver, range(4))[0])
     assert bits(costs[0]) == bits(costs[1])
 
 

@@ -153,16 +153,11 @@ def test_what_has_no_known_optimum_is_refused(changes: dict[str, Any], message: 
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize(("share", "noise"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.2)])
-def test_a_policy_costs_the_weighed_squares_of_its_errors_more(
-    env_id: str, share: float, noise: float
-) -> None:
+def test_a_policy_costs_its_squared_errors_more(env_id: str, share: float, noise: float) -> None:
     """The performance difference of an LQG problem, against the costs of the same seeds and against
     what `compute_cost` says of a gain; the squares scatter less."""
-    found, env, rng = (
-        best(env_id),
-        wrap_optimal_estimate(gym.make_vec(env_id, 64)),
-        np.random.default_rng(2),
-    )
+    found, rng = best(env_id), np.random.default_rng(2)
+    env = wrap_optimal_estimate(gym.make_vec(env_id, 64))
     names = [entry.name for entry in env.layout]
     agent, columns = Lqg(env, share * found.gains[0]), [names.index(each) for each in Lqg.needs]
     obs, _ = env.reset(seed=0)

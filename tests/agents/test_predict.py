@@ -22,9 +22,8 @@ STATES = ["beta", "gamma", "d1", "d2"]
 
 @pytest.fixture
 def env() -> gym.Env[Any, Any]:
-    return EstimateObservation(
-        gym.make("sideslip/YawVision-v0", scenario="lane-change"), "bicycle-kf"
-    )
+    bare = gym.make("sideslip/YawVision-v0", scenario="lane-change")
+    return EstimateObservation(bare, "bicycle-kf")
 
 
 NAMES = [VISION if name == "learned" else name for name in AGENTS]

@@ -121,9 +121,8 @@ def test_a_wrapper_that_changes_numbers_takes_their_names_and_leaves_the_cost() 
 def test_an_agent_of_another_full_scale_is_refused() -> None:
     env = EstimateObservation(gym.make("sideslip/YawFusion-v0"), "exact-kf")
     agent = make_agent("lqr", env)
-    scaled = gym.wrappers.RescaleAction(
-        gym.make("sideslip/YawFusion-v0"), np.float32(-2.0), np.float32(2.0)
-    )
+    bare = gym.make("sideslip/YawFusion-v0")
+    scaled = gym.wrappers.RescaleAction(bare, np.float32(-2.0), np.float32(2.0))
     assert "obs_gyro_mean" in sideslip.rollout(scaled).columns
     sideslip.rollout(env, make_agent("none", env), options={"vehicle": "passenger-car"})
     with pytest.raises(ValueError, match=r"full scale is .* N m, the car's 3500"):

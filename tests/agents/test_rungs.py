@@ -42,9 +42,7 @@ WORLDLY = [(rung, AFS, True) for rung in ("oracle-parameters-lqr", "oracle-state
         *(pytest.param(*each, False, marks=pytest.mark.long) for each in RARELY),
     ],
 )
-def test_rows_of_a_vector_env_have_the_bits_of_single_ones(
-    rung: str, env_id: str, in_world: bool
-) -> None:
+def test_rows_of_a_vector_env_have_single_ones_bits(rung: str, env_id: str, in_world: bool) -> None:
     options = {"controller": {} if rung == "nominal" else {"knots": 2}}
     told: Any = SLALOM | {"world": "v1"} if in_world else {"options": options}
     envs, agent = make_oracle(rung, env_id, num_envs=2, **told)
@@ -105,9 +103,8 @@ def test_options_go_to_the_filter_and_the_controller() -> None:
 
 
 def test_levels_are_the_scenarios() -> None:
-    scenario = SCENARIOS["straight"].replace(
-        disturbance_force=7.0, noise={"gyro": 0.1}, hdop_law="table"
-    )
+    changes: Any = {"disturbance_force": 7.0, "noise": {"gyro": 0.1}, "hdop_law": "table"}
+    scenario = SCENARIOS["straight"].replace(**changes)
     levels = make_noise_options(scenario)
     assert levels["force_sd"] == 7.0 and levels["gyro_noise"] == 0.1
     assert levels["hdop_table"] == [(1.0, 1.0), (101.0, 101.0)]

@@ -112,15 +112,9 @@ class Posterior:
     """
 
     def __init__(
-        self,
-        names: Any,
-        record: Record,
-        prior: Any,
-        Q: Any,
-        V: Any,
-        fast: tuple[str, ...] = ("gyro",),
-        factor: Any = lambda hdop: 1.0,
-    ) -> None:
+        self, names: Any, record: Record, prior: Any, Q: Any, V: Any,
+        fast: tuple[str, ...] = ("gyro",), factor: Any = lambda hdop: 1.0,
+    ) -> None:  # fmt: skip
         n, K = len(names), len(record.fast)
         noisy = np.flatnonzero(Q)
         q = len(noisy)

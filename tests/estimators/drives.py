@@ -53,9 +53,8 @@ class Drives:
         push = np.zeros((4, 2))
         push[0, 0], push[1, 1] = 1.0 / (car.mass * self.speed), 1.0 / car.yaw_inertia
         G, H = model.discretise(record.dt)
-        _, D = LinearModel(model.A, push, model.C, model.states, ("F", "N"), ()).discretise(
-            record.dt
-        )
+        pushed = LinearModel(model.A, push, model.C, model.states, ("F", "N"), ())
+        _, D = pushed.discretise(record.dt)
         rest = x[1:] - x[:-1] @ G.T - np.outer(record.fast[1:, FAST.steer], H[:, 0])
         force = rest @ np.linalg.pinv(D).T
         # the plant is that linear model, but for Kutta's error

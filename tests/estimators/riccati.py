@@ -23,14 +23,9 @@ NOISES = {"camera": ("psi_noise", "y_l_noise"), "gps": ("course_noise",)}
 
 
 def riccati(
-    vehicle: Vehicle,
-    *,
-    sensors: Mapping[str, SlowSensor],
-    speed: float,
-    dt: float = TICK,
-    seconds: float = 8.0,
-    **options: float,
-) -> tuple[Array, tuple[str, ...]]:
+    vehicle: Vehicle, *, sensors: Mapping[str, SlowSensor], speed: float, dt: float = TICK,
+    seconds: float = 8.0, **options: float,
+) -> tuple[Array, tuple[str, ...]]:  # fmt: skip
     """Covariances of the optimal estimates at every tick, (ticks, n, n), and the n states' names,
     from a start that is known. Delays repeat.
 
@@ -92,14 +87,9 @@ class _Link:
     """One slow sensor on a clock: its rows, its clones and when its frames arrive."""
 
     def __init__(
-        self,
-        name: str,
-        sensor: SlowSensor,
-        dt: float,
-        names: tuple[str, ...],
-        first: int,
+        self, name: str, sensor: SlowSensor, dt: float, names: tuple[str, ...], first: int,
         sd: Mapping[str, float],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.rows = [[names.index(state) for state in row] for row in MEASURED[name]]
         self.R = np.diag([sd[key] ** 2 for key in NOISES[name]])
         self.period, self.phase = round(sensor.period / dt), round((sensor.phase or 0.0) / dt)

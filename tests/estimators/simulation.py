@@ -53,13 +53,9 @@ FIG6 = Drive(
 
 
 def simulate(
-    drive: Drive,
-    slow: dict[str, SlowSensor],
-    seed: int,
-    gyro_bias: float = 0.0,
-    disturbed: bool = True,
-    quiet: bool = False,
-) -> Log:
+    drive: Drive, slow: dict[str, SlowSensor], seed: int, gyro_bias: float = 0.0,
+    disturbed: bool = True, quiet: bool = False,
+) -> Log:  # fmt: skip
     """A log with the truth. disturbed: OU force and moment of 50 N, 20 N m, 0.3 s. quiet: without
     sensor noise."""
     rng = np.random.default_rng(seed)
@@ -69,9 +65,8 @@ def simulate(
     model = make_vision_model(car, V)
     push = np.zeros((4, 2))
     push[0, 0], push[1, 1] = 1.0 / (car.mass * V), 1.0 / car.yaw_inertia
-    wide = type(model)(
-        model.A, np.hstack([model.B, push]), model.C, model.states, (), model.outputs
-    )
+    B = np.hstack([model.B, push])
+    wide = type(model)(model.A, B, model.C, model.states, (), model.outputs)
     G, H = wide.discretise(dt)
     t = np.arange(K + 1) * dt
     on = (t >= drive.onset) & ((t - drive.onset) * drive.frequency < drive.periods)
@@ -129,13 +124,9 @@ def _bodily(
 
 
 def _packets(
-    drive: Drive,
-    slow: dict[str, SlowSensor],
-    x: np.ndarray,
-    K: int,
-    noisy: float,
+    drive: Drive, slow: dict[str, SlowSensor], x: np.ndarray, K: int, noisy: float,
     rng: np.random.Generator,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     rows = []
     course_sd = math.radians(0.14) * (60.0 * KMH) / drive.speed
     for name, sensor in slow.items():
@@ -157,9 +148,8 @@ def _packets(
             if k + late <= K:
                 rows.append(row)
     packets = np.array(rows).reshape(-1, PACKET_WIDTH)
-    order = np.lexsort(
-        (packets[:, PACKET.sensor], packets[:, PACKET.captured], packets[:, PACKET.arrived])
-    )
+    columns = [PACKET.sensor, PACKET.captured, PACKET.arrived]
+    order = np.lexsort(packets[:, columns].T)
     return packets[order]
 
 

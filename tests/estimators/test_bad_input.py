@@ -95,12 +95,7 @@ def camera(late: float, jitter: float = 0.0) -> dict[str, Any]:
         ("exact-kf", camera(0.3), ValueError, "can hold 8"),
         ("exact-kf", LATE_GPS, ValueError, rf"gps can be 0.5 {WINDOW.format('buffer', 496)}"),
         ("exact-kf", {"delay": "stored"} | camera(0.512), ValueError, WINDOW.format("stored", 511)),
-        (
-            "exact-kf",
-            ASSUMED | camera(0.0),
-            ValueError,
-            "0.512 s is not within .* of 0.512 s",
-        ),
+        ("exact-kf", ASSUMED | camera(0.0), ValueError, "0.512 s is not within .* of 0.512 s"),
         ("exact-kf", MANY_FIXES, ValueError, "86 samples of gps can come .*'buffer' stores 64"),
         ("exact-kf", {"delay": "larsen"} | camera(0.1), ValueError, "0.1 s late, 4 .* can hold 1"),
         # rules that do not go together

@@ -304,9 +304,8 @@ def test_a_gps_alone_finds_a_gyro_that_is_far_too_late(late: float) -> None:
     log = read_parts(table.assign(yaw_rate_radps=gyro))[0][0]
     errors = []
     for latency in (FIND, {"gyro": late}):
-        filter_ = make_estimator(
-            "joint", vehicle=car, sensors=log.slow, dt=log.record.dt, latency=latency
-        )
+        facts: Any = {"vehicle": car, "sensors": log.slow, "dt": log.record.dt}
+        filter_ = make_estimator("joint", latency=latency, **facts)
         error = (filter_.run(log)["beta"] - truth)[1000:]
         errors.append(np.sqrt(np.mean(error**2)))
     assert errors[0] < 1.2 * errors[1]

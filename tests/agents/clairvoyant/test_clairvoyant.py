@@ -108,9 +108,8 @@ def test_the_forecast_is_what_the_car_meets() -> None:
 
 def test_a_lagged_reference_is_the_envs() -> None:
     """It hangs on the measured speed alone, which other actions change by little."""
-    env = gym.make(
-        ID, scenario={"base": "coms-slalom", "duration": 3.0}, control_period=1, reference="lagged"
-    )
+    slalom = {"base": "coms-slalom", "duration": 3.0}
+    env = gym.make(ID, scenario=slalom, control_period=1, reference="lagged")
     env.reset(seed=5)
     names = ("beta_ref", "gamma_ref")
     forecast = make_forecast(env.unwrapped, np.zeros((3000, 1)))
@@ -177,9 +176,7 @@ def test_steering_too() -> None:
 
 
 @pytest.mark.long
-def test_an_unfinished_plan_says_so_and_a_better_run_wins(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_unfinished_plan_says_so_and_a_better_run_wins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clairvoyant, "MAX_ITERATIONS", 1)
     env = make("sine", 0.4, small_angle=True, tyres="linear", roll=False)
     found = compute_clairvoyant(env, 0, {"other": np.full((40, 1), 0.1)})

@@ -188,9 +188,8 @@ def test_integrals_hold_at_the_limits() -> None:
 
 
 def test_the_gyro_stands_in_for_an_estimate_and_no_disturbances_are_asked_for() -> None:
-    env = EstimateObservation(
-        gym.make("sideslip/AfsYawFusion-v0"), "course-kf", outputs=["beta"], std=False
-    )
+    env: Any = gym.make("sideslip/AfsYawFusion-v0")
+    env = EstimateObservation(env, "course-kf", outputs=["beta"], std=False)
     agent = make_agent("model-following", env, rejection=False)
     assert "gyro" in agent.needs
     assert "gamma_hat" not in agent.needs

@@ -55,9 +55,8 @@ def test_all_three_ask_for_the_same_and_remember_it(env_id: str) -> None:
         if env_id == YAW:  # the steering's rate limits MPC, and LQR by no plan
             assert np.abs(actions[1] - actions[0]).max() < 0.05 * size
         assert np.abs(actions[3] - actions[2]).max() < 0.05 * np.abs(actions[2]).max()
-    free = make_agent(
-        "lqr", TruthObservation(gym.make(env_id, scenario=SMALL), ["friction"], STATES)
-    )
+    plain = TruthObservation(gym.make(env_id, scenario=SMALL), ["friction"], STATES)
+    free = make_agent("lqr", plain)
     assert abs(free.predict(obs)[0][0]) > 2.0 * abs(actions[0][0])
 
 

@@ -86,7 +86,7 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.long
 @pytest.mark.parametrize("slide", range(len(SLIDES)))
 @pytest.mark.parametrize("env_id", (YAW, AFS))
-def test_ipopt_finds_nothing_much_cheaper(
+def test_ipopt_finds_little_cheaper(
     slide: int, env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Eight iterations, as at an episode's first decision, come within 5 % of IPOPT's cost.

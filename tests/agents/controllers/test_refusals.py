@@ -85,9 +85,8 @@ def test_what_no_controller_can_be_built_with_is_refused(
 
 
 def test_a_vehicle_of_the_design_is_named_as_everywhere() -> None:
-    named, stated = (
-        make_agent("lqr", ENVS["slip"](), vehicle=car) for car in ("passenger-car", PASSENGER_CAR)
-    )
+    cars = "passenger-car", PASSENGER_CAR
+    named, stated = (make_agent("lqr", ENVS["slip"](), vehicle=car) for car in cars)
     assert isinstance(named, Lqr) and isinstance(stated, Lqr)
     assert named.vehicle == stated.vehicle == PASSENGER_CAR
     with pytest.raises(TypeError, match="disturbance_time is a number, got 'x'"):

@@ -52,14 +52,9 @@ def watch_ticks(onboard: OnboardController, watch: Callable[[Tick], None]) -> No
 
 
 def drive(
-    env_id: str,
-    onboard: OnboardController,
-    step: bool = True,
-    recorder: Recorder | None = None,
-    watch: Callable[[Tick], None] | None = None,
-    speed: float = 1.0,
-    **options: Any,
-) -> tuple[Rollout, _WireAgent, Loop]:
+    env_id: str, onboard: OnboardController, step: bool = True, recorder: Recorder | None = None,
+    watch: Callable[[Tick], None] | None = None, speed: float = 1.0, **options: Any,
+) -> tuple[Rollout, _WireAgent, Loop]:  # fmt: skip
     """A drive over loopback, its wires and the loop at the car's end."""
     with Port() as car, Port() as other:
         synchroniser = StreamSynchroniser(None if step else round(PATIENCE / speed))

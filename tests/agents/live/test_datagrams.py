@@ -33,17 +33,12 @@ from sideslip.envs.sensors.slow import SLOW
 from tests.agents.live.both_ends import camera, encode, inertial
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "howto" / "live.md"
-NUMBER = st.floats(-LIMIT, LIMIT)
+NUMBER, STAMP = st.floats(-LIMIT, LIMIT), st.integers(0, MAX_STAMP)
 SOUND = inertial(7).data
 
 
 @settings(max_examples=40)
-@given(
-    st.sampled_from(sorted(FIELDS)),
-    st.integers(0, 2**32 - 1),
-    st.integers(0, MAX_STAMP),
-    st.data(),
-)
+@given(st.sampled_from(sorted(FIELDS)), st.integers(0, 2**32 - 1), STAMP, st.data())
 def test_a_message_comes_back(kind: int, sequence: int, stamp: int, data: st.DataObject) -> None:
     width = len(FIELDS[kind])
     values = data.draw(st.lists(NUMBER, min_size=width, max_size=width))

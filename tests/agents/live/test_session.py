@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.live import controller
-from sideslip.agents.live.controller import (
-    _BLOCK,
-    _BLOCK_MAGIC,
-    _ITEM,
-    Recorder,
-    Session,
-)
+from sideslip.agents.live.controller import _BLOCK, _BLOCK_MAGIC, _ITEM, Recorder, Session
 from sideslip.agents.live.messages import PATIENCE
 from tests.agents.live.both_ends import SEED, STEERING, drive, onboard, watch_ticks
 
@@ -43,11 +37,8 @@ def driven(request: Any, tmp_path_factory: Any) -> tuple[Path, Any, int | None]:
 
 def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> None:
     path, estimates, patience = driven
-    replayed = list[Any]()
-    watch_ticks(
-        car := onboard(STEERING, "dakf"),
-        lambda _: replayed.append(np.concatenate([car.x, car.std])),
-    )
+    car, replayed = onboard(STEERING, "dakf"), list[Any]()
+    watch_ticks(car, lambda _: replayed.append(np.concatenate([car.x, car.std])))
     ticks, same = Session(path).replay(car, patience)
     assert same and Session(path).setup == SETUP
     assert np.array_equal(replayed, estimates) and ticks == len(estimates) >= 500

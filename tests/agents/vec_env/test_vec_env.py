@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import (
 
 from sideslip.agents.training.normalise import RewardScale, RewardScaleWrapper
 from sideslip.agents.vec_env import _NativeVecEnv, get_scales, make_vec_env
+from tests.envs.helpers import bits
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}
@@ -51,13 +52,6 @@ def dummy(name: str, count: int, wish: Any = None, **arguments: Any) -> DummyVec
         return env if wish is None else EstimateObservation(env, **wish)
 
     return DummyVecEnv([make] * count)
-
-
-def bits(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: bits(each) for key, each in value.items()}
-    array = np.asarray(value)
-    return array.dtype.str, array.shape, array.tobytes()
 
 
 def drawn(env: Any, step: int) -> Any:

@@ -61,9 +61,8 @@ def test_more_future_never_knows_less() -> None:
 
 def test_the_truth_lies_nearer_and_as_near_as_it_says() -> None:
     drive = Drive(duration=4.0, real=6000.0)
-    filter_ = make_estimator(
-        "exact-kf", vehicle=drive.truth, sensors={"camera": CAMERA}, speed=drive.speed
-    )
+    facts: Any = {"vehicle": drive.truth, "speed": drive.speed}
+    filter_ = make_estimator("exact-kf", sensors={"camera": CAMERA}, **facts)
     errors, nees = np.zeros(2), []
     for seed in range(4):
         log = simulate(drive, {"camera": CAMERA}, seed)

@@ -55,9 +55,7 @@ def nees(found: list[Any], told: bool, sensors: tuple[str, ...], **options: Any)
 
 
 @pytest.mark.parametrize("sensors", SETS, ids="-".join)
-def test_psi_follows_the_heading_against_the_road_within_its_deviation(
-    prompt: list[Any], sensors: Any
-) -> None:
+def test_psi_follows_the_road_within_its_deviation(prompt: list[Any], sensors: Any) -> None:
     """And does not where the input is missing; the course is one over the ground."""
     assert 0.4 < nees(prompt, True, sensors) < 2.1  # chi-square of 24, 99.9 %
     assert nees(prompt, False, sensors) > (3.0 if sensors == ("camera",) else 20.0)

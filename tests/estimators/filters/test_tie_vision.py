@@ -214,7 +214,5 @@ def test_pseudo_residuals_follow_the_papers_four_steps(inverse: Any) -> None:
             x = x + K @ eps
             e = (I - K @ C_A) @ G @ e  # (21)
         wanted.append(x[:4])
-    filter_ = make_estimator(
-        "multirate-residual-kf", sensors=log.slow, speed=V, inverse=inverse, **Q
-    )
-    np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)
+    kf = make_estimator("multirate-residual-kf", sensors=log.slow, speed=V, inverse=inverse, **Q)
+    np.testing.assert_allclose(kf.run(log).x, wanted, rtol=0.0, atol=1e-10)

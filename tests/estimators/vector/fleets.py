@@ -34,14 +34,9 @@ def home(name: str) -> tuple[str, str]:
 
 
 def make_batch(
-    name: Any,
-    count: int,
-    vehicle: Any = COMS,
-    sensors: Any = None,
-    speed: Any = None,
-    dt: float = TICK,
-    **options: Any,
-) -> Any:
+    name: Any, count: int, vehicle: Any = COMS, sensors: Any = None, speed: Any = None,
+    dt: float = TICK, **options: Any,
+) -> Any:  # fmt: skip
     """Filters side by side, reset to tick 0; a list has what each one is told."""
     told = vehicle, sensors or {}, speed
     lists = [each if isinstance(each, list) else [each] * count for each in told]
@@ -77,13 +72,9 @@ def outputs(name: str) -> list[str]:
 
 
 def fleet(
-    env_id: str,
-    count: int,
-    mode: str,
-    wrap: Any = None,
-    changes: Sequence[dict[str, Any]] | None = None,
-    **kwargs: Any,
-) -> SyncVectorEnv[Any, Any]:
+    env_id: str, count: int, mode: str, wrap: Any = None,
+    changes: Sequence[dict[str, Any]] | None = None, **kwargs: Any,
+) -> SyncVectorEnv[Any, Any]:  # fmt: skip
     """Environments whose episodes have different lengths, up to a quarter of a second."""
 
     def made(i: int) -> Any:

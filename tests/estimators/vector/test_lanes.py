@@ -34,9 +34,8 @@ def troubled(name: str) -> list[Any]:
     logs = drives(COUNT, *home(name), seconds=0.3)
     for i, log in enumerate(logs):
         fast = log.record.fast
-        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= (
-            1.0 + 0.01 * i * np.linspace(0, 1, len(fast))[:, None]
-        )
+        gain = 1.0 + 0.01 * i * np.linspace(0, 1, len(fast))
+        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= gain[:, None]
         fast[50 + i, FAST.gyro] = np.nan if i % 3 == 0 else fast[50 + i, FAST.gyro]
         fast[120, FAST.steer] = np.inf if i % 5 == 1 else fast[120, FAST.steer]
         fast[140, FAST.wheel_left] = np.nan if i % 7 == 2 else fast[140, FAST.wheel_left]
@@ -90,9 +89,8 @@ def test_a_capture_is_of_its_own_tick() -> None:
     for i, log in enumerate(logs):
         fast = log.record.fast
         fast[:, FAST.curvature] = np.random.default_rng(i).normal(0.02, 0.02, len(fast))
-        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= (
-            1.0 + 0.2 * i * np.linspace(0, 1, len(fast))[:, None]
-        )
+        gain = 1.0 + 0.2 * i * np.linspace(0, 1, len(fast))
+        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= gain[:, None]
     same_as_alone("exact-kf", 10, None, logs, slow=["gps"], gains="covariance")
 
 

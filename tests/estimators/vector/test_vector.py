@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -32,9 +31,7 @@ from tests.estimators.vector.fleets import (
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 
-def wrap_both(
-    env_id: str, count: int, mode: str, layers: Sequence[dict[str, Any]], **kwargs: Any
-) -> Any:
+def wrap_both(env_id: str, count: int, mode: str, layers: list[Any], **kwargs: Any) -> Any:
     """Around SyncVectorEnv, and around the vector env."""
     both = batches.pair(env_id, count, mode, **kwargs)
     return [EstimateObservation(env, **layers[0]) for env in both]
@@ -42,7 +39,7 @@ def wrap_both(
 
 QUICK = ("exact-kf", "course-kf")
 SLOW = [pytest.param(wrap_both, name, marks=pytest.mark.long) for name in FILTERS]
-CASES = [(pair, name) for name in FILTERS] + [(wrap_both, name) for name in QUICK]
+CASES: list[Any] = [(pair, name) for name in FILTERS] + [(wrap_both, name) for name in QUICK]
 CASES += [case for case in SLOW if case.values[1] not in QUICK]
 
 

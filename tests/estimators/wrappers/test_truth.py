@@ -140,9 +140,8 @@ def test_given_the_truth_the_filter_knows_its_error() -> None:
     plain = {"small_angle": True, "tyres": "linear", "roll": False, "lags": False}
     scenario = {"base": "random-steering", **plain}
     options = {"slow": ["camera", "gps"], "hdop_table": [(1.0, 1.0), (101.0, 51.0)]}
-    env = EstimateObservation(
-        gym.make(FUSION, scenario=scenario), "exact-kf", vehicle="truth", options=options
-    )
+    bare = gym.make(FUSION, scenario=scenario)
+    env = EstimateObservation(bare, "exact-kf", vehicle="truth", options=options)
     means = []
     for seed in range(16):
         env.reset(seed=seed)

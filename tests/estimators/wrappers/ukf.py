@@ -23,16 +23,10 @@ class Ukf:
     names = ("beta", "gamma", "psi", "y_l")
 
     def __init__(
-        self,
-        *,
-        vehicle: Vehicle,
-        sensors: Mapping[str, SlowSensor],
-        dt: float,
-        speed: float | None,
-        gyro: float = 0.005,
-        camera: tuple[float, float] = (3.5e-3, 0.02),
+        self, *, vehicle: Vehicle, sensors: Mapping[str, SlowSensor], dt: float,
+        speed: float | None, gyro: float = 0.005, camera: tuple[float, float] = (3.5e-3, 0.02),
         q: tuple[float, ...] = (0.01, 0.1, 1e-3, 1e-2),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.car, self.dt, self.held, self.q = vehicle, dt, speed, q
         self.gyro, self.camera = np.array([[gyro**2]]), np.diag(np.square(camera))
         self.reset(sensors, 0)
