@@ -1,7 +1,6 @@
 """LQR by yaw moment and, where there is some, steering: of motion, adapted to tyres, in a lane."""
 
 import copy
-import math
 from collections import namedtuple
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +13,7 @@ from ...envs.numerics.jit import copy_into, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
+from ...envs.validation import check_int
 from ...envs.vehicle.linear import LinearModel, make_vision_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle, VehicleSource, make_vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
@@ -32,6 +32,7 @@ TRUE_PARAMETERS = (
 )  # parameters of the true car, of which the observation has true_<name>; the last are its motors
 TYRES = ("front_tyres_hat", "rear_tyres_hat")  # of `joint`
 INVERSE_FRICTION = "inverse_friction_hat"
+_SPAN = 0.5, 1.6  # of the stiffness schedule, factors of the vehicle's
 _MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 _MAX_CARS = 1024  # for which the gains are kept
 
@@ -107,8 +108,7 @@ class Lqr(Controller):
         disturbance_time: Time in which F_d and N_d decay (s).
         vehicle: Vehicle of the design, as for `make_vehicle`; None: the env's nominal one.
         stiffness: Entries of the front and rear cornering stiffness (N/rad), to schedule gains on.
-        span: Range of the stiffness schedule, as factors of the vehicle's.
-        knots: Knots of each stiffness axis; the table is designed once.
+        knots: Knots of each stiffness axis, from 0.5 to 1.6 of the vehicle's; at least 2.
         steer_weight: Factor on the cost of added steering, whose rate limit the design lacks.
         grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
         knows_car: Whether gains and motor commands follow each row's observed `TRUE_PARAMETERS`.
@@ -118,13 +118,12 @@ class Lqr(Controller):
 
     def __init__(
         self, env: AnyEnv, disturbance_time: float = 0.3, vehicle: VehicleSource | None = None,
-        stiffness: Sequence[str] = (), span: tuple[float, float] = (0.5, 1.6), knots: int = 7,
-        steer_weight: float = 1.0, grip: float | None = None, knows_car: bool = False,
+        stiffness: Sequence[str] = (), knots: int = 7, steer_weight: float = 1.0,
+        grip: float | None = None, knows_car: bool = False,
     ) -> None:  # fmt: skip
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
-        if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
-            raise ValueError(f"span rises from above zero, with 2 knots or more: {span}, {knots}")
+        check_int("knots", knots, "knots", 2)
         names = get_env_facts(env).names
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if set(pair) <= set(names)), "none")
@@ -149,7 +148,7 @@ class Lqr(Controller):
         weight = check_positive("steer_weight", steer_weight)
         plant = period, self.full_scale, self.width == 2
         self.design_spec = DesignSpec(*plant, self._reference_kind, kind, time, weight, rate)
-        factors = np.geomspace(*span, knots) if stiffness else np.zeros(0)
+        factors = np.geomspace(*_SPAN, knots) if stiffness else np.zeros(0)
         nominals = car.front_stiffness, car.rear_stiffness
         self._design_gains(car, *(tuple((nominal * factors).tolist()) for nominal in nominals))
 
@@ -328,12 +327,13 @@ LaneMemory = namedtuple("LaneMemory", "integral rate heading started")
 
 LANE_IN, AT, LANE_LAST = LaneInputs(*range(10)), Lane(*range(9)), LaneMemory(*range(4))
 LANE_MOVED = Lane._fields[: AT.driver]
-HASTE = 3.0  # weight of the steering's haste in the cost, which `_make_lane_model` explains
+_HASTE = 3.0  # weight of the steering's haste in the cost, which `_make_lane_model` explains
+_CURVATURE_TIME = 0.3  # s, time constant of the curvature's filter
 _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
 def _make_lane_model(
-    vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float, inputs: slice
+    vehicle: Vehicle, speed: float, period: int, full_scale: float, inputs: slice
 ) -> DesignModel:
     """Make the model of `Lane` over a period (ticks) and its cost, for some of the two inputs."""
     # Inputs are the fraction of the full yaw moment (N m), and rad added to the driver's steering.
@@ -353,7 +353,7 @@ def _make_lane_model(
     G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discretise(T)
     # The cost at a period's end is the env's of beta and both inputs, with gamma against V kappa,
     # and the squares of the offset over 0.1 m and of its integral over 0.2 m s. The last term is
-    # haste ((command - applied angle) / reach)^2, with the angle `reach` that the actuator's rate
+    # _HASTE ((command - applied angle) / reach)^2, with the angle `reach` that the actuator's rate
     # covers in a period and a lag: without it a linear law commands too fast a steering.
     C = np.zeros((6, n))
     C[range(6), (AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)] = 1.0
@@ -363,7 +363,7 @@ def _make_lane_model(
     cost_outputs = np.vstack([C @ np.hstack([G, H]), command_error])
     reach = vehicle.steering_rate * (T + vehicle.steering_lag)
     scales = (BETA_SCALE, GAMMA_SCALE, 1.0, _OFFSET_SCALE, _INTEGRAL_SCALE, STEER_SCALE, reach)
-    shares = (1.0, 1.0, EFFORT_WEIGHT, 1.0, 1.0, EFFORT_WEIGHT, haste)
+    shares = (1.0, 1.0, EFFORT_WEIGHT, 1.0, 1.0, EFFORT_WEIGHT, _HASTE)
     W = T * np.diag([share / scale**2 for share, scale in zip(shares, scales, strict=True)])
     cost_matrix = cost_outputs.T @ W @ cost_outputs
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
@@ -414,27 +414,22 @@ class LaneKeeping(Controller):
     Args:
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
-        curvature_time: Time constant of the curvature's filter (s), of a control period at least.
-        haste: Weight of the steering command less the applied angle, as for `HASTE`.
     """
 
     needs = LaneInputs._fields
     memory = len(LaneMemory._fields)
 
-    def __init__(
-        self, env: AnyEnv, moment: bool = True, curvature_time: float = 0.3, haste: float = HASTE
-    ) -> None:
+    def __init__(self, env: AnyEnv, moment: bool = True) -> None:
         super().__init__(env)
         if self.width != 2:
             raise ValueError("LaneKeeping needs an env whose action steers (steering=True)")
-        haste = check_positive("haste", haste, allow_zero=True)
         speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
-        design, car = (self.control_period, self.full_scale, haste, inputs), self.nominal
+        car, design = self.nominal, (self.control_period, self.full_scale, inputs)
         gains = [_make_lane_model(car, speed, *design).solve()[0] for speed in speeds]
         table = np.ascontiguousarray(np.array(gains)[:, None, None])
         axes, time = (np.array(speeds), np.zeros(1), np.zeros(1)), self.control_period * TICK
         share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
-        filter_time = max(check_positive("curvature_time", curvature_time), time)
+        filter_time = max(_CURVATURE_TIME, time)
         self._design = table, axes, share, car.preview, filter_time, time, self.authority
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:

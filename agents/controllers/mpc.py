@@ -337,7 +337,6 @@ class Nmpc(Lqr):
         disturbance_time: Time in which F_d and N_d decay (s).
         vehicle: Vehicle of the design, as for `Lqr`.
         stiffness: Entries of front and rear cornering stiffness, as for `Lqr`.
-        span: Range of the stiffness schedule, as for `Lqr`.
         knots: Knots of each stiffness axis, as for `Lqr`.
         steer_weight: Factor on the cost of added steering, as for `Lqr`.
         grip: Grip limit, as for `Controller`.
@@ -350,10 +349,10 @@ class Nmpc(Lqr):
     def __init__(
         self, env: AnyEnv, horizon: float = 0.5, iterations: int = 2, disturbance_time: float = 0.3,
         vehicle: VehicleSource | None = None, stiffness: Sequence[str] = (),
-        span: tuple[float, float] = (0.5, 1.6), knots: int = 7, steer_weight: float = 10.0,
-        grip: float | None = None, knows_car: bool = False,
+        knots: int = 7, steer_weight: float = 10.0, grip: float | None = None,
+        knows_car: bool = False,
     ) -> None:  # fmt: skip
-        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip, knows_car
+        options = disturbance_time, vehicle, stiffness, knots, steer_weight, grip, knows_car
         super().__init__(env, *options)
         check_int("iterations", iterations, "passes")
         spec = self.design_spec

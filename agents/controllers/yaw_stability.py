@@ -106,8 +106,7 @@ class Esc(Controller):
         env: Env of the controller.
         bandwidth: Double pole of the yaw-rate loop (rad/s).
         band: Half width of the yaw rate's dead band (rad/s).
-        slip: Bound of the sideslip angle (rad).
-        stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
+        slip: Bound of the sideslip angle (rad); at twice it the moment is the full one.
         grip: Grip limit, as for `Controller`.
     """
 
@@ -115,16 +114,14 @@ class Esc(Controller):
 
     def __init__(
         self, env: AnyEnv, bandwidth: float = BANDWIDTH, band: float = 0.02, slip: float = 0.05,
-        stiffness: float | None = None, grip: float | None = None,
+        grip: float | None = None,
     ) -> None:  # fmt: skip
         bounded = "beta_hat" in get_env_facts(env).names
         self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
         super().__init__(env, grip)
         bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
         band = check_positive("band", band, allow_zero=True)
-        if stiffness is None:
-            stiffness = self.full_scale / slip
-        bound = slip, check_positive("stiffness", stiffness, allow_zero=True), int(bounded)
+        bound = slip, self.full_scale / slip, int(bounded)
         gains = np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS])
         scales, table = (self.full_scale, self.control_period * TICK), (np.array(SPEEDS), gains)
         self._design = self._target, *table, band, *bound, *scales

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.lqr import HASTE, LANE_MOVED, LaneKeeping, _make_lane_model
+from sideslip.agents.controllers.lqr import LANE_MOVED, LaneKeeping, _make_lane_model
 from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
@@ -43,26 +43,17 @@ def drive(env: Any, agent: Any, seed: int) -> tuple[np.ndarray, int]:
 def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> None:
     d = len(LANE_MOVED)
     for speed in SPEEDS[::6]:
-        model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, inputs)
+        model = _make_lane_model(COMS, speed, 10, LIMIT, inputs)
         G, B, K = model.G[:d, :d], model.H[:d], model.solve()[0][:, :d]
         wanted = control.dlqr(G, B, model.Q[:d, :d], model.R, model.N[:d])[0]
         assert pytest.approx(np.asarray(wanted), rel=1e-9) == K
         assert np.abs(np.linalg.eigvals(G - B @ K)).max() < 1.0
 
 
-def test_a_curvature_time_below_the_period_does_not_diverge() -> None:
-    env = env_of(0.0)
-    agent = LaneKeeping(env, curvature_time=0.004)
-    _, memory = agent.predict(observe(env))
-    for _ in range(50):
-        _, memory = agent.predict(observe(env, gamma_hat=0.1), memory)
-    assert memory[0, 1] == pytest.approx(0.1 / 7.0)
-
-
 def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
     """The integral leaves no offset; the car turns with the road."""
     d, speed, kappa = len(LANE_MOVED), 7.0, 0.02
-    model = _make_lane_model(COMS, speed, 10, LIMIT, HASTE, slice(0, 2))
+    model = _make_lane_model(COMS, speed, 10, LIMIT, slice(0, 2))
     closed = model.G - model.H @ model.solve()[0]
     rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d + 1] * kappa)
     assert rest[3] == pytest.approx(0.0, abs=1e-9)

@@ -15,7 +15,7 @@ from sideslip.envs.task import MODEL
 from sideslip.estimators import EstimateObservation
 
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
-VISION, UNEVEN = "sideslip/YawVision-v0", "sideslip/YawVisionUneven-v0"
+VISION = "sideslip/YawVision-v0"
 RATES, LANE = ["beta", "gamma", "d1", "d2"], ["beta", "gamma", "psi", "y_l"]
 ENVS: dict[str, Callable[[], Any]] = {
     "bare": lambda: gym.make(YAW),
@@ -24,9 +24,6 @@ ENVS: dict[str, Callable[[], Any]] = {
     "no rates": lambda: EstimateObservation(gym.make(AFS), "course-kf", outputs=["beta"]),
     "rates": lambda: EstimateObservation(gym.make(AFS), "dakf", outputs=RATES),
     "unsteered": lambda: EstimateObservation(gym.make("sideslip/YawGps-v0"), "dakf", outputs=RATES),
-    "lane": lambda: EstimateObservation(
-        gym.make(UNEVEN, steering=True), "uneven-delay-kf", outputs=LANE
-    ),
     "unsteered lane": lambda: EstimateObservation(gym.make(VISION), "multirate-kf", outputs=LANE),
 }
 Refusal = tuple[str, str, dict[str, Any], str]
@@ -45,14 +42,12 @@ VALUES: list[Refusal] = [
         ("model-following", "rates", {"bandwidth": wrong}, "two positive numbers")
         for wrong in ((5.0,), (5.0, 0.0), (5.0, np.inf), (np.nan, 5.0), (1.0, 2.0, 3.0))
     ),
-    ("lane-keeping", "lane", {"curvature_time": 0.0}, "curvature_time is a positive number"),
-    ("lane-keeping", "lane", {"haste": -1.0}, "haste is a number of zero or more"),
     ("lane-keeping", "unsteered lane", {}, "action steers"),
     ("lane-keeping", "slip", {}, r"psi_hat, y_l_hat.*EstimateObservation"),
     ("lqr", "bare", {}, r"beta_hat.*EstimateObservation"),
     ("lqr", "steered", {"disturbance_time": 0.0}, "disturbance_time is a positive number"),
     ("lqr", "steered", {"stiffness": ["a"]}, "names two entries or none"),
-    ("lqr", "steered", {"span": (1.0, 0.5)}, "span rises from above zero"),
+    ("lqr", "steered", {"knots": 1}, "knots is at least 2, got 1"),
     *(("lqr", "steered", {"grip": x}, "grip is a positive number") for x in (0.0, -1.0, np.nan)),
     ("adaptive-lqr", "steered", {}, "AdaptiveLqr needs front_tyres_hat, rear_tyres_hat"),
     *(
