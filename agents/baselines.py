@@ -140,7 +140,6 @@ def compute_range_rms(source: Scenario | World, name: str, ideal: float = 0.0) -
 
 def make_oracle(
     name: str, env_id: str, num_envs: int | None = None,
-    vector_kwargs: Mapping[str, Any] | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None, **env_kwargs: Any,
 ) -> tuple[Any, Controller]:  # fmt: skip
     """Make an oracle and the env whose observation it needs; ValueError for an unknown name.
@@ -154,7 +153,6 @@ def make_oracle(
         name: Name in `ORACLES`.
         env_id: Id of the env.
         num_envs: Rows of a vector env; None: a single env.
-        vector_kwargs: Arguments of the vector env.
         options: {"filter": of `exact-kf`, "controller": of the agent}, else TypeError, over the
             defaults: slow sensors of the id, the scenario's `make_noise_options`, a grip limit.
         env_kwargs: Arguments of the env (scenario, vehicle, ...).
@@ -175,7 +173,7 @@ def make_oracle(
         single_env = gym.make(env_id, **env_kwargs)
     base, env = single_env.unwrapped, single_env
     if num_envs is not None:
-        env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
+        env = gym.make_vec(env_id, num_envs=num_envs, **env_kwargs)
     if name not in STATE_ORACLES:
         env = _add_filter(env, base, name in PARAMETER_ORACLES, chosen["filter"])
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
