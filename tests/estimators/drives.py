@@ -38,8 +38,8 @@ class Drives:
 
     def run(self, seed: int) -> Log:
         """An episode less its last tick, whose force is not seen; its truth holds `STATES`."""
-        record = _episode(self._env, seed)
-        truth = dict(zip(STATES, self._truth(_episode(self._twin, seed)).T, strict=True))
+        record = record_episode(self._env, seed)
+        truth = dict(zip(STATES, self._truth(record_episode(self._twin, seed)).T, strict=True))
         last = len(record.fast) - 1
         packets = record.packets[record.packets[:, PACKET.arrived] < last]
         return Log(Record(record.fast[:last], packets), self._env.slow_sensors, truth)
@@ -62,7 +62,7 @@ class Drives:
         return np.hstack([x[:-1], force])
 
 
-def _episode(env: StabilityEnv, seed: int) -> Record:
+def record_episode(env: StabilityEnv, seed: int) -> Record:
     """The whole record of an uncontrolled episode."""
     env.reset(seed=seed)
     records, over = [env.record], False

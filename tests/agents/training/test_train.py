@@ -274,7 +274,7 @@ def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
 def test_ppo_without_options_costs_at_most_a_fifth_more_than_nominal(tmp_path: Path) -> None:
     task = TrainingTask()
     trainer.Trainer(task, int(task.settings["n_timesteps"]), tmp_path).train()
-    nominal, agent = make_oracle("nominal", task.env_id, 64, {"autoreset_mode": "SameStep"})
+    nominal, agent = make_oracle("nominal", task.env_id, 64)
     env, seeds = task.vector_env(64), range(64)
     policy = make_agent(str(tmp_path / POLICY), env)
     found, known = (

@@ -8,9 +8,10 @@ import pytest
 
 from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.layout import Z
-from sideslip.envs.record import FAST, Record, concatenate
+from sideslip.envs.record import FAST, Record
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
+from tests.estimators.drives import record_episode
 
 WINDING = make_scenario("tie-vision-fig7").replace(road="nominal-path", duration=4.0)
 RUNS = 24
@@ -24,14 +25,10 @@ def drives(**arguments: Any) -> list[Any]:
     found = []
     for seed in range(RUNS):
         env = StabilityEnv("fusion", WINDING, control_period=1000, **arguments)
-        env.reset(seed=seed)
-        records, over = [env.record], False
-        while not over:
-            _, _, _, over, _ = env.step(np.zeros(1, np.float32))
-            records.append(env.record)
+        record = record_episode(env, seed)
         z = env.get_state()["state"]
         psi = float(z[Z.motion.psi] - z[Z.motion.theta])
-        found.append((concatenate(records), psi, env))
+        found.append((record, psi, env))
     return found
 
 

@@ -18,8 +18,7 @@ from sideslip.estimators.vector.batch import build_batch
 from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from sideslip.estimators.wrappers.estimate import EstimatorSpec
-from tests.envs import batches
-from tests.envs.helpers import bits
+from tests.envs.batches import SHORT, actions, same
 
 VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
 MODES = ("NextStep", "SameStep")
@@ -103,43 +102,18 @@ def pair(
 
 def native(mode: str, count: int = 3, **arguments: Any) -> Any:
     """The vector env, whose bad actions end episodes."""
-    told = {"scenario": batches.SHORT, "on_bad_action": "fail", "autoreset_mode": mode}
+    told = {"scenario": SHORT, "on_bad_action": "fail", "autoreset_mode": mode}
     return gym.make_vec(VISION, num_envs=count, **(told | arguments))
-
-
-def actions(env: Any, step: int) -> Any:
-    """Any action, now and then a bad one, which ends a row's episode at once."""
-    shape = env.action_space.shape
-    drawn = np.random.default_rng(step).uniform(-1.0, 1.0, shape).astype(np.float32)
-    if step % 7 == 6:
-        drawn[step % len(drawn)] = BAD
-    return drawn
-
-
-def plain(infos: Any) -> Any:
-    """`infos` with the objects in `final_obs` taken out, for comparison."""
-    if isinstance(infos, dict):
-        return {key: plain(value) for key, value in infos.items()}
-    return list(infos) if infos.dtype.kind == "O" else infos
-
-
-def same_bits(one: Any, other: Any) -> None:
-    assert bits(one[0]) == bits(other[0])
-    assert bits(list(one[1:-1])) == bits(list(other[1:-1]))
-    first, second = plain(one[-1]), plain(other[-1])
-    assert first.keys() == second.keys()
-    for key in first:
-        assert bits(first[key]) == bits(second[key]), key
 
 
 def drive_both(alone: Any, together: Any, steps: int, start: int = 0, seed: Any = None) -> int:
     """Step both, after a reset with a seed, and compare everything; the episodes that ended."""
     ended = 0
     if seed is not None:
-        same_bits(alone.reset(seed=seed), together.reset(seed=seed))
+        same(alone.reset(seed=seed), together.reset(seed=seed))
     for step in range(start, start + steps):
         told = actions(alone, step)
         one, other = alone.step(told), together.step(told)
-        same_bits(one, other)
+        same(one, other)
         ended += int(np.logical_or(one[2], one[3]).sum())
     return ended

@@ -9,16 +9,8 @@ from sideslip.envs import COMS
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation, TruthObservation
 from tests.envs import batches
-from tests.estimators.vector.fleets import (
-    BAD,
-    MODES,
-    VISION,
-    actions,
-    drive_both,
-    native,
-    pair,
-    same_bits,
-)
+from tests.envs.batches import actions, same
+from tests.estimators.vector.fleets import BAD, MODES, VISION, drive_both, native, pair
 from tests.estimators.wrappers.constant import Constant
 
 UKF = "tests.estimators.wrappers.ukf:Ukf"
@@ -113,7 +105,7 @@ def test_a_snapshot_of_a_wrapped_vector_env_continues_bit_for_bit(layer: Any, mo
     for _ in range(2):
         env.set_state(snapshot)
         for i, before in enumerate(once, start=7):
-            same_bits(env.step(actions(env, i)), before)
+            same(env.step(actions(env, i)), before)
 
 
 def test_a_snapshot_brings_back_the_rows_that_a_mask_leaves_alone() -> None:

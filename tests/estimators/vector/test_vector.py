@@ -14,18 +14,17 @@ from sideslip.estimators import FILTERS
 from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs import batches
+from tests.envs.batches import actions, same
 from tests.envs.helpers import IDS
 from tests.estimators.vector.fleets import (
     BAD,
     MODES,
     UNEVEN,
     VISION,
-    actions,
     drive_both,
     home,
     outputs,
     pair,
-    same_bits,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -89,13 +88,13 @@ def test_rows_may_be_different_cars(mode: Any) -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_a_masked_reset_leaves_the_other_rows_alone(mode: Any) -> None:
     alone, together = pair(UNEVEN, 3, mode, [{"estimator": "exact-kf"}])
-    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    same(alone.reset(seed=1), together.reset(seed=1))
     for start in range(0, 40, 8):
         drive_both(alone, together, 8, start)
         mask = np.array([start % 16 == 0, False, True])
         one = alone.reset(seed=[start, None, 4], options={"reset_mask": mask.copy()})
         other = together.reset(seed=[start, None, 4], options={"reset_mask": mask.copy()})
-        same_bits(one, other)
+        same(one, other)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -154,13 +153,13 @@ def test_so_it_does_over_many_episodes(env_id: str, mode: str) -> None:
 @pytest.mark.parametrize("make", [pair, wrap_both])
 def test_masks_and_other_scenarios_tell_the_filters(make: Any, mode: str) -> None:
     alone, together = make(VISION, 3, mode, [{"estimator": "multirate-kf"}])
-    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    same(alone.reset(seed=1), together.reset(seed=1))
     for k, scenario in enumerate(("uneven-delay-fig5", "tie-vision-fig7", "sine")):
         drive_both(alone, together, 12)
         mask = np.array([True, k == 1, False])
         options = {"reset_mask": mask, "scenario": scenario, "duration": 0.08}
         one = alone.reset(seed=k, options=dict(options))
-        same_bits(one, together.reset(seed=k, options=dict(options)))
+        same(one, together.reset(seed=k, options=dict(options)))
     assert drive_both(alone, together, 30) > 3
 
 
@@ -202,12 +201,12 @@ def test_nees_is_told_where_the_truth_is(mode: str) -> None:
         if step % 5 == 4:
             told[step % 3] = BAD
         one, other = every.step(told), ends.step(told)
-        same_bits((*one[:4], {}), (*other[:4], {}))
+        same((*one[:4], {}), (*other[:4], {}))
         assert other[4]["beta_hat"].tobytes() == one[4]["beta_hat"].tobytes()
         ended = one[2] | one[3]
         if mode == "SameStep":
             one, other = ({**each[4].get("final_info", {})} for each in (one, other))  # type: ignore[assignment]
-            same_bits((0.0, one), (0.0, other))
+            same((0.0, one), (0.0, other))
         elif ended.any():
             assert other[4]["_nees"].tolist() == ended.tolist()
             assert other[4]["nees"][ended].tobytes() == one[4]["nees"][ended].tobytes()

@@ -13,8 +13,9 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.estimators import make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
+from tests.envs.batches import actions
 from tests.estimators.simulation import CAMERA, GPS
-from tests.estimators.vector.fleets import BAD, VISION, actions, fleet, make_batch, native
+from tests.estimators.vector.fleets import BAD, VISION, fleet, make_batch, native
 from tests.estimators.wrappers.constant import Constant
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
