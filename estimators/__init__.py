@@ -16,17 +16,7 @@ from .protocol import Estimates, EstimatorFactory, EstimatorLike, UnobservableWa
 from .wrappers.estimate import EstimateObservation
 
 __all__ = [
-    "FILTERS",
-    "DualRate",
-    "EstimateObservation",
-    "Estimates",
-    "Estimator",
-    "EstimatorFactory",
-    "EstimatorLike",
-    "FilterConfig",
-    "FilterOptions",
-    "UnobservableWarning",
-    "make_estimator",
-    "register_estimator",
-    "smooth",
-]
+    "FILTERS", "DualRate", "EstimateObservation", "Estimates", "Estimator", "EstimatorFactory",
+    "EstimatorLike", "FilterConfig", "FilterOptions", "UnobservableWarning", "make_estimator",
+    "register_estimator", "smooth",
+]  # fmt: skip

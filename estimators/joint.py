@@ -36,12 +36,9 @@ _PATIENCE = 10  # successive fast samples outside the memory, after which the cl
 
 
 def estimate(
-    log: "LogSource",
-    vehicle: VehicleSource,
-    *,
-    mapping: Mapping[str, str] | None = None,
+    log: "LogSource", vehicle: VehicleSource, *, mapping: Mapping[str, str] | None = None,
     latency: Mapping[str, float] | None = None,
-) -> "pd.DataFrame":
+) -> "pd.DataFrame":  # fmt: skip
     """Estimate the sideslip angle of a recorded drive with `joint` (needs the extra `report`).
 
     The log needs time, speed, yaw rate and steering at the road wheels, in columns such as time_s,

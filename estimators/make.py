@@ -232,15 +232,10 @@ if TYPE_CHECKING:
 
 
 def make_estimator(
-    name: str | EstimatorFactory,
-    *,
-    vehicle: VehicleSource = COMS,
-    sensors: Mapping[str, SlowSensor] | None = None,
-    dt: float = TICK,
-    speed: float | None = None,
-    present: Collection[str] | None = None,
-    **options: Any,
-) -> Estimator | ForeignEstimator:
+    name: str | EstimatorFactory, *, vehicle: VehicleSource = COMS,
+    sensors: Mapping[str, SlowSensor] | None = None, dt: float = TICK, speed: float | None = None,
+    present: Collection[str] | None = None, **options: Any,
+) -> Estimator | ForeignEstimator:  # fmt: skip
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
 
     An unknown option raises TypeError; unknown names, absent sensors and options that are at odds

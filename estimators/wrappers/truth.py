@@ -27,14 +27,10 @@ STIFFNESSES = ("front_stiffness", "rear_stiffness")
 _MOTORS = {"motor_left": "-", "motor_right": "-"}
 _MAX_PARAMETER = 1e7  # bound of any parameter of a vehicle, SI
 _STATES = {
-    "beta": ("rad", math.pi),
-    "gamma": ("rad/s", 20.0),
-    "F_d": ("N", _MAX_PARAMETER),
-    "N_d": ("N m", _MAX_PARAMETER),
-    "phi": ("rad", math.pi),
-    "phi_rate": ("rad/s", 100.0),
+    "beta": ("rad", math.pi), "gamma": ("rad/s", 20.0), "F_d": ("N", _MAX_PARAMETER),
+    "N_d": ("N m", _MAX_PARAMETER), "phi": ("rad", math.pi), "phi_rate": ("rad/s", 100.0),
     "friction_factor": ("-", 100.0),
-}
+}  # fmt: skip
 
 
 def calibrate(readings: Readings, calibration: Readings) -> Readings:
