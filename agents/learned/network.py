@@ -123,8 +123,7 @@ class Network:
                 raise ValueError(f"layer {i} takes {width} inputs, got {shapes}")
             width = len(b)
         for name, values in self.tensors.items():
-            if not np.isfinite(values).all():
-                count = np.count_nonzero(~np.isfinite(values))
+            if count := np.count_nonzero(~np.isfinite(values)):
                 raise ValueError(f"{name}: {count} are not finite")
         if (self.scale < 0.0).any():
             raise ValueError("scale is below zero")

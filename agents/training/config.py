@@ -1,4 +1,4 @@
-"""The algorithms of `sideslip train`, their settings, and the task of a training.
+"""The algorithms of `sideslip train`, their settings, the task of a training, and distillations.
 
 The settings in `hyperparams/`, in rl-baselines3-zoo's format, were chosen on YawVision-v0, seed 0.
 

@@ -170,9 +170,6 @@ def load_network(policy: BasePolicy, network: Network) -> None:
         parameters += [] if module is None else module.parameters()
     with torch.no_grad():
         for parameter, array in zip(parameters, arrays, strict=True):
-            if parameter.shape != array.shape:
-                text = f"a network has {array.shape} weights where the actor"
-                raise ValueError(f"{text} has {tuple(parameter.shape)}: it is another one")
             parameter.copy_(torch.from_numpy(array))
 
 

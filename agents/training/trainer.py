@@ -103,12 +103,15 @@ def _read_zip(file: Path, task: TrainingTask, trust: bool) -> _ZipTensors:
 
 
 def _check_policy(policy: Policy, task: TrainingTask) -> None:
-    """Check that a task's observation and form are those of an initial policy; else ValueError."""
-    entries = [name for name, _ in policy.card.observation]
-    names = [entry.name for entry in get_layout(task.vector_env(1))]
+    """Check that a task's entries, action and form are an initial policy's; else ValueError."""
+    entries, env = [name for name, _ in policy.card.observation], task.vector_env(1)
+    names = [entry.name for entry in get_layout(env)]
     if entries != names:
         known, here = ", ".join(entries), ", ".join(names)
         raise ValueError(f"{policy.name} reads {known}; here there is {here}")
+    if env.single_action_space.shape != (policy.network.width,):
+        text = f"{policy.name} gives {policy.network.width} numbers"
+        raise ValueError(f"{text}, the env's action is of {env.single_action_space}")
     form, kwargs = get_policy_form(policy, task.algo), task.settings.get("policy_kwargs", {})
     if kwargs != kwargs | form:
         text = f"{policy.name} is a network of {form}"
@@ -191,23 +194,20 @@ class Trainer:
 
     def build(self) -> EvalCallback:
         """Build the callback with its model, new or from a checkpoint, a zip or a policy."""
-        task, initial, checkpoint = self.task, self.initial, self._checkpoint
+        task, run, initial, checkpoint = self.task, self.run_options, self.initial, self._checkpoint
         policy, tensors = None, None
         if isinstance(initial, Policy):
             policy = initial
             _check_policy(policy, task)
         elif initial is not None:
             tensors = _read_zip(Path(initial), task, self.trust)
-        callback = EvalCallback(
-            task, self._folder, self.run_options, self.steps, policy, checkpoint
-        )
+        callback = EvalCallback(task, self._folder, run, self.steps, policy, checkpoint)
         steps = checkpoint.steps if checkpoint else 0
         if checkpoint:
             callback.scaling = Standardisation(*checkpoint.scaling)
         elif policy:
-            network = policy.network
-            numbers = network.mean.tolist(), network.scale.tolist(), network.clip
-            callback.scaling = Standardisation(*numbers)
+            mean, scale = policy.network.mean.tolist(), policy.network.scale.tolist()
+            callback.scaling = Standardisation(mean, scale, policy.network.clip)
         else:
             callback.scaling = tensors.scaling if tensors else _measure_scaling(task)
         options = dict[str, Any](env_kwargs=task.options(task.num_envs), scaled=False)
@@ -219,7 +219,7 @@ class Trainer:
         else:
             scales = (np.resize(callback.weights, env.num_envs) / period)[:, None].tolist()
         scaled_env = RewardScaleWrapper(env, RewardScale(scales))
-        run, seed = self.run_options, (task.seed + steps) % 2**32
+        seed = (task.seed + steps) % 2**32
         further = dict[str, Any](device=run.device, tensorboard_log=run.tensorboard_log, seed=seed)
         if task.algorithm.on_tensors:
             further["source"] = partial(_make_source, task, first, scaled_env.reward_scale)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3")
@@ -86,6 +87,12 @@ def normalised_twice(folder: Path) -> None:
 
 QUIET = {"base": "straight", "duration": 0.3, "disturbance_force": 0.0, "disturbance_moment": 0.0}
 TANH = dataclasses.replace(POLICY, network=dataclasses.replace(RAW.network, activation="tanh"))
+LAST = POLICY.network.weights[-1]
+TWICE = dataclasses.replace(
+    POLICY.network,
+    weights=[*POLICY.network.weights[:-1], np.concatenate([LAST, LAST])],
+    biases=[*POLICY.network.biases[:-1], np.zeros(2)],
+)
 REFUSED: dict[str, Refusal] = {
     "rounds": config("1 at least", rounds=0),
     "hidden": config("1 at least", hidden=(0,)),
@@ -157,6 +164,11 @@ REFUSED: dict[str, Refusal] = {
         "'activation_fn': 'silu'}, and the settings say",
         POLICY,
         lambda: dataclasses.replace(make_finetune_task(POLICY, **FEW), settings=SETTINGS["ppo"]),
+    ),
+    "other action": started(
+        "distill-coms-yaw gives 2 numbers, the env's action is of Box",
+        dataclasses.replace(POLICY, network=TWICE),
+        lambda: make_finetune_task(POLICY, **FEW),
     ),
     "other entries": started(
         r"distill-coms-yaw reads gyro, .*beta_hat.*; here there",
