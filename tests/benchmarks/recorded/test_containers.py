@@ -37,11 +37,9 @@ BO_ 512 Gps: 8 Car
  SG_ Quality : 16|16@1+ (0.0625,0) [0|99] "" Car
 """
 FAST_COLUMNS = {
-    "speed_x_mps": "Speed",
-    "yaw_rate_radps": "YawRate",
-    "accel_y_mps2": "AccelY",
+    "speed_x_mps": "Speed", "yaw_rate_radps": "YawRate", "accel_y_mps2": "AccelY",
     "steer_rad": "Steer",
-}
+}  # fmt: skip
 COLUMNS = {**FAST_COLUMNS, "course_rad": "Course"}
 
 
@@ -125,15 +123,13 @@ def write_bag(folder: Path, storage: str, late: float = 0.0) -> Path:
             when = types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
             header = types["std_msgs/msg/Header"](when, "car")
             vector = types["geometry_msgs/msg/Vector3"]
-            twist = types["geometry_msgs/msg/Twist"](
-                vector(speed, accel, steer), vector(0.0, 0.0, yaw_rate)
-            )
+            parts = vector(speed, accel, steer), vector(0.0, 0.0, yaw_rate)
+            twist = types["geometry_msgs/msg/Twist"](*parts)
             raw = store.serialize_cdr(types[kinds[0]](header, twist), kinds[0])
             writer.write(motion, stamp, raw)
             if np.isfinite(course):
-                raw = store.serialize_cdr(
-                    types[kinds[1]](header, vector(course, 0.0, 0.0)), kinds[1]
-                )
+                fix = types[kinds[1]](header, vector(course, 0.0, 0.0))
+                raw = store.serialize_cdr(fix, kinds[1])
                 writer.write(gps, stamp + round(1e9 * late), raw)
     return path
 
@@ -285,11 +281,8 @@ def test_a_mapping_stands_in_a_file(tmp_path: Path) -> None:
 def cut(path: Path) -> Path:
     """Leave two thirds; of a candump half of the last digit pair (a line ends with " R")."""
     data = path.read_bytes()
-    end = (
-        data.rindex(b"\n", 0, 2 * len(data) // 3) - 3
-        if path.suffix == ".log"
-        else 2 * len(data) // 3
-    )
+    end = 2 * len(data) // 3
+    end = data.rindex(b"\n", 0, end) - 3 if path.suffix == ".log" else end
     path.write_bytes(data[:end])
     return path
 

@@ -69,13 +69,9 @@ def test_a_known_car_is_found_within_its_intervals(plain: bool) -> None:
 
 def test_the_start_does_not_matter_where_the_log_tells() -> None:
     log, _ = drive(1)
-    ends = [
-        identify([log], PASSENGER_CAR.scale_stiffness(*at), tyres="fiala")
-        for at in ((0.7, 1.3), (1.3, 0.7))
-    ]
-    one, two = (
-        np.array([e.car.front_stiffness, e.car.rear_stiffness, e.car.yaw_inertia]) for e in ends
-    )
+    starts = (PASSENGER_CAR.scale_stiffness(*at) for at in ((0.7, 1.3), (1.3, 0.7)))
+    cars = [identify([log], start, tyres="fiala").car for start in starts]
+    one, two = ([x.front_stiffness, x.rear_stiffness, x.yaw_inertia] for x in cars)
     np.testing.assert_allclose(one, two, rtol=0.02)
 
 
@@ -150,9 +146,7 @@ def test_swapped_columns_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=f"columns are swapped, {message}"):
             identify([spoilt], PASSENGER_CAR)
-        assert any(
-            "swapped" in finding.text for finding in find_contradictions([spoilt], PASSENGER_CAR)
-        )
+        assert any("swapped" in x.text for x in find_contradictions([spoilt], PASSENGER_CAR))
     assert find_swapped([log]) == ""
 
 

@@ -162,9 +162,8 @@ def test_estimators_get_no_worse_elsewhere(seeds: range, laws: tuple[str | None,
     for seed in seeds:
         drawn = drawn_car(seed)
         own = SignalCalibration(latency={"gps": drawn.late})
-        stated = [
-            slip_errors(drawn.held_out, PASSENGER_CAR, each) for each in (SignalCalibration(), own)
-        ]
+        both = SignalCalibration(), own
+        stated = [slip_errors(drawn.held_out, PASSENGER_CAR, each) for each in both]
         for tyres in laws:
             found = identify([drawn.log], PASSENGER_CAR, tyres=tyres)
             now = [slip_errors(drawn.held_out, found.car, each) for each in (found.wires, own)]
@@ -174,16 +173,11 @@ def test_estimators_get_no_worse_elsewhere(seeds: range, laws: tuple[str | None,
             if tyres is None:
                 load = drawn.car.mass / PASSENGER_CAR.mass
                 true = (2.0 * drawn.car.front_stiffness, 2.0 * drawn.car.rear_stiffness)
-                outside += [
-                    abs(row.value - value / load) > row.half
-                    for row, value in zip(
-                        found.findings[:3], (*true, drawn.car.yaw_inertia), strict=True
-                    )
-                ]
+                pairs = zip(found.findings[:3], (*true, drawn.car.yaw_inertia), strict=True)
+                outside += [abs(row.value - value / load) > row.half for row, value in pairs]
     for law in laws:
         before = np.sum([stated for tyres, stated, _ in errors if tyres == law], axis=0)
         after = np.sum([now for tyres, _, now in errors if tyres == law], axis=0)
         assert np.all(np.sqrt(after / before) < 1.05), np.sqrt(after / before)
-    assert (
-        not outside or np.mean(outside) < 0.15
-    )  # 95 % intervals, and friction is not the stated one
+    # 95 % intervals, and friction is not the stated one
+    assert not outside or np.mean(outside) < 0.15

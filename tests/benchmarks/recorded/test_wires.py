@@ -38,10 +38,7 @@ def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
         ("latency = {radar = 0.1}", "radar=0.1"),
         ("latency = {gps = -0.1}", "0 to 5 s"),
         ("latency = {steer = 9.0}", "-5 to 5 s"),
-        (
-            'noise = {gyro_noise = "loud"}',
-            "noise gyro_noise is a number of zero or more, got 'loud'",
-        ),
+        ('noise = {gyro_noise = "loud"}', "gyro_noise is a number of zero or more, got 'loud'"),
         ("noise = {gyro_nois = 0.1}", "did you mean 'gyro_noise'"),
         ("at = {gps = [1.0, 0.0]}", r"gps sits at \[x, y, z\] m forward, left, up, within 10 m"),
         ("at = {gps = [1000.0, 0.0, 0.0]}", "within 10 m, got"),
@@ -118,9 +115,8 @@ def test_a_sensor_ahead_of_the_centre_of_gravity_is_moved_there() -> None:
     packets[:, PACKET.value] = shown[rows]
     record = dataclasses.replace(right.record, fast=fast, packets=packets)
     log = dataclasses.replace(right, record=record, truth={"beta": shown})
-    moved = apply_wires(
-        log, SignalCalibration(at=dict.fromkeys(("gps", "sideslip", "accel"), place))
-    )
+    places = dict.fromkeys(("gps", "sideslip", "accel"), place)
+    moved = apply_wires(log, SignalCalibration(at=places))
     assert np.abs(shown - slip).max() > 0.02
     np.testing.assert_allclose(moved.truth["beta"], slip, atol=3e-4)  # slips are small
     np.testing.assert_allclose(moved.record.packets[:, PACKET.value], slip[rows], atol=3e-4)
@@ -156,9 +152,8 @@ def test_a_stated_latency_comes_to_the_logged_one() -> None:
     packets[:, PACKET.arrived] += 10
     slow = {"gps": dataclasses.replace(log.slow["gps"], delays=(0.1,))}
     record = dataclasses.replace(log.record, packets=packets)
-    late = apply_wires(
-        dataclasses.replace(log, record=record, slow=slow), SignalCalibration(latency={"gps": 0.2})
-    )
+    punctual = dataclasses.replace(log, record=record, slow=slow)
+    late = apply_wires(punctual, SignalCalibration(latency={"gps": 0.2}))
     delays = late.record.packets[:, PACKET.arrived] - late.record.packets[:, PACKET.captured]
     assert late.slow["gps"].longest_delay == pytest.approx(0.3) and set(delays) == {30.0}
 

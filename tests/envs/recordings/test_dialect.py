@@ -151,9 +151,8 @@ def test_stamps_since_1970(tmp_path: Path, unit: str, scale: int) -> None:
 def test_a_compass_course_is_read_as_one(tmp_path: Path) -> None:
     table = drive(300).assign(heading=np.nan)
     table.loc[::20, "heading"] = (350.0 + 2.0 * np.arange(15)) % 360.0
-    values, _ = read_quantities(
-        saved(table, tmp_path), {"course_degnorth": "heading"}, ("time", "steer"), None
-    )
+    mapping = {"course_degnorth": "heading"}
+    values, _ = read_quantities(saved(table, tmp_path), mapping, ("time", "steer"), None)
     course = values["course"][::20]
     expected = (90.0 - table["heading"][::20]) * DEG
     np.testing.assert_allclose(np.sin(course), np.sin(expected), atol=1e-12)

@@ -203,9 +203,7 @@ def test_there_is_room_for_the_worst_case(camera: dict[str, Any], n: int) -> Non
     ],
 )
 def test_more_packets_under_way_than_there_is_room_for_are_refused(changes: Any) -> None:
-    with pytest.raises(
-        ValueError, match=rf"packets under way at once; .* room for {MAX_IN_FLIGHT}"
-    ):
+    with pytest.raises(ValueError, match=rf"way at once; there is room for {MAX_IN_FLIGHT}"):
         make_link(SlowSensor(**changes))
     with pytest.raises(ValueError, match="under way"):
         StabilityEnv(camera=changes)

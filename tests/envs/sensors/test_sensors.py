@@ -150,9 +150,8 @@ def test_an_antenna_off_the_centre_moves_as_a_point_of_the_body_does(
     V_X, V_Y = c * state.v_x - s * state.v_y, s * state.v_x + c * state.v_y
     places = []
     for t in (-h, h):
-        moved = state._replace(
-            X=state.X + V_X * t, Y=state.Y + V_Y * t, psi=state.psi + state.gamma * t
-        )
+        place = {"X": state.X + V_X * t, "Y": state.Y + V_Y * t}
+        moved = state._replace(psi=state.psi + state.gamma * t, **place)
         places.append(np.array(gps(moved, ahead=ahead, left=left)[2:4]))
     velocity = (places[1] - places[0]) / (2.0 * h)
     course, speed = gps(state, ahead=ahead, left=left)[:2]
@@ -171,9 +170,8 @@ def test_gps_noise_follows_hdop_as_its_law_says(law: str, weight: float) -> None
         np.array(gps(motion, Noise(), (1.0,) * 4, hdop=hdop, weight=weight)[:4]) - still
         for hdop in (1.0, 3.0)
     )
-    assert at_1 == pytest.approx(
-        [Noise().course / 8.0, Noise().gps_speed, 0.5, 0.5], rel=1e-12
-    )  # roundings of numbers up to 8
+    sizes = [Noise().course / 8.0, Noise().gps_speed, 0.5, 0.5]
+    assert at_1 == pytest.approx(sizes, rel=1e-12)  # roundings of numbers up to 8
     times = {"constant": 1.0, "half": 2.0, "table": 3.0}[law]
     np.testing.assert_allclose(at_3, times * at_1, rtol=1e-12)
 
@@ -244,9 +242,8 @@ def test_bias_is_added_to_every_sample() -> None:
     one, other = (drive(ticks=50, scenario=s)[1] for s in (biased, LINEAR | SWERVING))
     # one rounding each
     np.testing.assert_allclose(one[:, FAST.gyro], other[:, FAST.gyro] + 0.01, rtol=1e-15)
-    np.testing.assert_allclose(
-        one[:, FAST.accel_y], other[:, FAST.accel_y] - 0.3, rtol=0.0, atol=1e-15
-    )
+    accel = other[:, FAST.accel_y] - 0.3
+    np.testing.assert_allclose(one[:, FAST.accel_y], accel, rtol=0.0, atol=1e-15)
 
 
 HDOP, SATELLITES = PACKET.value + 4, PACKET.value + 5

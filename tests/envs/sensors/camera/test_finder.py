@@ -45,20 +45,14 @@ def errors(
 def draws(count: int, bend: float = 0.0, view: FieldOfView = VIEW) -> list[RoadScene]:
     rng = np.random.default_rng(5)
     low = np.array([-view.heading, -view.offset, 0.0, -bend])
-    return [
-        RoadScene(psi, y, s, road=RoadParams(kappa, -1e6, 1.0))
-        for psi, y, s, kappa in rng.uniform(
-            low, [view.heading, view.offset, 500.0, bend], (count, 4)
-        )
-    ]
+    places = rng.uniform(low, [view.heading, view.offset, 500.0, bend], (count, 4))
+    return [RoadScene(psi, y, s, road=RoadParams(kappa, -1e6, 1.0)) for psi, y, s, kappa in places]
 
 
 def test_over_the_field_of_view_within_a_fifth_of_a_degree_and_two_centimetres() -> None:
     headings = offsets = np.linspace(-1.0, 1.0, 5)
-    grid = [
-        RoadScene(psi=VIEW.heading * a, y=VIEW.offset * b, s=3.0 * k)
-        for k, (a, b) in enumerate(product(headings, offsets))
-    ]
+    places = enumerate(product(headings, offsets))
+    grid = [RoadScene(VIEW.heading * a, VIEW.offset * b, 3.0 * k) for k, (a, b) in places]
     for scenes in (grid, draws(25)):
         psi, y_l, lanes = errors(scenes)
         assert psi < 0.2 and y_l < 2.0
@@ -95,9 +89,8 @@ def test_pitch_and_roll_are_told_from_the_lane() -> None:
         lane = FINDER.find(CLEAR.render_picture(RoadScene(psi=0.05, y=0.3, pitch=pitch)))
         assert FINDER.fit is not None and FINDER.fit.pitch == pytest.approx(pitch, abs=2e-3)
         assert lane.y_l == pytest.approx(0.3 + 5.135 * 0.05, abs=0.02)
-    lane = FINDER.find(
-        CLEAR.render_picture(RoadScene(y=1.5, roll=0.02))
-    )  # in its middle nothing shows it
+    # in the lane's middle nothing shows a roll
+    lane = FINDER.find(CLEAR.render_picture(RoadScene(y=1.5, roll=0.02)))
     assert FINDER.fit is not None and FINDER.fit.roll == pytest.approx(0.02, abs=4e-3)
     assert lane.y_l == pytest.approx(1.5, abs=0.04)
 

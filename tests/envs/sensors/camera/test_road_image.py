@@ -74,9 +74,8 @@ def test_dashes_move_with_the_car() -> None:
     def bright(s: float) -> list[bool]:
         pixels = CAMERA.project_points(np.arange(5.0, 15.0, 0.5), np.array(1.75))
         columns, rows = np.round(pixels).astype(int).T
-        return [
-            bool(light > 150) for light in PAINTER.render_picture(RoadScene(s=s))[rows, columns]
-        ]
+        lights = PAINTER.render_picture(RoadScene(s=s))[rows, columns]
+        return [bool(light > 150) for light in lights]
 
     assert bright(2.0)[:-4] == bright(0.0)[4:] and bright(9.0) == bright(0.0)
     assert 0.3 < np.mean([bright(s) for s in range(0, 9, 2)]) < 0.6
