@@ -56,8 +56,8 @@ PATHS = {
         Step("benchmarks/control/run.py", "measure",
              "drives entry.make(task, n) in processes: n seeds at once, step by step",
              "DriveResult of each case: metrics, shape (seeds, len(NUMBERS))"),
-        Step("benchmarks/control/tables.py", "Matrix.by_tier",
-             "pairs drives with nominal's, and ranks by score"),
+        Step("benchmarks/control/score.py", "Matrix.overall",
+             "pairs drives with nominal's on the same seed: r; ranks by the score, its mean"),
     ),
 }  # fmt: skip
 """Steps by the picture's name."""

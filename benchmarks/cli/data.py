@@ -18,19 +18,8 @@ from ...envs.io import read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.tables import print_suite
-from .common import (
-    File,
-    Text,
-    Texts,
-    check_file,
-    parse_options,
-    print_written,
-    refuse_unused_options,
-    register,
-    take,
-    take_argument,
-    write_output,
-)
+from . import common
+from .common import File, Text, Texts, register, take, take_argument
 
 if TYPE_CHECKING:
     from ...envs.sensors.camera.images import Film, Image, Pinhole
@@ -52,7 +41,7 @@ def _read_wires(
     offset = None if degrees is None else math.radians(degrees)
     steering = {"ratio": command.steering_ratio, "sign": command.steering_sign, "offset": offset}
     overrides: dict[str, Any] = {k: value for k, value in steering.items() if value is not None}
-    late = {**known.latency, **parse_options(latency)}
+    late = {**known.latency, **common.parse_options(latency)}
     return known._replace(latency=late, **overrides).check()
 
 
@@ -60,7 +49,7 @@ def _parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
     """Parse options by estimator, such as {"joint": {"robust": 0.0}} from "joint.robust=0"."""
     options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
-        ((key, value),) = parse_options([text]).items()
+        ((key, value),) = common.parse_options([text]).items()
         name, dot, option = key.partition(".")
         if not (name and dot and option):
             raise ValueError(f"an estimator's option is ESTIMATOR.NAME=VALUE, got {text!r}")
@@ -110,14 +99,14 @@ class _Replay:
             used = "log html json parquet plot kml vehicle estimator"  # as for a batch of logs
             if (self.vehicle, self.estimator) != (type(self).vehicle, type(self).estimator):
                 console.print("A receiver's log says nothing of --vehicle and --estimator.")
-            refuse_unused_options(self, used, f"a receiver's log ({log})")
+            common.refuse_unused_options(self, used, f"a receiver's log ({log})")
             with use_shared_bar(console, f"replay {log}"):
                 received = replay_nmea(log)
-            write_output(console, [make_receiver_suite(received)], vars(self))
+            common.write_output(console, [make_receiver_suite(received)], vars(self))
             for path, write in ((self.plot, draw), (self.kml, write_kml)):
                 if path is not None:
                     write(path, received)
-            print_written(console, self.plot, self.kml)
+            common.print_written(console, self.plot, self.kml)
             return
         if self.plot or self.kml:
             raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
@@ -131,7 +120,7 @@ class _Replay:
                 delay=self.course_delay, bias_deg=self.course_bias, gyro_bias_degps=self.gyro_bias,
                 figures=_has_figures(self.html),
             )  # fmt: skip
-        write_output(console, [suite], vars(self))
+        common.write_output(console, [suite], vars(self))
 
 
 def _has_figures(html: Path | None) -> bool:
@@ -180,7 +169,7 @@ class _Identify:
             raise Exit(1)
         if self.out is not None:
             write_vehicle(self.out, result.car, result.wires)
-            print_written(console, self.out)
+            common.print_written(console, self.out)
 
 
 @register("inspect", "Judge whether a recorded drive is worth estimating from.")
@@ -206,7 +195,7 @@ class _Inspect:
         with use_shared_bar(console, f"inspect {self.log}"):
             log = self.log, self.vehicle, self.mapping, wires
             suite = inspect_file(*log, figures=_has_figures(self.html))
-        write_output(console, [suite], vars(self))
+        common.write_output(console, [suite], vars(self))
         if suite.verdict.startswith("Do not"):
             raise Exit(1)
 
@@ -237,14 +226,14 @@ class _Lane:
         if (source is None) == (self.calibrate is None):
             raise ValueError("expected a picture or a film, or --calibrate FOLDER")
         if source is None:
-            refuse_unused_options(self, "calibrate json", "--calibrate")
+            common.refuse_unused_options(self, "calibrate json", "--calibrate")
             self._calibrate_camera()
             return
         if not 1.0 < self.lane_width < 10.0:
             raise ValueError(f"--lane-width is 1 to 10 m, got {self.lane_width}")
         cv2.setNumThreads(1)
         still = source.suffix.lower() in PICTURES
-        check_file(out, ".png .jpg .jpeg" if still else ".mp4 .avi")
+        common.check_file(out, ".png .jpg .jpeg" if still else ".mp4 .avi")
         if still:
             try:
                 picture = read_picture(source)
@@ -266,7 +255,7 @@ class _Lane:
         if self.json is not None:
             frames = [lane._asdict() for lane in lanes]
             write_document(self.json, {"source": str(source), "frames": frames})
-        print_written(_console, out, self.json)
+        common.print_written(_console, out, self.json)
 
     def _calibrate_camera(self) -> None:
         """Write the intrinsics that the chessboards of a folder's pictures give."""
@@ -276,13 +265,13 @@ class _Lane:
         assert folder is not None
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: there is no such folder")
-        check_file(path, ".json")
+        common.check_file(path, ".json")
         boards = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
         camera, error = calibrate_camera(boards)
         numbers = {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error}
         write_document(path, numbers)
         _console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures")
-        print_written(_console, path)
+        common.print_written(_console, path)
 
     def _make_finder(self, pictures: "list[Image]", source: Path) -> "LaneFinder":
         """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""

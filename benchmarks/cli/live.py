@@ -19,19 +19,8 @@ from rich.markup import escape
 from ...envs.validation import check_choice
 from ..harness.results import write_text
 from ..report.study import format_verdict
-from .common import (
-    File,
-    Text,
-    Texts,
-    make_driver,
-    make_setup,
-    print_written,
-    refuse_unused_options,
-    register,
-    show_episode,
-    take,
-    take_argument,
-)
+from . import common
+from .common import File, Text, Texts, register, take, take_argument
 from .names import check_env
 
 console = Console(soft_wrap=True, highlight=False)
@@ -75,20 +64,21 @@ class _Live:
         from ...agents.live.loop import LOOPBACK
 
         target = _parse_address(self.to) if self.to else (LOOPBACK, self.port)
-        setup = make_setup(vars(self))
+        setup = common.make_setup(vars(self))
         if self.relay is not None:
-            refuse_unused_options(self, "relay to port latency speed duration json", "--relay")
+            used = "relay to port latency speed duration json"
+            common.refuse_unused_options(self, used, "--relay")
             self._relay(self.relay, target)
         elif self.replay is not None:
-            refuse_unused_options(self, "replay estimator agent env json trust", "--replay")
+            common.refuse_unused_options(self, "replay estimator agent env json trust", "--replay")
             self._replay(self.replay, setup)
         elif self.estimator is not None:
             used = " ".join({*vars(self)} - {"to"})
-            refuse_unused_options(self, used, "an ESTIMATOR: see --publish")
+            common.refuse_unused_options(self, used, "an ESTIMATOR: see --publish")
             self._run_loop(setup, [_parse_address(text) for text in self.publish or []])
         elif self.simulate:
             used = "simulate env vehicle scenario option control_period seed to port step speed"
-            refuse_unused_options(self, used, "--simulate without an ESTIMATOR")
+            common.refuse_unused_options(self, used, "--simulate without an ESTIMATOR")
             self._simulate(setup, target)
         else:
             raise ValueError("name an ESTIMATOR, or --simulate, --relay or --replay")
@@ -103,7 +93,7 @@ class _Live:
         patience = None if self.step else round(PATIENCE / min(self.speed, 1.0))
         with ExitStack() as stack:
             port = stack.enter_context(Port(self.host, self.port))
-            onboard = OnboardController(*make_driver(setup, self.trust), setup["seed"])
+            onboard = OnboardController(*common.make_driver(setup, self.trust), setup["seed"])
             setup["env"] = onboard.base.spec.id
             loop = Loop(onboard, StreamSynchroniser(patience), port, publish, step=self.step)
             page = None if self.page is None else (self.host, self.page)
@@ -138,7 +128,7 @@ class _Live:
         if drive is not None:
             lines.append(_compare_offline(drive, setup, self.trust, numbers))
         console.print(f"[bold]{escape(format_verdict(*lines))}[/]")
-        print_written(console, self.record)
+        common.print_written(console, self.record)
         self._write(numbers)
 
     def _simulate(self, setup: dict[str, Any], target: Any) -> None:
@@ -150,7 +140,7 @@ class _Live:
         env = gym.make(env_id, **setup["options"])
         with Port() as port:
             drive, wires = simulate(env, port, target, self.seed, self.step, self.speed)
-        show_episode(console, drive, "the other end")
+        common.show_episode(console, drive, "the other end")
         console.print(f"{wires.late} of {wires.periods} controls came a period late")
 
     def _relay(self, source: str, target: Any) -> None:
@@ -185,7 +175,8 @@ class _Live:
                 check_choice(name, setup[kind], known)
         unasked = "" if setup["env"] == requested["env"] else setup["env"]
         check_names_no_code(unasked, "", setup["estimator_options"])
-        onboard = OnboardController(*make_driver(requested | setup, self.trust), setup["seed"])
+        driver = common.make_driver(requested | setup, self.trust)
+        onboard = OnboardController(*driver, setup["seed"])
         ticks, same = recorded.replay(onboard, setup["patience"])
         text = "those of the session bit for bit" if same else "NOT those of the session"
         console.print(f"{ticks} ticks; the estimates are {text}")
@@ -194,7 +185,7 @@ class _Live:
     def _write(self, numbers: Mapping[str, Any]) -> None:
         if self.json is not None:
             write_text(self.json, json.dumps(numbers, indent=1) + "\n")
-            print_written(console, self.json)
+            common.print_written(console, self.json)
 
 
 def _parse_address(text: str) -> tuple[str, int]:
@@ -222,7 +213,7 @@ def _compare_offline(
     from ...agents.rollout import rollout
 
     columns, late, periods = drive
-    offline = rollout(*make_driver(setup, trust), setup["seed"]).columns
+    offline = rollout(*common.make_driver(setup, trust), setup["seed"]).columns
     same = all(np.array_equal(offline[name], values) for name, values in columns.items())
     rows = min(len(columns["beta"]), len(offline["beta"]))
     away = float(np.max(np.abs(columns["beta"][:rows] - offline["beta"][:rows])))

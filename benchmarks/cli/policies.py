@@ -19,18 +19,7 @@ from ..harness.parallel import Bar, use_shared_bar
 from ..harness.results import check_writable
 from ..harness.stats import Estimate
 from . import common
-from .common import (
-    File,
-    Text,
-    Texts,
-    check_file,
-    get_command_line,
-    parse_options,
-    print_written,
-    register,
-    take,
-    take_argument,
-)
+from .common import File, Text, Texts, register, take, take_argument
 from .names import check_env
 
 if TYPE_CHECKING:
@@ -60,15 +49,15 @@ class _Export:
 
         target = self.out or self.zipped.with_suffix(".safetensors")
         check_writable(target)
-        policy = export_zip(self.zipped, target, self.env, parse_options(self.option),
-                            trust=self.trust, normalise=self.normalise,
-                            estimator=self.estimator, command=get_command_line())  # fmt: skip
+        policy = export_zip(self.zipped, target, self.env, common.parse_options(self.option),
+                            trust=self.trust, normalise=self.normalise, estimator=self.estimator,
+                            command=common.get_command_line())  # fmt: skip
         default = "the scales of its training" if (policy.network.scale != 1.0).any() else "nothing"
         scaled = find_normaliser(self.zipped, self.normalise) or default
         text = f"network: {_describe_sizes(policy.network)}; observations normalised by: {scaled}"
         console = Console(soft_wrap=True)
         console.print(text, markup=False, highlight=False)
-        print_written(console, target)
+        common.print_written(console, target)
 
 
 def _describe_sizes(network: "Network") -> str:
@@ -136,7 +125,7 @@ class _Enjoy:
             cars = (name, first), ("no control", evaluation.entries["none"])
             drivers = [FilmDriver(driver, *entry.make(task)) for driver, entry in cars]
             write_film(self.video, drivers, seed, console)
-            print_written(console, self.video)
+            common.print_written(console, self.video)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
@@ -203,16 +192,16 @@ class _Distill:
         from ..studies.policies import Lessons
 
         target, console = self.out or Path(f"{self.name}.safetensors"), Console()
-        check_file(target, ".safetensors")
+        common.check_file(target, ".safetensors")
         names = "rounds epochs cells noise seed batch traces auxiliary_weight"
         numbers = {name: getattr(self, name) for name in names.split()}
         config = DistillConfig(hidden=tuple(self.hidden or (64, 64)), **numbers)
         about: dict[str, object] = {"class": self.kind, "teacher": self.teacher}
         about |= {"cars": self.cars, "varied": self.varied} | config.describe()
         options = {"algorithm": "distill", "algorithm_options": about}
-        options |= {"seeds": {"training": self.seed}, "command": get_command_line()}
+        options |= {"seeds": {"training": self.seed}, "command": common.get_command_line()}
         taught = self.estimator, self.teacher, self.cars, self.varied, self.seed
-        lessons = Lessons(self.kind, *taught, parse_options(self.option))
+        lessons = Lessons(self.kind, *taught, common.parse_options(self.option))
         card = lessons.make_card(**options)
 
         def show(now: RoundResult) -> None:
@@ -223,7 +212,7 @@ class _Distill:
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
             distill(card, lessons.make_tasks(), config, target, show)
         console.print(_evaluate_on_tasks(target, self.kind, self.episodes))
-        print_written(console, target)
+        common.print_written(console, target)
 
 
 _TASK_EPISODES = 32  # of each task of a policy's class
@@ -276,7 +265,7 @@ class _Train:
 
         chosen = {item.name: getattr(self, item.name, None) for item in fields(TrainingTask)}
         for name in ("estimator_options", "env_options"):
-            chosen[name] = parse_options(chosen[name])
+            chosen[name] = common.parse_options(chosen[name])
         options = {name: value for name, value in chosen.items() if value not in (None, [], {})}
         out, logs, resume, varied = self.out, self.log_folder, self.resume, self.varied
         if self.env_id is not None:
@@ -335,7 +324,7 @@ class _Train:
             where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
             text = f"mean cost on test seeds{where}: {shown}"
             console.print(text, highlight=False, soft_wrap=True)
-        print_written(console, file, folder / callbacks.CURVE)
+        common.print_written(console, file, folder / callbacks.CURVE)
 
 
 def _make_table(trained: "EvalCallback") -> Table:

@@ -6,6 +6,8 @@ Args:
     chunk: Seeds of an entry in a task.
     case: Task and who drives it.
     results: Episodes by case.
+    suite: Suite to which rows and tables are added.
+    salt: Salt of the seeds, hexadecimal digits, else ValueError.
     matrix: Measurements of the suite.
     ranked: Standings, the best first.
     tier: Tier; None: all.

@@ -155,8 +155,8 @@ class ControlCase(NamedTuple):
         agent = self.entry.agent
         card = load_policy(agent).card.env_options if is_policy(agent) else {}
         observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
-        options = self.task.env_options | {"on_bad_action": "fail"}
-        return options | observed | dict(self.task.changes)
+        changes = observed | dict(self.task.changes)
+        return self.task.env_options | {"on_bad_action": "fail"} | changes
 
     @property
     def spec(self) -> str:

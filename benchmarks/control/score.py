@@ -11,8 +11,9 @@ Args:
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
@@ -186,12 +187,7 @@ class Standing:
         return float(np.mean(means)) if means else math.nan
 
     def add_rows(self, suite: Suite, salt: str) -> None:
-        """Add a row for each metric and task, and those of the tier.
-
-        Args:
-            suite: Suite to which the rows are added.
-            salt: Salt of the seeds.
-        """
+        """Add a row for each metric and task, and those of the tier."""
         labels = {"estimator": self.entry.estimator, "controller": self.entry.agent, "salt": salt}
         for task, metrics in self.by_task.items():
             where = {"scenario": task.name, "spec": ControlCase(task, self.entry).spec}
@@ -226,3 +222,34 @@ def rank_entries(results: Results, tier: str | None) -> list[Standing]:
     nominal = {task: result for task, result in driven if not result.error}
     ranked = [Standing(tier or "", entry, drives, nominal) for entry, drives in by_entry.items()]
     return sorted(ranked, key=lambda standing: standing.rank)
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """The matrix of controllers and estimators, as a run measured it."""
+
+    results: Results
+    salt: str = ""  # salt of the seeds
+    # log of oracle-state's cost over clairvoyant's in each calibrated task, shape (n,)
+    foresight: Mapping[ControlTask, Array] = field(default_factory=dict)
+
+    @cached_property
+    def tasks(self) -> list[ControlTask]:
+        """Tasks that were driven."""
+        return list(dict.fromkeys(task for task, _ in self.results))
+
+    @cached_property
+    def by_tier(self) -> dict[str, list[Standing]]:
+        """Standings by tier, the best first."""
+        tiers = dict.fromkeys(task.tier for task in self.tasks)
+        return {tier: rank_entries(self.results, tier) for tier in tiers}
+
+    @cached_property
+    def overall(self) -> list[Standing]:
+        """Standings over all tiers, the best first."""
+        return rank_entries(self.results, None)
+
+    def add_rows(self, suite: Suite) -> None:
+        """Add the rows of all tiers' standings."""
+        for standing in chain(*self.by_tier.values()):
+            standing.add_rows(suite, self.salt)

@@ -2,8 +2,7 @@
 
 All pairs of both drive the scored tasks of four tiers on salted seeds. `_Gains` are r of an entry's
 drives, shape (n,), by task (see `score`). The cost of an entry over another's is exp(-r) in verdict
-and figures, so that a loss that the other does not have counts e^2 times. As a command the file
-lists reversals: pairs of entries whose order turns in a world of other errors.
+and figures, so that a loss that the other does not have counts e^2 times.
 """
 
 import itertools
@@ -21,15 +20,15 @@ from rich.console import Console
 from ...envs.record import Array
 from ...envs.scenarios.world import GROUPS, World, make_world
 from ...envs.vehicle.parameters import VEHICLES
-from ..harness.results import Explorer, Panel, Suite
+from ..harness.results import Explorer, Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.study import Request, Study, describe_leader, format_verdict, summarise_names
 from . import entries
 from .calibration import measure_foresight, read_current
 from .entries import ControlCase, Entry
 from .run import SIGNALS, Results, measure, measure_decision_time
-from .score import Standing, rank_entries
-from .tables import Matrix, compute_gaps, make_tables
+from .score import Matrix, Standing, rank_entries
+from .tables import compute_gaps, make_tables
 from .tasks import (
     PARAMETERS,
     QUICK_LEAD_IN,
@@ -66,8 +65,7 @@ def _measure(request: Request) -> Matrix:
 
 
 def _add_tables(suite: Suite, matrix: Matrix) -> None:
-    for standing in itertools.chain(*matrix.by_tier.values()):
-        standing.add_rows(suite, matrix.salt)
+    matrix.add_rows(suite)
     suite.tables = make_tables(matrix)
 
 
@@ -212,12 +210,12 @@ def _describe_reasons(matrix: Matrix) -> str:
     return f"Knowing {', then '.join(texts)} of the cost." if parameters else ""
 
 
-_PANELS = (
-    Panel("sideslip / mrad", (("beta", "true"), ("beta_ref", "reference"))),
-    Panel("yaw rate / (rad/s)", (("gamma", "true"), ("gamma_ref", "reference"))),
-    Panel("yaw moment / (N m)", (("yaw_moment", "delivered"),)),
-    Panel("front steering / mrad", (("steer", "delivered"),)),
-)
+_PANELS = {
+    "sideslip / mrad": (("beta", "true"), ("beta_ref", "reference")),
+    "yaw rate / (rad/s)": (("gamma", "true"), ("gamma_ref", "reference")),
+    "yaw moment / (N m)": (("yaw_moment", "delivered"),),
+    "front steering / mrad": (("steer", "delivered"),),
+}
 _SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
 _BODY = (1.5, 1.15)  # length and width of a car's body, over its wheelbase and its track
 _COST = "exp(-r) / %: cost over nominal's, less is better"

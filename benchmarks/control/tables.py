@@ -1,51 +1,21 @@
 """What a run of the matrix measured, as tables: standings, baselines, and what went wrong."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from ...envs.record import Array
 from ...envs.task import FAILURES
 from ..harness.metrics import EPISODE
 from ..harness.results import Column, Line, ResultTable
 from ..harness.stats import average
 from .entries import Entry
 from .run import Results
-from .score import PairedDrives, Standing, rank_entries
+from .score import Matrix, PairedDrives, Standing
 from .tasks import NOMINAL, PARAMETERS, STATE, TITLES, ControlTask, find_oracle
 
 _PERIOD = 0.01  # s, between two decisions in every task
 _CAR_OUTCOMES = ("none", "spin", "off-road")  # how an episode ends by the car's own motion
-
-
-@dataclass(frozen=True)
-class Matrix:
-    """The matrix of controllers and estimators, as a run measured it."""
-
-    results: Results
-    salt: str = ""  # salt of the seeds
-    # log of oracle-state's cost over clairvoyant's in each calibrated task, shape (n,)
-    foresight: Mapping[ControlTask, Array] = field(default_factory=dict)
-
-    @cached_property
-    def tasks(self) -> list[ControlTask]:
-        """Tasks that were driven."""
-        return list(dict.fromkeys(task for task, _ in self.results))
-
-    @cached_property
-    def by_tier(self) -> dict[str, list[Standing]]:
-        """Standings by tier, the best first."""
-        driven = {task.tier for task in self.tasks}
-        return {tier: rank_entries(self.results, tier) for tier in TITLES if tier in driven}
-
-    @cached_property
-    def overall(self) -> list[Standing]:
-        """Standings over all tiers, the best first."""
-        return rank_entries(self.results, None)
-
 
 _LABEL = Column("label", "controller and estimator")
 _MAIN = (

@@ -4,7 +4,6 @@
 seeds follow a salt, a hash of the entries' sources and the world: nobody can have tuned on them.
 
 Args:
-    salt: Hexadecimal digits, else ValueError.
     n: Number of seeds.
     more: Texts that make salt or seeds others.
 """

@@ -52,6 +52,7 @@ from ..control.tasks import (
     make_task_seeds,
 )
 from ..harness.results import read_objects, write_text
+from ..report.study import Request
 from .worker import LIMIT
 
 EPISODES = 64
@@ -128,7 +129,7 @@ def choose_estimator(agent: str) -> str:
 
 
 @dataclass(frozen=True)
-class ComparisonRequest:
+class ComparisonRequest(Request):
     """A user's entries and where they drive; ValueError for what cannot be compared.
 
     A scenario's name that is scored means its tasks; another one is driven in both ids with a yaw
@@ -139,10 +140,8 @@ class ComparisonRequest:
     vehicle: Any = None  # as for `make_vehicle`, instead of the tasks' cars, true and nominal
     scenarios: tuple[Any, ...] = ()  # as for `make_scenario`; empty: some tasks of every tier
     env_id: str = ""  # id whose tasks alone are driven
-    episodes: int = EPISODES  # of a task
     seeds: tuple[int, ...] | None = None  # instead of salted ones
     fresh: bool = False  # seeds are drawn after the user's files are hashed, and all drive anew
-    salt: str = ""  # of a fresh request that is repeated
     limit: float = LIMIT  # wall time of an entry in a task (s)
 
     def __post_init__(self) -> None:
@@ -150,7 +149,7 @@ class ComparisonRequest:
             _check_entry(entry)
         if self.env_id:
             check_choice("env", self.env_id, _IDS)
-        if len(self.seeds or range(self.episodes)) < 2:
+        if self.n < 2:
             raise ValueError("an interval needs two episodes or more")
         if len(set(self.seeds or ())) < len(self.seeds or ()):
             raise ValueError("a seed stands twice: its drives would count as independent")
@@ -163,6 +162,13 @@ class ComparisonRequest:
         if not self.limit > 0.0:
             raise ValueError(f"a limit is in s and above 0, got {self.limit!r}")
         _ = self.tasks
+
+    @property
+    def n(self) -> int:
+        """Episodes of a task."""
+        if self.seeds:
+            return len(self.seeds)
+        return EPISODES if self.episodes is None else self.episodes
 
     @property
     def files(self) -> list[Path]:

@@ -1,6 +1,6 @@
 """The open benchmark: a user's entries and the package's on the same episodes, and their scores.
 
-`sideslip.score` gives an entry's score as a Python object; `run` makes the suite.
+`sideslip.score` gives an entry's score as a Python object; `STUDY` makes the suite.
 """
 
 import hashlib
@@ -9,21 +9,20 @@ import os
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...envs.numerics import require_extra
-from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
-from ..control.run import Chunk, Results, measure
-from ..control.score import Standing, rank_entries
+from ..control.entries import QUICK_EPISODES, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlCase
+from ..control.run import Chunk, measure
+from ..control.score import Matrix, Standing
 from ..control.tables import make_failure_tables, make_main_table, make_task_table
 from ..control.tasks import make_salt, make_task_seeds, make_tuning_seeds
 from ..harness.results import Suite
 from ..harness.stats import Estimate
-from ..report.study import Request, format_percent
+from ..report.study import Request, Study, format_percent, format_verdict
 from .challenge import (
     EPISODES,
     ComparisonRequest,
@@ -43,65 +42,68 @@ _MAX_SENTENCES = 4  # entries with a sentence
 _REHEARSED = 2  # episodes of a task in which entries show what they open
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The episodes of a request; salt: "" for the caller's seeds; on_file: the baselines are."""
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Matrix):
+    """The episodes of a request; salt: "" for the caller's seeds."""
 
     request: ComparisonRequest
-    salt: str
-    on_file: bool
-    results: Results
-
-    @cached_property
-    def overall(self) -> list[Standing]:
-        """Standings over all tasks, the best first."""
-        return rank_entries(self.results, None)
+    on_file: bool  # whether the baselines are
 
 
-def _compare(request: ComparisonRequest, options: Request) -> Comparison:
+def _compare(request: Request) -> Comparison:
     """Drive a request: names and files in processes of their own, objects in this one."""
+    assert isinstance(request, ComparisonRequest)
     entries, tasks = request.entries, request.tasks
-    progress: dict[str, Any] = {"jobs": options.jobs, "console": options.console}
-    shared = progress | {"keep": options.keep}
+    progress: dict[str, Any] = {"jobs": request.jobs, "console": request.console}
+    shared = progress | {"keep": request.keep}
     controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
     filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
     rivals = make_baseline_cases(tasks, controllers, filters)
     cases = [ControlCase(task, entry) for task in tasks for entry in entries]
     isolated = [case for case in cases if not case.entry.objects]
     objects = [case for case in cases if case.entry.objects]
-    known = find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
+    known = find_baselines(rivals, request.n, **shared) if request.is_as_shipped else None
     allowed: frozenset[str] | None = None
     salt = known[0] if known else request.salt or make_salt()
     if request.fresh:
-        allowed = _find_opened_files(request, isolated, options)
+        allowed = _find_opened_files(request, isolated)
         digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(allowed)]
         salt = make_salt(*digests, secrets.token_hex(16))
-    seeds = request.seeds or make_task_seeds(salt, request.episodes)
+    seeds = request.seeds or make_task_seeds(salt, request.n)
     results = known[1] if known else measure(rivals, seeds, title="baselines", **shared)
     runner = IsolatedDrive(request.limit, allowed)
     results |= measure(isolated, seeds, title="entrants", runner=runner, **progress)
     results |= measure(objects, seeds, jobs=1, runner=run_user_chunk)
-    return Comparison(request, "" if request.seeds else salt, bool(known), results)
+    salt = "" if request.seeds else salt
+    return Comparison(results, salt, request=request, on_file=bool(known))
 
 
-def _find_opened_files(
-    request: ComparisonRequest, cases: Sequence[ControlCase], options: Request
-) -> frozenset[str]:
+def _find_opened_files(request: ComparisonRequest, cases: Sequence[ControlCase]) -> frozenset[str]:
     """Find the files that entries open, theirs included, by a drive on tuning seeds."""
     chunks = [Chunk(*case, tuple(make_tuning_seeds(_REHEARSED))) for case in cases]
-    opened = options.run_cases(IsolatedDrive(request.limit).rehearse, chunks, "rehearsal")
+    opened = request.run_cases(IsolatedDrive(request.limit).rehearse, chunks, "rehearsal")
     return frozenset().union(*opened, map(os.path.realpath, request.files))
 
 
-def _compose_verdict(comparison: Comparison) -> list[str]:
-    """Compose at most five lines: the user's entries, the best first, and how far to trust them."""
+def _add_tables(suite: Suite, comparison: Comparison) -> None:
+    ranked, request = comparison.overall, comparison.request
+    suite.tables = [
+        make_main_table("Your entries and the package's", ranked, request.entries),
+        make_task_table("Task by task", ranked, request.tasks),
+        *make_failure_tables(comparison.results),
+    ]
+    comparison.add_rows(suite)
+
+
+def _compose_verdict(comparison: Comparison) -> str:
+    """Compose the verdict: the user's entries, the best first, and how far to trust them."""
     entries = comparison.request.entries
     placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.entry in entries]
     count, more = len(comparison.overall), len(placed) - _MAX_SENTENCES
     lines = [f"Place {i} of {count}: {_make_sentence(x)}." for i, x in placed[:_MAX_SENTENCES]]
     if more > 0:
         lines[-1] = f"{more + 1} more stand in the table."
-    return [*lines, _describe_trust(comparison)]
+    return format_verdict(*lines, _describe_trust(comparison))
 
 
 def _make_sentence(standing: Standing) -> str:
@@ -133,8 +135,8 @@ def _make_sentence(standing: Standing) -> str:
 def _describe_trust(comparison: Comparison) -> str:
     """Sentence on what the numbers rest, and what they do not say."""
     request = comparison.request
-    n, count = len(request.seeds or range(request.episodes)), len(request.tasks)
-    where = f"{count} task{'s' if count > 1 else ''} x {n} episodes"
+    count = len(request.tasks)
+    where = f"{count} task{'s' if count > 1 else ''} x {request.n} episodes"
     if request.fresh:
         files = ", ".join(path.name for path in request.files)
         return (
@@ -220,9 +222,10 @@ def score(
     if estimator is None:
         estimator = choose_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
     entry = make_user_entry(agent, estimator, trust)
-    where = vehicle, scenario_list, env_id, episodes, chosen
-    request = ComparisonRequest((entry,), *where, fresh=fresh, limit=limit)
-    comparison = _compare(request, Request(jobs=jobs))
+    where = vehicle, scenario_list, env_id, chosen
+    comparison = _compare(
+        ComparisonRequest((entry,), *where, fresh, limit, episodes=episodes, jobs=jobs)
+    )
     standing = next(item for item in comparison.overall if item.entry == entry)
     rows = []
     for task, result in standing.results.items():
@@ -234,29 +237,19 @@ def score(
         pairs = standing.pairs.get(task)
         rows.append(row | {"n": pairs.n if pairs else 0, "error": result.error})
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
-    errors, names = [row["error"] for row in rows], (entry.agent, entry.estimator)
-    n, tasks, error = standing.n, tuple(rows), next(filter(None, errors), "")
-    return Score(*names, total, cost, won, failures, n, tasks, error, _make_sentence(standing))
+    error = next((row["error"] for row in rows if row["error"]), "")
+    return Score(
+        entry.agent, entry.estimator, total, cost, won, failures,
+        standing.n, tuple(rows), error, _make_sentence(standing),
+    )  # fmt: skip
 
 
-def run(request: ComparisonRequest, options: Request) -> Suite:
-    """Drive a request and make its suite.
-
-    Args:
-        request: Entries and tasks.
-        options: Processes, progress, and the folder of the baselines' finished cases.
-    """
-    comparison = _compare(request, options)
-    text = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
-    suite = Suite("control", "Your own beside the package's", text)
-    suite.verdict = "\n".join(_compose_verdict(comparison))
-    title = "Your entries and the package's"
-    suite.tables = [
-        make_main_table(title, comparison.overall, request.entries),
-        make_task_table("Task by task", comparison.overall, request.tasks),
-        *make_failure_tables(comparison.results),
-    ]
-    for tier in dict.fromkeys(task.tier for task in request.tasks):
-        for standing in rank_entries(comparison.results, tier):
-            standing.add_rows(suite, comparison.salt)
-    return suite
+STUDY = Study(
+    "control",
+    "Your own beside the package's",
+    "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours.",
+    (EPISODES, QUICK_EPISODES),
+    _compare,
+    _add_tables,
+    _compose_verdict,
+)

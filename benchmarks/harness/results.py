@@ -91,14 +91,6 @@ class ResultTable:
     opened: bool = False  # the report shows it unfolded
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One of the plots above each other."""
-
-    label: str  # quantity with its unit
-    lines: Sequence[tuple[str, str]]  # signals and legend; the first has the entry's colour
-
-
 @dataclass
 class Explorer:
     """Time series of which two are shown beside each other."""
@@ -107,7 +99,8 @@ class Explorer:
     menus: Sequence[str]  # labels of the parts of a cell's key but the last one, which is the entry
     # signals (n,) by key, with time "t" (s); with X, Y (m) and psi (rad) a cell is shown in motion
     cells: Mapping[tuple[str, ...], Mapping[str, Array]]
-    panels: Sequence[Panel]
+    # plots above each other by quantity and unit: signals and legend, the entry's colour first
+    panels: Mapping[str, Sequence[tuple[str, str]]]
     caption: str = ""  # caption, a sentence
     pair: tuple[str, str] = ("", "")  # the two entries at the start
     # length and width of the car (m) by the shared part of the key

@@ -235,7 +235,7 @@ def _format_explorer(explorer: Explorer) -> str:
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
-        "panels": [{"label": p.label, "lines": list(map(list, p.lines))} for p in explorer.panels],
+        "panels": [{"label": x, "lines": list(map(list, y))} for x, y in explorer.panels.items()],
         "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
         "colours": {key[-1]: find_colour(key[-1]) for key in explorer.cells},
         "cells": cells,

@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 Results = TypeVar("Results")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Request:
     """The options of a run."""
 

@@ -7,11 +7,10 @@ import pytest
 
 from sideslip.benchmarks.control.entries import REFERENCE_FILTER, Entry
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
-from sideslip.benchmarks.control.score import Standing, rank_entries
+from sideslip.benchmarks.control.score import Matrix, Standing, rank_entries
 from sideslip.benchmarks.control.suite import _compose_verdict, _name_agent, _rank
 from sideslip.benchmarks.control.tables import (
     _LINE,
-    Matrix,
     _list_upsets,
     _make_motion_table,
     _make_oracle_table,
@@ -111,18 +110,13 @@ def test_won_are_episodes_that_both_finish() -> None:
     assert (lqr.scores[ONE][:8] == 2.0).all() and (lqr.scores[ONE][8:] < 2.0).all()
 
 
-def test_who_surely_loses_more_cars_stands_under_a_line() -> None:
-    """However little it costs; a few more do not suffice."""
+def test_who_loses_a_few_cars_more_stands_above_the_line() -> None:
     some = results(nominal=2, lqr=3)
     standing = {each.label: each for each in table(some)}
     lqr = standing[f"lqr on {REFERENCE_FILTER}"]
     assert lqr.overall["failure_rate"].value == 3 / 40 and lqr.n == 80
     assert [each.entry.agent for each in table(some)][:2] == [STATE, "lqr"]
-    often = results(nominal=6, lqr=30)
-    assert [each.entry.agent for each in table(often)][-1] == "lqr"
-    labels = [line["label"] for line in make_main_table("", table(often)).cells]
-    assert labels[-2:] == ["surely lose more cars than nominal:", f"lqr on {REFERENCE_FILTER}"]
-    assert not any("surely" in line["label"] for line in make_main_table("", table(some)).cells)
+    assert _LINE not in [line["label"] for line in make_main_table("", table(some)).cells]
 
 
 @pytest.mark.parametrize("filter_, best", [("joint", "adaptive-lqr"), ("dakf", "lqr")])

@@ -38,7 +38,6 @@ from sideslip.benchmarks.entrants.challenge import (
     make_user_entry,
 )
 from sideslip.benchmarks.entrants.score import _compose_verdict, _make_sentence
-from sideslip.benchmarks.report.study import Request
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.benchmarks.conftest import Run
 from tests.policies import VISION
@@ -152,14 +151,14 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
 ) -> None:
     on_file(tmp_path, monkeypatch)
     del driven[:]
-    found = score._compare(challenge(tmp_path, episodes=8), Request())
+    found = score._compare(challenge(tmp_path, episodes=8))
     assert found.on_file and found.salt == "abcd"
     mine = [(cell, seeds) for cell, seeds in driven if cell[1].is_users]
     assert mine and all(seeds == salted("abcd", 8, cell) for cell, seeds in mine)
     again = [(cell, seeds) for cell, seeds in driven if not cell[1].is_users]
     assert again and all(seeds == salted("abcd", 2, cell) for cell, seeds in again)
     assert {entry.agent for (_, entry), _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
-    assert "on file, a sample driven again" in _compose_verdict(found)[-1]
+    assert "on file, a sample driven again" in _compose_verdict(found)
 
 
 @pytest.mark.parametrize("why", ["costs", "episodes", "vehicle", "scenario", "seeds", "fresh"])
@@ -176,7 +175,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     }
     options = changes.get(why, {})
     del driven[:]
-    found = score._compare(challenge(tmp_path, **{"episodes": 8} | options), Request())
+    found = score._compare(challenge(tmp_path, **{"episodes": 8} | options))
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
     assert set(everyone) == set(found.results)
@@ -194,7 +193,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
             for car in ("vehicle", "nominal")
         ]
         assert {car["mass"] for car in cars} == {900.0}
-    assert ("Publishable" in _compose_verdict(found)[-1]) == (why == "fresh")
+    assert ("Publishable" in _compose_verdict(found)) == (why == "fresh")
 
 
 def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
@@ -203,11 +202,11 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
     monkeypatch.setattr(score, "_find_opened_files", lambda *_: rehearsed)
-    found = [score._compare(challenge(tmp_path, fresh=True), Request()) for _ in range(2)]
+    found = [score._compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
     assert found[0].salt != found[1].salt
-    again = score._compare(challenge(tmp_path, salt=found[0].salt), Request())
-    assert again.salt == found[0].salt and "Not publishable" in _compose_verdict(again)[-1]
-    assert f"--salt {found[0].salt} repeats them" in _compose_verdict(found[0])[-1]
+    again = score._compare(challenge(tmp_path, salt=found[0].salt))
+    assert again.salt == found[0].salt and "Not publishable" in _compose_verdict(again)
+    assert f"--salt {found[0].salt} repeats them" in _compose_verdict(found[0])
     mine = [seeds for cell, seeds in driven if cell[1].is_users]
     third = len(mine) // 3
     assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
@@ -216,7 +215,7 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
         request = ComparisonRequest((on_default(f"{tmp_path}/pd.py"),), fresh=True)
-        salts.add(score._compare(request, Request()).salt)
+        salts.add(score._compare(request).salt)
     assert len(salts) == 2
 
 
@@ -224,8 +223,8 @@ def test_the_verdict_has_a_sentence_each_in_five_lines(tmp_path: Path, driven: D
     pairs = [on_default(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
         Path(pair.agent).write_text(PD)
-    found = score._compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)), Request())
-    lines = _compose_verdict(found)
+    found = score._compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
+    lines = _compose_verdict(found).splitlines()
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
     mine, fails, broken = (
         _make_sentence(next(x for x in found.overall if x.entry == pairs[i])) for i in (0, 4, 1)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import Column, Explorer, Line, Panel, ResultTable, Suite
+from sideslip.benchmarks.harness.results import Column, Explorer, Line, ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
 
 HOSTILE = "</script><b>1 & 2</b>"
@@ -121,7 +121,7 @@ def matrix() -> Suite:
             [("gust", "none"), ("gust", "lqr"), ("step-steer", "none"), ("step-steer", HOSTILE)], 1
         )
     }
-    panels = [Panel("slip / mrad", [("beta", "true")])] * 2
+    panels = {name: [("beta", "true")] for name in ("slip / mrad", "again / mrad")}
     delays = np.array([0.0, 100.0, 300.0])
     line = (np.array([0.9, 0.8, 0.5]), np.array([0.88, 0.78, 0.4]), np.array([0.92, 0.82, 0.6]))
     return Suite(
