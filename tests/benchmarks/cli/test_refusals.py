@@ -68,6 +68,7 @@ MISTAKES: list[tuple[tuple[object, ...], str]] = [
     (("enjoy", VISION, "--scenario", "moon"), "unknown scenario 'moon'"),
     (("enjoy", VISION, "--html", "nowhere/report.html"), "no such folder"),
     (("enjoy", VISION, "--episodes", 0), "greater than or equal to 1"),
+    (("bench", "speed", "--json", "nowhere/rows.json"), "cannot write nowhere/rows.json"),
     (("bench", "control", "--fresh"), "go with --agent or --estimator"),
     (("bench", "control", "--vehicle", "coms"), "--vehicle go with --agent or --estimator"),
     (("bench", "papers", "--keep", "cases"), "--keep goes with the suite control, got papers"),

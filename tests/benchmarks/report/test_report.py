@@ -4,7 +4,6 @@ import base64
 import gzip
 import hashlib
 import json
-import os
 import re
 import sys
 from html import unescape
@@ -107,7 +106,7 @@ def test_tables_are_folded_and_scroll_and_many_figures_are_folded_too(tmp_path: 
     assert "<details open" not in page
 
 
-def test_plotly_is_there_once_packed_and_only_for_figures(tmp_path: Path) -> None:
+def test_plotly_is_there_once_and_packed(tmp_path: Path) -> None:
     suites = [estimation(), estimation()]
     page = written(tmp_path, suites)
     assert page.count('data-name="plotly"') == 1
@@ -116,8 +115,6 @@ def test_plotly_is_there_once_packed_and_only_for_figures(tmp_path: Path) -> Non
     assert page.count('data-name="figure"') == figures
     library = unpacked(page, "plotly")[0]
     assert library.count("plotly.js v") == 1
-    (tmp_path / "report.html").unlink()
-    assert "plotly" not in re.findall('data-name="(.*?)"', written(tmp_path, [control()]))
 
 
 def test_only_our_scripts_may_run(tmp_path: Path) -> None:
@@ -138,7 +135,8 @@ def test_without_figures_plotly_is_not_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "plotly", None)
-    assert "multirate-kf" in written(tmp_path, [control(), estimation(figures=False)])
+    page = written(tmp_path, [control(), estimation(figures=False)])
+    assert "multirate-kf" in page and 'data-name="plotly"' not in page
 
 
 def test_nothing_comes_from_the_network(tmp_path: Path) -> None:
@@ -206,20 +204,10 @@ def test_a_cell_is_formatted_as_its_column_says(cell: Any, column: Column, text:
     assert _format_cell(cell, column) == text
 
 
-@pytest.mark.parametrize("failing", ["drawing", "disk"])
-def test_failure_leaves_the_old(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
+def test_failure_leaves_the_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = written(tmp_path, [control()])
-
-    def fail(*_: Any, **__: Any) -> Any:
-        raise OSError("No space left on device")
-
-    if failing == "drawing":
-        monkeypatch.setattr(report, "_encode_figure", fail)
-    else:
-        monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(report, "_encode_figure", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
         write_report(tmp_path / "report.html", [estimation()], COMMAND, VERSIONS)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == before
