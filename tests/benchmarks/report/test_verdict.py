@@ -109,9 +109,9 @@ def test_a_replay_without_truth_has_no_winner() -> None:
     traces = {"bicycle-kf": np.zeros(3), "exact-kf": np.zeros(3)}
     first, *_ = fits(recorded._compose_verdict(Replayed(traces=traces), False))
     assert first.startswith("Nobody wins")
-    squares = {"bicycle-kf": [4e-4] * 3, "exact-kf": [0.9e-4, 1.0e-4, 1.1e-4]}
+    squares = {"exact-kf": [0.9e-4, 1.0e-4, 1.1e-4], "bicycle-kf": [4e-4] * 3}
     scores = {
-        name: np.array([[square, 1.0, 0.94, 3.0 + i] for square in row])
+        name: np.array([[square, 1.0, 0.94, 3.0 - i] for square in row])
         for i, (name, row) in enumerate(squares.items())
     }
     known = Replayed(scores=scores, traces=traces)
