@@ -13,10 +13,9 @@ from gymnasium.error import ResetNeeded
 
 from .camera_simulator import CameraSimulator
 from .engine.config import EnvConfig
-from .engine.layout import EpisodeArrays, Z
+from .engine.layout import CarTruth, Episode, EpisodeArrays, Z, compute_true_states
 from .engine.reset import reset_vehicle
 from .engine.step import step_episode
-from .engine.views import CarTruth, Episode, compute_true_states, make_episode_arrays
 from .numerics.functions import TICK
 from .numerics.jit import compile_call
 from .numerics.packed import read
@@ -159,7 +158,7 @@ class StabilityEnv(SingleRenderMixin, gym.Env[npt.NDArray[np.float32], npt.NDArr
             raise ValueError("appearance is of pictures: vision='image'")
         self.layout: tuple[ObservationEntry, ...] = self.config.layout
         self.observation_space, self.action_space = self.config.make_spaces()
-        self._row = make_episode_arrays(self.config)
+        self._row = self.config.make_arrays()
         self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()

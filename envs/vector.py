@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode
 from .engine.batch import IntArray, NumbaEngine
 from .engine.batch_env import BatchEnv
 from .engine.config import EnvConfig
-from .engine.layout import Z
-from .engine.views import Episode, compute_true_states
+from .engine.layout import Episode, Z, compute_true_states
 from .numerics.functions import TICK
 from .record import Array
 from .rendering.renderer import VectorRenderMixin

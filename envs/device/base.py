@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from gymnasium.vector import AutoresetMode
 
 from ..engine.batch_env import BatchEnv
-from ..engine.config import EpisodeConfig
+from ..engine.layout import EpisodeConfig
 from ..engine.step import get_start_variant
 from ..numerics.torch_backend import DTYPES, torch
 from ..task import REPORT, RUNNING, Infos, StepReport

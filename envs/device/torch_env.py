@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ..engine.batch import BatchArrays, IntArray, NumbaEngine
 from ..engine.batch_env import BatchEnv
-from ..engine.config import EpisodeConfig, make_car, make_task_params
-from ..engine.layout import P, Z
+from ..engine.config import make_car, make_task_params
+from ..engine.layout import EpisodeConfig, P, Z
 from ..numerics.packed import read
 from ..numerics.torch_backend import torch
 from ..record import PACKET_WIDTH, Array

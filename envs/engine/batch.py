@@ -25,7 +25,6 @@ from .step import (
     make_step_variant,
     step_vehicle,
 )
-from .views import make_episode_arrays
 from .window import overwrite_steering, precompute_lane_window
 
 IntArray = npt.NDArray[np.int64]
@@ -247,7 +246,7 @@ class NumbaEngine:
     """
 
     def __init__(self, config: EnvConfig, count: int) -> None:
-        one = make_episode_arrays(config)  # all have its bounds, and write its window in turn
+        one = config.make_arrays()  # all have its bounds, and write its window in turn
         numbers = [np.zeros((count, *array.shape), array.dtype) for array in one[:-2]]
         ticks_done, delivered = np.zeros((2, count), np.int64)
         self.arrays = BatchArrays._make([*numbers, ticks_done, delivered, np.zeros(count, bool)])

@@ -16,7 +16,8 @@ from gymnasium.vector.utils import batch_space
 from ..task import Infos
 from ..validation import Mask, format_rows, short_repr
 from .batch import IntArray, NumbaEngine
-from .config import EnvConfig, EpisodeConfig
+from .config import EnvConfig
+from .layout import EpisodeConfig
 
 ArrayT = TypeVar("ArrayT")
 

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..numerics.functions import FOREVER, TICK, count_ticks
-from ..record import Array
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..scenarios.driver import STEERING_KINDS, STEERING_WIDTH, DriverParams, SpeedProfile, Wind
 from ..scenarios.manoeuvres import make_scenario
 from ..scenarios.road import ROADS, make_path
@@ -35,6 +35,7 @@ from ..sensors.slow import (
 )
 from ..task import (
     REFERENCES,
+    REPORT,
     ObservationEntry,
     make_observation_layout,
     make_reference_params,
@@ -57,8 +58,12 @@ from ..vehicle.linear import Bicycle
 from ..vehicle.parameters import GRAVITY, Vehicle, make_vehicle
 from ..vehicle.tyres import TYRE_LAWS
 from .layout import (
+    FLAGS,
     PARAMS_WIDTH,
+    STATE_WIDTH,
     Disturbance,
+    EpisodeArrays,
+    EpisodeConfig,
     EpisodeParams,
     EpisodeStart,
     FrictionWave,
@@ -66,20 +71,9 @@ from .layout import (
     TaskParams,
     TyreChange,
 )
+from .window import make_window
 
 _SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
-
-
-@dataclass(frozen=True)
-class EpisodeConfig:
-    """An episode before its draws."""
-
-    start: EpisodeStart
-    vehicle: Vehicle  # with the scenario's replacements
-    nominal: Vehicle  # likewise
-    scenario: Scenario
-    slow: dict[str, SlowSensor]
-    held_speed: float | None  # m/s, where it is one number and held exactly
 
 
 _SlowChanges = Mapping[str, Mapping[str, Any] | None]  # by name, as `apply_changes` takes them
@@ -297,6 +291,15 @@ class EnvConfig:
         """Make the spaces of observations and actions."""
         actions = gym.spaces.Box(-1.0, 1.0, (self.action_width,), np.float32)
         return make_space(self.layout), actions
+
+    def make_arrays(self) -> EpisodeArrays:
+        """Make the arrays of one car's episode, zeros but for the bounds."""
+        n = int(self.control_period)
+        switches, obs = np.zeros(len(FLAGS), np.int64), np.zeros(len(self.layout), np.float32)
+        rows, packets = np.zeros((n, FAST_WIDTH)), np.zeros((self.max_packets, PACKET_WIDTH))
+        report, window = np.zeros(len(REPORT)), make_window(n)
+        p, z = np.zeros(PARAMS_WIDTH), np.zeros(STATE_WIDTH)
+        return EpisodeArrays(p, z, switches, obs, rows, packets, report, self.bounds, window)
 
     @cached_property
     def base(self) -> EpisodeConfig:

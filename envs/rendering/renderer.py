@@ -7,8 +7,7 @@ import numpy.typing as npt
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 
-from ..engine.layout import P, Z
-from ..engine.views import Episode
+from ..engine.layout import Episode, P, Z
 from ..numerics.functions import TICK
 from ..record import Array
 from ..validation import check_choice

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..engine.config import EpisodeConfig
-from ..engine.layout import P, Z
+from ..engine.layout import EpisodeConfig, P, Z
 from ..engine.step import make_step_params, make_step_variant
 from ..engine.tick import StepParams, apply_tyre_change
 from ..numerics.jit import as_python

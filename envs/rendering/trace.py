@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..engine.layout import Z
-from ..engine.views import Episode
+from ..engine.layout import Episode, Z
 from ..record import Array
 from ..task import REPORT
 from ..vehicle.dynamics import Motion

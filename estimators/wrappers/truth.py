@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
-from ...envs.engine.views import TRUE_STATE, CarTruth
+from ...envs.engine.layout import TRUE_STATE, CarTruth
 from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import check_choice

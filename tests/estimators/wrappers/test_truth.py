@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from sideslip.envs import COMS
-from sideslip.envs.engine.views import TRUE_STATE
+from sideslip.envs.engine.layout import TRUE_STATE
 from sideslip.estimators import EstimateObservation, make_estimator
 from sideslip.estimators.vector import estimate as vectorised
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruthObservation
