@@ -1,9 +1,8 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
 `jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
-call what `primitives`, `packed` and `functions` have. `simd` has the lanes, `simd8` reads eight
-neighbours of a row, `torch_backend` torch's tensors. `compiler` and `kernel_cache` keep machine
-code on disk.
+call what `primitives`, `packed` and `functions` have. `simd` has the lanes, `torch_backend`
+torch's tensors. `compiler` and `kernel_cache` keep machine code on disk.
 """
 
 from collections.abc import Iterator

@@ -6,17 +6,17 @@ memory of filters in lanes (`vector.lanes`) has the same fields, whose columns c
 """
 
 from ...envs.numerics.jit import inline, jit
-from ...envs.numerics.packed import load_element
-from ...envs.numerics.primitives import Scalar, Vector, absolute, any_lane, select, sqrt
-from ...envs.numerics.simd8 import (
+from ...envs.numerics.packed import (
     allocate_scratch,
     count_upper_rows,
     load8,
     load8_symmetric,
+    load_element,
     mirror,
     store8,
     vector_width,
 )
+from ...envs.numerics.primitives import Scalar, Vector, absolute, any_lane, select, sqrt
 from .record import N_CORE, N_TOTAL, FilterRecord
 
 

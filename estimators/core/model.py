@@ -8,9 +8,8 @@ and the rest is a known push.
 
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.packed import load_element, store_element
+from ...envs.numerics.packed import allocate_scratch, load8, load_element, store8, store_element
 from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
-from ...envs.numerics.simd8 import allocate_scratch, load8, store8
 from ...envs.vehicle.linear import write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply

@@ -3,9 +3,8 @@
 import numpy as np
 
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.packed import load_element
+from ...envs.numerics.packed import load8, load_element, store8, vector_width
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
-from ...envs.numerics.simd8 import load8, store8, vector_width
 from ...envs.record import FAST
 from .covariance import apply_transition, predict_covariance
 from .innovation import MAX_SURPRISE, note_surprise

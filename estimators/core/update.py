@@ -4,8 +4,8 @@ import numpy as np
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import inline, jit, noinline
+from ...envs.numerics.packed import load8, store8
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
-from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
 from .covariance import correct_scalar, dot, project, project_row
 from .innovation import check_sample, compute_sample_variance, note_surprise

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from gymnasium.vector import SyncVectorEnv
 
 from ...envs.numerics.jit import compile_call
+from ...envs.numerics.packed import allocate_aligned, pad_to_cache_line
 from ...envs.numerics.simd import LANES
-from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry
 from ..core.filter import Observed, OutputTable, StepRecord

@@ -12,7 +12,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from sideslip.envs.numerics import jit, kernel_cache
-from sideslip.envs.numerics.simd8 import allocate_scratch, load8, mirror, store8
+from sideslip.envs.numerics.packed import allocate_scratch, load8, mirror, store8
 from sideslip.envs.scenarios.road import TrackPath, compute_path_offset
 
 from .. import processes
