@@ -301,12 +301,9 @@ class KeepingEnv(PlantEnv):
     """
 
     def __init__(
-        self,
-        sensors: str = "vision",
-        control_period: int = 10,
-        render_mode: str | None = None,
+        self, sensors: str = "vision", control_period: int = 10, render_mode: str | None = None,
         **options: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.plant: _KeepingPlant = _KeepingPlant(render_mode)
         options = {"steering": True, "reference": "zero-slip", **options}
         car = make_keeping_vehicle()

@@ -108,14 +108,9 @@ class Canvas:
         self.draw_polygon([b, neck + 0.45 * head * normal, neck - 0.45 * head * normal], colour)
 
     def draw_text(
-        self,
-        place: Sequence[float] | Array,
-        words: str,
-        colour: str,
-        size: int = 13,
-        align: float = 0.0,
-        bold: bool = False,
-    ) -> float:
+        self, place: Sequence[float] | Array, words: str, colour: str, size: int = 13,
+        align: float = 0.0, bold: bool = False,
+    ) -> float:  # fmt: skip
         """Draw words whose middle line passes a place; returns their width (px).
 
         Args:

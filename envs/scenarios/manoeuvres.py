@@ -99,8 +99,7 @@ def _make_scenarios(tier: str, common: Fields, **shapes: Fields) -> list[Scenari
 
 # "gentle" and the step: what one yaw moment can hold at zero slip
 _ONE = _make_scenarios(
-    "1",
-    _COMS,
+    "1", _COMS,
     coms_random=_make_random_steering(0.005, 0.015),
     coms_double_lane_change=_DOUBLE_LANE_CHANGE,
     coms_slalom=_set_amplitude(_SLALOM, 0.04, 0.1),
@@ -108,58 +107,52 @@ _ONE = _make_scenarios(
     coms_brake_in_turn=_set_amplitude(_BRAKE_IN_TURN, 0.04, 0.1),
     coms_gentle_slalom=_set_amplitude(_SLALOM, 0.02, 0.05),
     coms_step=_set_amplitude(_STEP, 0.015, 0.05),
-)
+)  # fmt: skip
 _TWO_A = _make_scenarios(
-    "2a",
-    _CAR | {"friction": (0.9, 1.0)},
+    "2a", _CAR | {"friction": (0.9, 1.0)},
     car_random=_make_random_steering(0.002, 0.006),
     car_slalom=_set_amplitude(_SLALOM, 0.01, 0.025),
     car_step=_set_amplitude(_STEP, 0.008, 0.025),
     car_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.01, 0.03),
     car_iso_3888_1=_ISO_3888_1 | {"path_speed": (60.0 * KMH, 80.0 * KMH)},
-)
+)  # fmt: skip
 _TWO_B = _make_scenarios(
-    "2b",
-    _CAR | _set_friction(0.3, 1.0),
+    "2b", _CAR | _set_friction(0.3, 1.0),
     any_friction_random=_make_random_steering(0.002, 0.006),
     any_friction_slalom=_set_amplitude(_SLALOM, 0.01, 0.025),
     any_friction_step=_set_amplitude(_STEP, 0.008, 0.025),
     any_friction_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.01, 0.03),
     # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds no car on the track
     any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
-)
+)  # fmt: skip
 _AROUND_80 = {"speed": (75.0 * KMH, 85.0 * KMH)}
 _TWO_C = _make_scenarios(
-    "2c",
-    _CAR | _set_friction(0.6, 1.0),
+    "2c", _CAR | _set_friction(0.6, 1.0),
     limit_slalom=_set_amplitude(_SLALOM, 0.02, 0.06) | _AROUND_80,
     limit_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.03, 0.08) | _AROUND_80,
     limit_step=_set_amplitude(_STEP, 0.02, 0.06),
     limit_random=_make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
-)
+)  # fmt: skip
 
 # Those of env version 1 ask for stability: without control cars slip by 2 degrees, or are lost.
 _SMALL_CAR = _make_scenarios(
-    "small car",
-    _COMS,
+    "small car", _COMS,
     small_car_random=_make_random_steering(0.02, 0.04),
     small_car_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.1, 0.16),
     small_car_double_lane_change=_DOUBLE_LANE_CHANGE
     | {"path_speed": (13.0, 16.0), "driver_preview": 1.0, "half_width": 3.0},
-)
+)  # fmt: skip
 _ROAD = _make_scenarios(
-    "road",
-    _CAR | {"speed": (60.0 * KMH, 90.0 * KMH)} | _set_friction(0.4, 1.0),
+    "road", _CAR | {"speed": (60.0 * KMH, 90.0 * KMH)} | _set_friction(0.4, 1.0),
     road_random=_make_random_steering(0.01, 0.02),
     road_slalom=_set_amplitude(_SLALOM, 0.04, 0.07),
     road_step=_set_amplitude(_STEP, 0.03, 0.06),
     road_sine_with_dwell=_set_amplitude(_SINE_WITH_DWELL, 0.04, 0.07),
     road_brake_in_turn=_set_amplitude(_BRAKE_IN_TURN, 0.015, 0.03),
-)
+)  # fmt: skip
 _ATTENTIVE: Fields = {"steering": "driver", "driver_preview": 1.6, "duration": 6.0}
 _LIMIT = _make_scenarios(
-    "limit",
-    _CAR | {"speed": (80.0 * KMH, 110.0 * KMH)} | _set_friction(0.6, 1.0),
+    "limit", _CAR | {"speed": (80.0 * KMH, 110.0 * KMH)} | _set_friction(0.6, 1.0),
     limit_fmvss_126=_set_amplitude(_SINE_WITH_DWELL, 0.06, 0.12),
     limit_wet_sine=_set_amplitude(_SINE_WITH_DWELL, 0.04, 0.08)
     | {"speed": (70.0 * KMH, 90.0 * KMH), "friction": (0.3, 0.6)},
@@ -177,7 +170,7 @@ _LIMIT = _make_scenarios(
     limit_hit_at_the_rear=_ATTENTIVE
     | {"half_width": 6.0, "wind_force": (6000.0, 14000.0), "wind_arm": (-1.5, -1.0)}
     | {"wind_start": (1.0, 2.0), "wind_length": 0.15},
-)
+)  # fmt: skip
 
 # Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
 _RECOVERY = Scenario(
