@@ -59,14 +59,11 @@ def test_every_number_has_a_unit_and_a_range_around_its_default(kind: Any) -> No
                "camera_offset", "camera_outage", "gps_outage"}  # fmt: skip
     for entry in dataclasses.fields(kind):
         words = (str, bool) if entry.default is not None else ()
-        if (
-            entry.name in without
-            or isinstance(entry.default, words)
-            or "Mapping" in str(entry.type)
-        ):
+        is_word = isinstance(entry.default, words) or "Mapping" in str(entry.type)
+        if entry.name in without or is_word:
             continue
         low, high = entry.metadata["plausible"]
-        assert entry.metadata["unit"] and low < high
+        assert entry.metadata["unit"] and entry.metadata["text"] and low < high
         if isinstance(entry.default, float):
             assert low <= entry.default <= high
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import SCENARIOS, StabilityVectorEnv
+from sideslip.envs import SCENARIOS
 
 from ..helpers import FULL, IDS, unwrapped
 
@@ -276,15 +276,6 @@ def test_a_snapshot_goes_on_in_the_compiled_engine() -> None:
     env.set_state(snapshot)
     env.step(torch.as_tensor(action))
     assert largest_error(host.get_state(), env.get_state()) < EXACT
-
-
-def test_spaces_and_layout_are_those_of_the_vector_env() -> None:
-    env = make_device_env(FUSION, 2)
-    host = batch(FUSION, 2)
-    assert isinstance(host, StabilityVectorEnv)
-    assert env.observation_space == host.observation_space
-    assert env.action_space == host.action_space
-    assert env.layout == host.layout
 
 
 @pytest.mark.long

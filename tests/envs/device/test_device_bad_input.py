@@ -16,7 +16,7 @@ from ..helpers import bits
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device import DeviceVectorEnv, make_device_env  # noqa: E402
+from sideslip.envs.device import make_device_env  # noqa: E402
 
 pytestmark = pytest.mark.plain
 
@@ -48,12 +48,6 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
 def test_arguments(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make_device_env(FUSION, **(FEW | arguments))
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_a_device_that_is_not_there_is_named_with_those_that_are() -> None:
-    with pytest.raises(ValueError, match=r"device 'cuda' is not there: torch .* finds cpu"):
-        DeviceVectorEnv(device="cuda")
 
 
 def test_a_device_is_called_as_its_tensors_call_it() -> None:

@@ -57,21 +57,11 @@ def around(typical: float) -> st.SearchStrategy[float]:
 
 
 TYPICAL = {
-    "mass": 500.0,
-    "yaw_inertia": 200.0,
-    "front_arm": 1.0,
-    "rear_arm": 1.0,
-    "front_stiffness_per_tyre": 6000.0,
-    "rear_stiffness_per_tyre": 6000.0,
-    "wheel_radius": 0.3,
-    "rear_track": 1.0,
-    "motor_torque": 100.0,
-    "sprung_mass": 300.0,
-    "roll_arm": 0.3,
-    "roll_inertia": 100.0,
-    "roll_stiffness": 10000.0,
-    "roll_damping": 300.0,
-}
+    "mass": 500.0, "yaw_inertia": 200.0, "front_arm": 1.0, "rear_arm": 1.0,
+    "front_stiffness_per_tyre": 6000.0, "rear_stiffness_per_tyre": 6000.0, "wheel_radius": 0.3,
+    "rear_track": 1.0, "motor_torque": 100.0, "sprung_mass": 300.0, "roll_arm": 0.3,
+    "roll_inertia": 100.0, "roll_stiffness": 10000.0, "roll_damping": 300.0,
+}  # fmt: skip
 
 
 @settings(max_examples=75)
@@ -86,13 +76,9 @@ TYPICAL = {
     kappa=st.floats(-1.0, 1.0),
 )
 def test_vehicles_that_nobody_builds(
-    vehicle: dict[str, float],
-    state: dict[str, float],
-    plant: tuple[bool, ...],
-    tyres: str,
-    slope: tuple[float, float],
-    kappa: float,
-) -> None:
+    vehicle: dict[str, float], state: dict[str, float], plant: tuple[bool, ...], tyres: str,
+    slope: tuple[float, float], kappa: float,
+) -> None:  # fmt: skip
     """Also where 1 ms is far too long a step for the integrator."""
     small_angle, lags, roll = plant
     try:
@@ -100,23 +86,14 @@ def test_vehicles_that_nobody_builds(
     except ValueError:
         roll = False
     scenario = FULL | {
-        "steering": "sine",
-        "amplitude": 1.0,
-        "curvature": kappa,
-        "curve_start": 0.0,
-        "small_angle": small_angle,
-        "tyres": tyres,
-        "lags": lags,
-        "roll": roll,
-        "bank": slope[0],
-        "grade": slope[1],
-        "disturbance_force": 50.0,
-    }
+        "steering": "sine", "amplitude": 1.0, "curvature": kappa, "curve_start": 0.0,
+        "small_angle": small_angle, "tyres": tyres, "lags": lags, "roll": roll, "bank": slope[0],
+        "grade": slope[1], "disturbance_force": 50.0,
+    }  # fmt: skip
     arguments: dict[str, Any] = {"reference": "model", "gps": {"period": 0.01}, "strict": False}
     env = StabilityEnv("gps", scenario=scenario, **arguments)
-    start = env.reset(
-        seed=0, options={"vehicle": {"base": "coms", **vehicle}, "state": state, "duration": 0.3}
-    )
+    options = {"vehicle": {"base": "coms", **vehicle}, "state": state, "duration": 0.3}
+    start = env.reset(seed=0, options=options)
     moments = play(env, [1.0, -1.0] * 15)
     assert_finite(env, start, moments)
     assert moments[-1].terminated or moments[-1].truncated

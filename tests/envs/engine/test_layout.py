@@ -1,6 +1,5 @@
 """State by name: every number of an episode has one place, compiled code reads it there."""
 
-import copy
 from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
@@ -93,17 +92,6 @@ def test_parts_are_read_and_written_by_name_in_compiled_loops() -> None:
 
 
 SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
-
-
-def test_a_copy_has_an_episode_of_its_own() -> None:
-    env = StabilityEnv("fusion")
-    env.reset(seed=1)
-    env.step([0.5])
-    other = copy.deepcopy(env)
-    before = bits(env.get_state()["state"])
-    obs = other.step([0.1])[0]
-    assert bits(env.get_state()["state"]) == before
-    assert bits(env.step([0.1])[0]) == bits(obs)
 
 
 @pytest.mark.parametrize("n", [7, 10, 50])

@@ -18,7 +18,7 @@ from sideslip.envs.highway.traffic import (
 )
 from sideslip.envs.vehicle.dynamics import Motion
 
-from highway_env.road.lane import PolyLane, SineLane, StraightLane  # isort: skip
+from highway_env.road.lane import SineLane, StraightLane  # isort: skip
 
 
 V = 20.0
@@ -146,15 +146,10 @@ LANES = {
     "left": ROADS["curved"](1).route[1],
     "right": ROADS["curved"](1).route[2],
     "sine": SineLane([0.0, 0.0], [500.0, 0.0], 5.0, 2.0 * math.pi / 100.0, 0.3),
-    "spline": PolyLane(
-        [(0.0, 0.0), (30.0, 2.0), (60.0, -3.0), (90.0, 0.0)],
-        [(0.0, 2.0), (30.0, 4.0), (60.0, -1.0), (90.0, 2.0)],
-        [(0.0, -2.0), (30.0, 0.0), (60.0, -5.0), (90.0, -2.0)],
-    ),
 }
 
 
-@pytest.mark.parametrize("name", ["straight", "left", "right", "sine"])
+@pytest.mark.parametrize("name", LANES)
 def test_a_place_is_the_foot_of_the_perpendicular(name: str) -> None:
     """From a point on the lane's normal, by the lane's own line and slope in fine differences."""
     lane, along, y, step = LANES[name], 37.0, 1.3, 1e-4
@@ -178,12 +173,6 @@ def test_the_curvature_of_a_sine_is_the_formulas() -> None:
     slope, second = A * w * math.cos(w * x + phase), -A * w**2 * math.sin(w * x + phase)
     found = locate_on_lane(lane, x, -A * math.sin(w * x + phase), 0.0)
     assert found.curvature == pytest.approx(-second / (1.0 + slope**2) ** 1.5, rel=1e-4)
-
-
-def test_a_place_on_a_spline_is_near_it() -> None:
-    lane = LANES["spline"]
-    place = locate_on_lane(lane, 45.0, -lane.position(45.0, 0.0)[1], 0.0)
-    assert abs(place.y) < 0.5 and abs(place.theta) < 0.5
 
 
 def test_directions_are_those_nearest_to_the_car() -> None:

@@ -178,11 +178,8 @@ def load_kernels(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The kernels, as in a process of its own."""
     monkeypatch.setattr(compiler, "_libraries", {})
     options: dict[str, Any] = {"targetoptions": {"nopython": True}, "folder": folder}
-    names: dict[str, Any] = {
-        "__name__": "tiny",
-        "math": math,
-        "kernel": partial(_Kernel, **options),
-    }
+    names: dict[str, Any] = {"__name__": "tiny", "math": math}
+    names["kernel"] = partial(_Kernel, **options)
     exec(KERNELS, names)
     return SimpleNamespace(**names)
 
@@ -292,9 +289,8 @@ def test_a_line_says_that_kernels_are_compiled(
     monkeypatch.setattr(kernel_cache.logger, "propagate", False)
     kernel_cache.logger.setLevel(logging.INFO)
     assert call(True) == []
-    assert [record.getMessage().split()[0] for record in records] == [
-        *("sideslip:", "compiled", "compiled"),
-    ]
+    first_words = [record.getMessage().split()[0] for record in records]
+    assert first_words == ["sideslip:", "compiled", "compiled"]
     kernel_cache.logger.setLevel(logging.NOTSET)
     monkeypatch.setenv("SIDESLIP_QUIET", "1")
     assert call(False) == []

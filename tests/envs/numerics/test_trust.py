@@ -16,12 +16,8 @@ from sideslip.envs.numerics import compiler, kernel_cache
 from sideslip.envs.numerics.compiler import _Kernel
 
 kernel_folder = kernel_cache.find_kernel_folder.__wrapped__  # asked anew each time
-LEVELS = (
-    "",
-    "sideslip",
-    "sideslip/kernels",
-    f"sideslip/kernels/{kernel_cache.hash_sources('envs')}",
-)
+KERNELS = "sideslip/kernels"
+LEVELS = ("", "sideslip", KERNELS, f"{KERNELS}/{kernel_cache.hash_sources('envs')}")
 
 
 @pytest.fixture(autouse=True)
@@ -168,12 +164,9 @@ def test_what_is_checked_is_what_is_read(planted: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("fault", ["group", "others", "owner", "link", "file"])
 def test_a_folder_that_others_could_write_is_not_used(
-    fault: str,
-    level: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    fault: str, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> None:  # fmt: skip
     assert kernel_folder("envs") == tmp_path / "base" / LEVELS[-1]
     folder = tmp_path / "base" / level
     if fault in ("group", "others"):
@@ -217,11 +210,9 @@ def test_a_kernels_folder_is_checked_whenever_it_is_read(planted: Path) -> None:
     ids=str,
 )
 def test_a_path_that_is_not_absolute_is_not_used(
-    variables: dict[str, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    variables: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> None:  # fmt: skip
     """A folder that was downloaded and is worked in could bring kernels."""
     for name in ("XDG_CACHE_HOME", "HOME"):
         monkeypatch.delenv(name, raising=False)

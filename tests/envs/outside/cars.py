@@ -16,13 +16,9 @@ from sideslip.envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs
 MODELS = tuple(OUTSIDE_PLANTS)
 V = 80.0 / 3.6
 CALM: dict[str, Any] = {
-    "duration": 2.0,
-    "speed": V,
-    "friction": 1.0489,
-    "disturbance_force": 0.0,
-    "disturbance_moment": 0.0,
-    "noise": SILENT,
-}
+    "duration": 2.0, "speed": V, "friction": 1.0489, "disturbance_force": 0.0,
+    "disturbance_moment": 0.0, "noise": SILENT,
+}  # fmt: skip
 STEP = CALM | {"steering": "step", "amplitude": 0.02}
 
 

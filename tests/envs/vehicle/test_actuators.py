@@ -79,9 +79,8 @@ def test_yaw_moment_keeps_its_share_first(N_z: float, a_x: float) -> None:
     T_l, T_r = allocate_torques(N_z, a_x, CAR, 1.0, CAR.T_max)
     most = T_MAX * d_r / r
     kept = min(max(N_z, -most), most)
-    assert compute_yaw_moment(T_l, T_r, CAR) == pytest.approx(
-        kept, abs=1e-12
-    )  # roundings of 370 N m
+    # roundings of 370 N m
+    assert compute_yaw_moment(T_l, T_r, CAR) == pytest.approx(kept, abs=1e-12)
     room = T_MAX - abs(kept) * r / d_r
     drive = min(max(m * r * a_x / 2.0, -room), room)
     assert 0.5 * (T_l + T_r) == pytest.approx(drive, abs=1e-13)
@@ -116,10 +115,9 @@ def test_yaw_moment_limit_is_that_of_two_full_motors() -> None:
     T_l, T_r = allocate_torques(COMS.yaw_moment_limit, 0.0, CAR, 1.0, CAR.T_max)
     assert (T_l, T_r) == pytest.approx((-100.0, 100.0), rel=1e-15)
     for vehicle in (COMS, PASSENGER_CAR):
-        T_max = vehicle.motor_torque
-        assert compute_yaw_moment(-T_max, T_max, make_car(vehicle)) == pytest.approx(
-            vehicle.yaw_moment_limit, rel=1e-15
-        )
+        T_max, limit = vehicle.motor_torque, vehicle.yaw_moment_limit
+        full = compute_yaw_moment(-T_max, T_max, make_car(vehicle))
+        assert full == pytest.approx(limit, rel=1e-15)
 
 
 @given(st.floats(1e-4, 10.0), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
@@ -158,14 +156,9 @@ def test_motors_follow_the_exponential_tick_by_tick() -> None:
 
 
 def test_steering_follows_its_own_exponential() -> None:
-    turning = FULL | {
-        "lags": True,
-        "steering": "step",
-        "amplitude": 0.1,
-        "onset": -1.0,  # the step is over when the episode begins ...
-        "hold": 1.0,  # ... and its mirror image begins: a ramp that the actuator lags behind
-    }
-    rows = applied("coms", turning, 150)
+    # the step is over when the episode begins, and its mirror image begins: a ramp
+    turning = {"lags": True, "steering": "step", "amplitude": 0.1, "onset": -1.0, "hold": 1.0}
+    rows = applied("coms", FULL | turning, 150)
     value, tau = rows[0, FAST.steer_command], 0.03
     for row in rows:
         command = row[FAST.steer_command]
@@ -179,9 +172,8 @@ def test_steering_follows_its_own_exponential() -> None:
 @pytest.mark.parametrize("lags", [{"motor_lag": 0.0}, {"motor_lag": 0.0, "steering_lag": 0.0}])
 def test_without_a_lag_the_torque_acts_at_once(lags: dict[str, float]) -> None:
     """Also where only the steering lags: the first tick already has the whole moment."""
-    env = StabilityEnv(
-        vehicle={"base": "coms", **lags}, scenario=LINEAR | {"lags": True}, control_period=1
-    )
+    car = {"base": "coms", **lags}
+    env = StabilityEnv(vehicle=car, scenario=LINEAR | {"lags": True}, control_period=1)
     env.reset(seed=0)
     (moment,) = play(env, [1.0])
     assert moment.record.fast[0, FAST.torque_right] == pytest.approx(100.0, rel=1e-15)

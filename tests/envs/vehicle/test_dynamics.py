@@ -57,9 +57,10 @@ def drive(
     state: Motion, seconds: float, h: float, steer: float = 0.0, car: CarParams = CAR, **how: Any
 ) -> Motion:
     load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, PlantVariant(0, LINEAR))
-    road, law, rule = how.get("road", STRAIGHT), how.get("law", FIALA), how.get("rule", kutta3)
+    road, rule = how.get("road", STRAIGHT), how.get("rule", kutta3)
+    variant = PlantVariant(0, how.get("law", FIALA), how.get("roll", 0))
     for _ in range(round(seconds / h)):
-        state = rule(state, (load, load, load), CALM, car, road, h, PlantVariant(0, law))
+        state = rule(state, (load, load, load), CALM, car, road, h, variant)
     return state
 
 
@@ -211,13 +212,16 @@ def test_road_coordinates_and_ground_agree_after_a_long_bend() -> None:
 
 
 @pytest.mark.parametrize("car", [CAR, make_car(PASSENGER_CAR)])
+@pytest.mark.parametrize("roll", [0, 1])
 @pytest.mark.parametrize("law", [LINEAR, FIALA])
 @pytest.mark.parametrize(("rule", "order"), [(kutta3, 3), (rk4, 4)])
-def test_the_rules_have_their_orders(rule: Any, order: int, car: CarParams, law: int) -> None:
+def test_the_rules_have_their_orders(
+    rule: Any, order: int, law: int, roll: int, car: CarParams
+) -> None:
     """Slip angles keep their signs here: at zero Fiala's curve has a jump in its second slope."""
     start = motion(v_x=12.0, v_y=-0.2, gamma=0.3)
     steps = [0.008, 0.004, 0.002]
-    how: Any = {"law": law, "rule": rule}
+    how: Any = {"law": law, "rule": rule, "roll": roll}
     exact = np.array(drive(start, 0.8, 0.00025, 0.06, car, **how))
     errors = [np.abs(drive(start, 0.8, h, 0.06, car, **how) - exact).max() for h in steps]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
@@ -290,9 +294,7 @@ def test_relaxing_tyres_by_an_independent_integration(vehicle: Any, V: float, ro
         state = motion(v_x=V)
         for k in range(3000):
             angles = (amplitude * math.sin(3.0e-3 * (k + part)) for part in (0.0, 0.5, 1.0))
-            a, b, c = (
-                compute_tyre_load(TyreInputs(angle, 10.0, 10.0), car, variant) for angle in angles
-            )
+            a, b, c = (compute_tyre_load(TyreInputs(x, 10.0, 10.0), car, variant) for x in angles)
             state = kutta3(state, (a, b, c), CALM, car, STRAIGHT, 1e-3, variant)
         return state
 
@@ -316,9 +318,8 @@ def test_a_step_in_slip_reaches_63_percent_after_the_relaxation_length(small_ang
     V, delta, forces = 10.0, 0.01, []
     for relaxation in (0.4, 0.0):
         car = CAR._replace(m=1e12, I=1e12, relaxation=relaxation)
-        load = compute_tyre_load(
-            TyreInputs(delta, 0.0, 0.0), car, PlantVariant(small_angle, LINEAR)
-        )
+        inputs, linear = TyreInputs(delta, 0.0, 0.0), PlantVariant(small_angle, LINEAR)
+        load = compute_tyre_load(inputs, car, linear)
         variant, state = PlantVariant(small_angle, MAGIC_FORMULA), motion(v_x=V)
         for _ in range(40):  # 0.4 m
             state = kutta3(state, (load, load, load), CALM, car, STRAIGHT, 1e-3, variant)
@@ -334,11 +335,10 @@ def test_a_step_in_slip_reaches_63_percent_after_the_relaxation_length(small_ang
 def test_relaxing_tyres_are_stable_at_a_standstill_and_backwards() -> None:
     car = make_car(COMS.replace(relaxation=0.05))
     load = compute_tyre_load(TyreInputs(0.5, 20.0, -20.0), car, PlantVariant(0, FIALA, 1))
+    variant = PlantVariant(0, MAGIC_FORMULA)
     for V in (0.0, 0.01, -3.0, 30.0):
         state = motion(v_x=V, v_y=0.3)._replace(slip_f=0.5, slip_r=-0.5)
         for _ in range(3000):
-            state = kutta3(
-                state, (load, load, load), CALM, car, CIRCLE, 1e-3, PlantVariant(0, MAGIC_FORMULA)
-            )
+            state = kutta3(state, (load, load, load), CALM, car, CIRCLE, 1e-3, variant)
         assert np.all(np.isfinite(state))
         assert max(abs(state.slip_f), abs(state.slip_r)) < 20.0

@@ -87,9 +87,7 @@ def test_matrices_are_the_plants_jacobian(
     n, m = model.B.shape
     # a typical size of each state and input: all columns are compared on one scale
     size = np.array([0.01, 0.05, 0.01, 0.1][:n] + [0.01, 10.0, 0.001][:m])
-    exact = np.vstack(
-        [np.hstack([model.A, model.B]), np.hstack([model.C, np.zeros((len(model.C), m))])]
-    )
+    exact = np.block([[model.A, model.B], [model.C, np.zeros((len(model.C), m))]])
     # The small-angle plant is linear: a step of any length gives the matrix up to roundings of
     # the intermediate sums. The full plant is odd about straight driving, so that a central
     # difference errs by the third derivative times the step squared, some (1e-4 x 0.01)^2, and
@@ -99,15 +97,11 @@ def test_matrices_are_the_plants_jacobian(
     for j in range(n + m):
         ahead, behind = np.zeros((2, n + m))
         ahead[j], behind[j] = step * size[j], -step * size[j]
-        rise = [
-            up - down
-            for up, down in zip(
-                seen(name, ahead[:n], ahead[n:], vehicle, v, small_angle),
-                seen(name, behind[:n], behind[n:], vehicle, v, small_angle),
-                strict=True,
-            )
-        ]
-        columns.append(np.concatenate(rise) / (2.0 * step))
+        up, down = (
+            np.concatenate(seen(name, at[:n], at[n:], vehicle, v, small_angle))
+            for at in (ahead, behind)
+        )
+        columns.append((up - down) / (2.0 * step))
     difference = np.array(columns).T - exact * size
     assert np.abs(difference[:n]).max() <= error * np.abs(exact[:n] * size).max()
     assert np.abs(difference[n:]).max() <= error * np.abs(exact[n:] * size).max()
@@ -134,15 +128,6 @@ def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
     np.testing.assert_allclose(model.B[:, :2], B, rtol=1e-15, atol=0.0)
     np.testing.assert_array_equal(model.C, C)
     np.testing.assert_array_equal(model.B[:, 2], [0.0, 0.0, -V_x, -V_x * l_pre])
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_the_models_agree_where_they_overlap(name: str) -> None:
-    small, large = make_bicycle_model(COMS, 7.0), MODELS[name](COMS, 7.0)
-    np.testing.assert_array_equal(large.A[:2, :2], small.A)
-    np.testing.assert_array_equal(large.B[:2, :2], small.B)
-    assert large.states[:2] == small.states
-    assert large.inputs[:2] == small.inputs
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -40,13 +40,6 @@ def test_an_understeering_car_has_no_critical_speed() -> None:
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_every_parameter_has_a_unit_and_a_description(name: str) -> None:
-    metadata = Vehicle.__dataclass_fields__[name].metadata
-    assert metadata["unit"]
-    assert metadata["text"]
-
-
-@pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf])
 def test_values_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
     """Zero is for some only, a negative number for places alone."""
@@ -69,12 +62,6 @@ def test_a_relaxation_that_a_tick_cannot_follow_is_refused() -> None:
 def test_a_complete_mapping_of_an_older_file_has_no_relaxation() -> None:
     old = {key: value for key, value in COMS.to_dict().items() if key != "relaxation"}
     assert make_vehicle(old) == COMS.replace(relaxation=0.0)
-
-
-@pytest.mark.parametrize("value", ["380", None, True, [380.0]])
-def test_what_is_no_number_is_refused(value: Any) -> None:
-    with pytest.raises(TypeError, match=r"Vehicle\.mass: expected a number"):
-        COMS.replace(mass=value)
 
 
 def test_scaled_scales_the_stiffness_only() -> None:
@@ -145,14 +132,11 @@ def test_a_mapping_may_start_from_another_vehicle() -> None:
         ({"base": "coms", "masss": 1.0}, TypeError, "parameter 'masss'; did you mean 'mass'"),
         ({"mass": 380.0}, ValueError, "missing yaw_inertia, front_arm, .* or front_stiffness_axle"),
         ({"front_stiffness": 1e4, "front_stiffness_axle": 2e4}, ValueError, "exclude each other"),
-        (
-            {"base": "coms", "rear_stiffness": 1e4},
-            ValueError,
-            "rear_stiffness must name its convention: rear_stiffness_per_tyre or rear_stiffness_ax",
-        ),
+        ({"base": "coms", "rear_stiffness": 1e4}, ValueError,
+         "rear_stiffness must name its convention: rear_stiffness_per_tyre or rear_stiffness_ax"),
         (5, TypeError, "a vehicle is a name, the path of"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_vehicle(values: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make_vehicle(values)  # type: ignore[arg-type]
@@ -163,16 +147,9 @@ def test_what_is_no_vehicle(values: object, error: type[Exception], message: str
     [
         ("", ValueError, "holds nothing"),
         ("mass = ", ValueError, "expected TOML, but"),
-        (
-            TOML.replace("_axle", ""),
-            ValueError,
-            "front_stiffness must name its convention: front_stiffness_per_tyre or front_stiff",
-        ),
-        (
-            TOML + "front_stiffness_per_tyre = 55000.0",
-            ValueError,
-            "front_stiffness_per_tyre and front_stiffness_axle exclude each other",
-        ),
+        (TOML.replace("_axle", ""), ValueError, "front_stiffness must name its convention: front_"),
+        (TOML + "front_stiffness_per_tyre = 55000.0", ValueError,
+         "front_stiffness_per_tyre and front_stiffness_axle exclude each other"),
         (TOML.replace("1500", "-1500"), ValueError, "mass: -1500 kg is not positive"),
         (TOML.replace("1500", '"heavy"'), TypeError, "mass: expected a number, got 'heavy'"),
         (TOML + "wings = 2\n", TypeError, "unknown vehicle parameter 'wings'"),
@@ -191,7 +168,7 @@ def test_what_is_no_vehicle(values: object, error: type[Exception], message: str
         ('base = "mine.toml"', ValueError, "its base is the file itself"),
     ],
     ids=range(20),
-)
+)  # fmt: skip
 def test_a_bad_file_is_refused(
     tmp_path: Path, content: str, error: type[Exception], message: str
 ) -> None:
