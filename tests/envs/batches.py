@@ -21,17 +21,10 @@ def batch(env_id: str, count: int, **arguments: Any) -> StabilityVectorEnv:
     return env
 
 
-def sync(
-    env_id: str, count: int, mode: str = "NextStep", **arguments: Any
-) -> SyncVectorEnv[Any, Any]:
+def sync(env_id: str, count: int, mode: str, **arguments: Any) -> SyncVectorEnv[Any, Any]:
     """The same of single environments."""
-    env = gymnasium.make_vec(
-        env_id,
-        num_envs=count,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": mode},
-        **arguments,
-    )
+    how = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    env = gymnasium.make_vec(env_id, num_envs=count, **how, **arguments)
     assert isinstance(env, SyncVectorEnv)
     return env
 

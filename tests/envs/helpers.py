@@ -12,15 +12,10 @@ from sideslip.envs import Record, StabilityEnv
 from sideslip.envs.sensors.inertial import Noise
 
 assert sideslip.__version__  # importing it registers the ids
-IDS = tuple(
-    sorted(
-        name
-        for name in gymnasium.registry
-        if name.startswith("sideslip/")
-        and name not in ("sideslip/Highway-v0", "sideslip/Outside-v0")  # which need extras
-        and name.endswith("-v0")
-    )
-)
+_EXTRA = {"sideslip/Highway-v0", "sideslip/Outside-v0"}
+"""The ids that need an extra."""
+_V0 = {name for name in gymnasium.registry if re.fullmatch("sideslip/.*-v0", name)}
+IDS = tuple(sorted(_V0 - _EXTRA))
 V1 = tuple(sorted(name for name in gymnasium.registry if re.fullmatch("sideslip/.*-v1", name)))
 
 SILENT: dict[str, float] = dict.fromkeys(Noise._fields, 0.0)

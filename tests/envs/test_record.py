@@ -6,18 +6,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, Log, Record, StabilityEnv
+from sideslip.envs import record as columns
 from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import Z
 from sideslip.envs.numerics.functions import TICK
-from sideslip.envs.record import (
-    FAST,
-    FAST_UNITS,
-    FAST_WIDTH,
-    PACKET,
-    PACKET_WIDTH,
-    Fast,
-    concatenate,
-)
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Fast, concatenate
 from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
@@ -144,9 +137,9 @@ def test_packets_of_picks_one_sensor() -> None:
 
 
 def test_columns_have_units_and_fit() -> None:
-    assert len(FAST_UNITS) == FAST_WIDTH == len(Fast._fields)
+    assert len(columns.FAST_UNITS) == FAST_WIDTH == len(Fast._fields)
     assert list(FAST) == list(range(FAST_WIDTH))
-    assert max(len(kind.values) for kind in SLOW) == VALUES == PACKET_WIDTH - PACKET.value
+    assert max(len(kind.values) for kind in SLOW) == VALUES == PACKET_WIDTH - columns.PACKET.value
     env = StabilityEnv()
     env.reset(seed=0)
     assert env.record.present == Fast._fields

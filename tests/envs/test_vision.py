@@ -159,10 +159,8 @@ def test_a_road_without_paint_and_a_lane_out_of_view_are_quality_0() -> None:
 def test_the_newest_picture_is_there_and_no_vector_engine_takes_it() -> None:
     env = made(vision="image")
     drive(env, 1)
-    assert (
-        env.unwrapped.camera.picture.shape == (720, 1280)
-        and env.unwrapped.camera.lane.quality > 0.5
-    )
+    camera = env.unwrapped.camera
+    assert camera.picture.shape == (720, 1280) and camera.lane.quality > 0.5
     with pytest.raises(ValueError, match="vectorization_mode='sync'"):
         gym.make_vec(ID, 2, vision="image")
     rows: Any = gym.make_vec(ID, 2, vectorization_mode="sync", scenario=BEND, vision="image")

@@ -75,9 +75,7 @@ def test_gymnasiums_wrappers(no_warnings: None, tmp_path: Path) -> None:
     assert len(films) >= 2 and min(films) > 5000
 
 
-def test_stable_baselines_records_what_its_own_function_makes(
-    no_warnings: None, tmp_path: Path
-) -> None:
+def test_stable_baselines_records_what_it_makes(no_warnings: None, tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
     util = pytest.importorskip("stable_baselines3.common.env_util")
     from stable_baselines3.common.vec_env import VecVideoRecorder

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import StabilityEnv, make_scenario
+from sideslip.envs import StabilityEnv
 from sideslip.envs.record import FAST, PACKET
 from sideslip.estimators import EstimateObservation
 
@@ -138,9 +138,3 @@ def test_older_draws_keep_their_bits() -> None:
             env.reset(seed=seed)
             cars.append((env.vehicle, env.motion.v_x))
         assert cars[0] == cars[1]
-
-
-def test_recovery_has_nobody_who_steers_and_a_car_that_slides() -> None:
-    scenario = make_scenario("recovery")
-    assert (scenario.steering, scenario.tier) == ("straight", "")
-    assert scenario.range("initial_beta")[0] > 0.0

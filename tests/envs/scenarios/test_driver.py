@@ -10,13 +10,9 @@ import pytest
 from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.engine.layout import P
 from sideslip.envs.numerics.packed import read
+from sideslip.envs.scenarios import road
 from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle, compute_target_angle
-from sideslip.envs.scenarios.road import (
-    compute_path_offset,
-    make_path,
-    make_sections,
-    transform_path,
-)
+from sideslip.envs.scenarios.road import compute_path_offset, make_path, transform_path
 from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
@@ -35,9 +31,7 @@ def motion(**changes: float) -> Motion:
     return Motion(7.0, *[0.0] * 8)._replace(**changes)
 
 
-def driven(
-    scenario: dict[str, Any], seed: int = 0
-) -> tuple[StabilityEnv, list[Moment], np.ndarray]:
+def driven(scenario: dict[str, Any], seed: int = 0) -> tuple[StabilityEnv, list[Moment], Any]:
     """(env, moments, (s, y) after each 10 ms) of an uncontrolled episode."""
     env = StabilityEnv("fusion", scenario=scenario)
     env.reset(seed=seed)
@@ -141,14 +135,13 @@ def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
         snapshot["params"][P.path[i]] *= side
     env.set_state(snapshot)
     v = 25.0 / 3.6
-    lanes = make_sections("iso-3888-2", COMS.width, 0.5 * v, v / 8.0, side)
+    lanes = road.make_sections("iso-3888-2", COMS.width, 0.5 * v, v / 8.0, side)
     seen = 0
     for _ in range(800):
         play(env, [0.0])
         s, y, psi = env.motion.s, env.motion.y, env.motion.psi
-        for ahead, left in itertools.product(
-            (COMS.front_arm, -COMS.rear_arm), (-0.5 * COMS.width, 0.5 * COMS.width)
-        ):
+        half = 0.5 * COMS.width
+        for ahead, left in itertools.product((COMS.front_arm, -COMS.rear_arm), (-half, half)):
             along = s + ahead * math.cos(psi) - left * math.sin(psi)
             across = y + ahead * math.sin(psi) + left * math.cos(psi)
             for lane in lanes:

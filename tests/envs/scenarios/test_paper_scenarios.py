@@ -79,13 +79,12 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
     assert (scenario.small_angle, scenario.tyres, scenario.roll) == (True, "linear", rolls)
     assert scenario.lags == expected.get("lags", False)
     assert (scenario.hdop, scenario.hdop_spread, scenario.hdop_law) == (1.0, 0.0, "constant")
-    assert (scenario.disturbance_force, scenario.disturbance_moment, scenario.disturbance_time) == (
-        (50.0, 20.0, 0.3) if disturbed else (0.0, 0.0, 0.3)
-    )
+    names = ("disturbance_force", "disturbance_moment", "disturbance_time")
+    acting = (50.0, 20.0, 0.3) if disturbed else (0.0, 0.0, 0.3)
+    assert tuple(getattr(scenario, each) for each in names) == acting
     assert dict(scenario.noise) == noises
     assert scenario.wind_force == expected.get("wind_force", 0.0)
-    low, high = scenario.get_draw_ranges()
-    np.testing.assert_array_equal(low, high)  # nothing is drawn
+    np.testing.assert_array_equal(*scenario.get_draw_ranges())  # nothing is drawn
     env = StabilityEnv("fusion", scenario=name)
     for seed in (0, 1):
         env.reset(seed=seed)
@@ -131,8 +130,7 @@ def test_twins_of_road_tests_drive_the_whole_plant(name: str) -> None:
     assert scenario.lags
     assert scenario.roll
     assert scenario.hdop_law == "half"
-    low, high = scenario.get_draw_ranges()
-    np.testing.assert_array_equal(low, high)
+    np.testing.assert_array_equal(*scenario.get_draw_ranges())
     _, seen, _ = uncontrolled(name)
     assert seen[-1, 0] == scenario.duration
     assert np.abs(seen[:, 1]).max() > 0.01  # the slip is worth an estimate

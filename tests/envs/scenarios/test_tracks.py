@@ -14,26 +14,20 @@ from sideslip.envs.engine.layout import P
 from sideslip.envs.numerics.functions import FOREVER
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
-from sideslip.envs.scenarios.road import (
-    PATHS,
-    TrackPath,
-    compute_path_offset,
-    make_path,
-    make_sections,
-    transform_path,
-)
+from sideslip.envs.scenarios import road
+from sideslip.envs.scenarios.road import TrackPath, make_path, make_sections, transform_path
 from sideslip.envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load
 
 from ..helpers import FULL, LINEAR, bits, play
 
 pytestmark = pytest.mark.plain
 
-TRACKS = PATHS[1:]
+TRACKS = road.PATHS[1:]
 widths = st.floats(1.0, 2.6)
 
 
 def offsets(path: TrackPath, s: np.ndarray) -> np.ndarray:
-    offset: np.ndarray = as_python(compute_path_offset, ARRAYS)(path, s)
+    offset: np.ndarray = as_python(road.compute_path_offset, ARRAYS)(path, s)
     return offset
 
 
@@ -162,12 +156,9 @@ def test_the_env_tells_its_tyres_now() -> None:
 
 def test_each_rear_tyre_has_its_sides_grip_and_the_front_ones_the_mean() -> None:
     car = make_car(COMS)._replace(mu=0.9, mu_r=0.3)
-    load = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car, PlantVariant(0, FIALA))
-    high = compute_tyre_load(
-        TyreInputs(0.0, -100.0, -100.0), car._replace(mu_r=0.9), PlantVariant(0, FIALA)
-    )
-    low = compute_tyre_load(
-        TyreInputs(0.0, -100.0, -100.0), car._replace(mu=0.3), PlantVariant(0, FIALA)
+    cars, inputs = (car, car._replace(mu_r=0.9), car._replace(mu=0.3)), (0.0, -100.0, -100.0)
+    load, high, low = (
+        compute_tyre_load(TyreInputs(*inputs), each, PlantVariant(0, FIALA)) for each in cars
     )
     assert (load.rear_l, load.limit_l, load.slope_l) == (high.rear_l, high.limit_l, high.slope_l)
     assert (load.rear_r, load.limit_r, load.slope_r) == (low.rear_r, low.limit_r, low.slope_r)

@@ -188,13 +188,8 @@ def test_a_loaded_car_drives_as_one_that_was_built_so() -> None:
     """Load, inertia, centre of gravity and tyres are in `vehicle`, and the plant's are the same."""
     load, inertia, shift = 0.2, 1.1, 0.04
     car = PASSENGER_CAR
-    world: dict[str, Any] = {
-        "load": load,
-        "inertia": inertia,
-        "gravity_shift": shift,
-        "relaxation": 0.5,
-    }
-    world |= {"tyres": "magic-formula"}
+    world: dict[str, Any] = {"load": load, "inertia": inertia, "gravity_shift": shift}
+    world |= {"relaxation": 0.5, "tyres": "magic-formula"}
     loaded = StabilityEnv("gps", SCENARIO, "passenger-car", world=world)
     loaded.reset(seed=1)
     back = shift * car.wheelbase
@@ -220,9 +215,8 @@ def test_torque_is_scaled_and_its_rate_is_limited() -> None:
     """A record holds what is commanded; the moment delivered is that of the scaled torques."""
     scale, left, rate = 0.9, 0.97, 20.0
     no_lags: dict[str, Any] = {"vehicle": {"base": "passenger-car", "motor_lag": 0.0}}
-    moments = swerve(
-        {"torque_scale": scale, "torque_left": left, "torque_rate": rate}, action=1.0, **no_lags
-    )
+    torque = {"torque_scale": scale, "torque_left": left, "torque_rate": rate}
+    moments = swerve(torque, action=1.0, **no_lags)
     rows, car = fast_rows(moments), PASSENGER_CAR
     torques = rows[:, [FAST.torque_left, FAST.torque_right]] * scale * np.array([left, 1.0])
     N_z = 0.5 * car.rear_track / car.wheel_radius * (torques[:, 1] - torques[:, 0])
@@ -247,9 +241,8 @@ def test_friction_and_bank_are_waves_along_the_road() -> None:
     straight = SCENARIO | {"amplitude": 0.0, "duration": 10.0}
     world = {"bank_wave": 0.02, "bank_length": 40.0}
     rows = fast_rows(swerve(world, 1000, 0.0, scenario=straight))
-    assert _find_wave(rows, rows[:, FAST.accel_y], 40.0) == pytest.approx(
-        GRAVITY * math.sin(0.02), rel=0.15
-    )
+    wave = _find_wave(rows, rows[:, FAST.accel_y], 40.0)
+    assert wave == pytest.approx(GRAVITY * math.sin(0.02), rel=0.15)
     hard = SCENARIO | {"amplitude": 0.3, "frequency": 1e-3, "friction": 0.5}
     hard |= {"steering": "held-step", "lags": False}
     world = {"friction_wave": 0.3, "friction_length": 30.0}
@@ -287,9 +280,8 @@ def test_the_rate_of_the_moment_costs_what_its_formula_says() -> None:
         share = 0.5 * car.rear_track / car.wheel_radius * torque / limit
         before = np.concatenate([np.zeros(RATE_TICKS), share[:-RATE_TICKS]])
         cost = weight * ((share - before) / (RATE_TICKS * 1e-3)) ** 2 * 1e-3
-        extra = [
-            one.info["cost"] - other.info["cost"] for one, other in zip(rated, free, strict=True)
-        ]
+        costs = (np.array([moment.info["cost"] for moment in each]) for each in (rated, free))
+        extra = np.subtract(*costs)
         np.testing.assert_allclose(extra, cost.reshape(-1, period).sum(1), atol=1e-12)
         assert max(extra) > 1e-4
 
@@ -333,9 +325,8 @@ def test_rows_of_a_batch_have_a_single_cars_bits(mode: str) -> None:
 
 def test_groups_are_scaled_about_the_ideal() -> None:
     world = WORLDS["v1"]
-    assert set(GROUPS) == {
-        World.__dataclass_fields__[name].metadata["group"] for name in NAMES[:-3]
-    }
+    fields = [World.__dataclass_fields__[name] for name in NAMES[:-3]]
+    assert set(GROUPS) == {field.metadata["group"] for field in fields}
     doubled = world.scale("camera", 2.0)
     assert doubled.camera_yaw == pytest.approx(2.0 * np.array(world.camera_yaw))
     assert doubled.steer_scale == world.steer_scale
@@ -416,12 +407,7 @@ def test_friction_that_changes_is_that_of_another_road_from_then_on(world: Any) 
 
 def test_no_car_of_the_world_is_near_its_critical_speed() -> None:
     """Others are drawn anew: a driver would lose them on a straight road."""
-    told: dict[str, Any] = {
-        "scenario": "any-friction-step",
-        "vehicle": "passenger-car",
-        "world": "v1",
-    }
-    env: Any = StabilityEnv("fusion", **told)
+    env = StabilityEnv("fusion", "any-friction-step", "passenger-car", world="v1")
     for seed in range(64):
         env.reset(seed=seed)
         assert critical_speed(env.vehicle) > 1.5 * env.motion.v_x

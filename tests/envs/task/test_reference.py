@@ -74,10 +74,7 @@ def test_zero_slip_asks_for_none() -> None:
 
 
 SWERVING: dict[str, Any] = {"steering": "sine", "amplitude": 0.3, "frequency": 0.7, "duration": 3.0}
-TARGETS = {
-    "coms": make_reference_params(COMS),
-    "passenger-car": make_reference_params(PASSENGER_CAR),
-}
+TARGETS = {car.name: make_reference_params(car) for car in (COMS, PASSENGER_CAR)}
 
 
 @pytest.mark.parametrize("name", TARGETS)

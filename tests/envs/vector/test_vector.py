@@ -17,7 +17,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 
-from ..batches import MODES, SHORT, actions, batch, drive, pair, plain, same, same_cars, sync
+from ..batches import MODES, SHORT, actions, batch, drive, pair, plain, same, same_cars
 from ..helpers import IDS, bits, unwrapped
 
 FUSION = "sideslip/YawFusion-v0"
@@ -72,16 +72,11 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"scenario": {"base": "straight", "half_width": 0.01, "wind_force": 600.0}},
     {"scenario": {"base": "tie-vision-fig7", "duration": 0.2}, "yaw_first": False},
     {"scenario": {"base": "coms-slalom", "duration": 0.7}, "reference": "lagged"},
-    {
-        "scenario": {"base": "straight", "curvature": 0.01, "curve_start": 0.0, "duration": 0.7},
-        "with_map": True,
-    },
-    {
-        "scenario": {"base": "recovery", "duration": 0.7},
-        "reference": "lagged",
-        "gps": {"phase": None},
-    },
-]
+    {"scenario": {"base": "straight", "curvature": 0.01, "curve_start": 0.0, "duration": 0.7},
+     "with_map": True},
+    {"scenario": {"base": "recovery", "duration": 0.7}, "reference": "lagged",
+     "gps": {"phase": None}},
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -224,10 +219,7 @@ def test_spaces_and_returned_arrays_follow_gymnasium(name: str) -> None:
 @pytest.mark.plain
 def test_disabled_rows_wait_for_a_reset() -> None:
     """Each row's episode is the single env's; a row that is over refuses the step of all."""
-    alone, env = (
-        sync(FUSION, 3, "Disabled", scenario=SHORT, on_bad_action="fail"),
-        batch(FUSION, 3, autoreset_mode="Disabled", scenario=SHORT, on_bad_action="fail"),
-    )
+    alone, env = pair(FUSION, 3, "Disabled")
     same(alone.reset(seed=0), env.reset(seed=0))
     told = np.array([[0.1], [np.nan], [0.2]], np.float32)
     same(alone.step(told), env.step(told))

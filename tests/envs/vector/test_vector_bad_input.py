@@ -51,10 +51,7 @@ ROWS: list[tuple[Any, list[int]]] = [
     (np.array([[np.inf], [0], [-np.inf]]), [0, 2]),
     *(([[0.0], action, [0.0]], [1]) for action, _ in BAD_ACTIONS),
     ([["left"], [0.0], {}], [0, 2]),
-    *(
-        (actions, [0, 1, 2])
-        for actions in list[Any]([np.zeros((3, 2)), np.zeros((2, 1)), None, {}, "left"])
-    ),
+    *((bad, [0, 1, 2]) for bad in (np.zeros((3, 2)), np.zeros((2, 1)), None, {}, "left")),
 ]
 
 

@@ -53,24 +53,15 @@ def test_a_masked_reset_leaves_the_other_rows_alone(mode: str) -> None:
 
 LISTS: list[dict[str, Any]] = [
     {"scenario": ["sine", {"base": "slalom", "speed": 6.0}, "uneven-delay-fig5", "sine"]},
-    {
-        "vehicle": [
-            "coms",
-            COMS.scale_stiffness(0.9),
-            {"base": "coms", "mass": 420.0},
-            "passenger-car",
-        ]
-    },
+    {"vehicle": ["coms", COMS.scale_stiffness(0.9), {"base": "coms", "mass": 420.0},
+                 "passenger-car"]},
     {"friction": [0.9, 0.5, 0.3, 0.7]},
     {"friction": np.array([0.9, 0.5, 0.3, 0.7]), "duration": (0.05, 0.1, 0.15, 0.2)},
     {"state": [{}, {"v_y": 0.2}, {"v_x": 5.0, "gamma": 0.1}, {"y": 1.0}], "scenario": "step-steer"},
     {"friction": [0.5, None, None, None], "duration": [None, 0.1, 0.5, None]},
-    {
-        "scenario": ["tie-vision-fig7", "sine", "straight", "step-steer"],
-        "friction": 0.6,
-        "duration": 0.1,
-    },
-]
+    {"scenario": ["tie-vision-fig7", "sine", "straight", "step-steer"], "friction": 0.6,
+     "duration": 0.1},
+]  # fmt: skip
 
 
 def own(value: Any, i: int) -> Any:
