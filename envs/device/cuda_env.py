@@ -149,17 +149,12 @@ class _DriverKernel:
         return values[0] if values else None
 
 
-def load_kernel(
+def _load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
     """Load a kernel: a function of the number of rows, whether they are reset, and `DeviceArrays`.
 
     In numba's simulator it is plain Python, a thread after the other.
-
-    Args:
-        constants: Constants of the kernel.
-        real: Type of floats.
-        device: GPU.
     """
     if not SIMULATED:
         from cuda.bindings import driver
@@ -221,7 +216,7 @@ class CudaVectorEnv(TensorVectorEnv):
         sizes = make_specification(self._constants, self._real, num_envs, 1)
         if not SIMULATED:
             _check_memory(sizes, num_envs, self.device)
-        self._kernel = load_kernel(self._constants, self._real, self.device)
+        self._kernel = _load_kernel(self._constants, self._real, self.device)
         self._memory = DeviceArrays(*(self._allocate(*spec) for spec in sizes))
         words = np.random.default_rng().integers(0, 2**32, (WORDS, num_envs))
         words[WORDS // 2] |= 1  # PCG64's increment is odd

@@ -137,15 +137,6 @@ class DeviceArrays(NamedTuple):
     counts: Matrix  # of ticks and of packets
 
 
-class _ThreadArrays(NamedTuple):
-    """A thread's own working arrays, or its part of the record."""
-
-    switches: Matrix
-    window: Matrix
-    rows: Matrix
-    packets: Matrix
-
-
 def make_specification(
     constants: KernelConstants, real: type[np.floating[Any]], N: int, starts: int
 ) -> DeviceArrays:
@@ -174,13 +165,9 @@ def make_specification(
 
 
 def _step_row(
-    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, thread_arrays: _ThreadArrays
+    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, row: EpisodeArrays
 ) -> None:
     """Step row i by one env-step; or reset it, if `resets` and it is ASKED."""
-    row = EpisodeArrays(
-        m.params[:, i], m.states[:, i], thread_arrays.switches, m.obs[i], thread_arrays.rows,
-        thread_arrays.packets, m.reports[:, i], m.bounds, thread_arrays.window,
-    )  # fmt: skip
     start_index, over = 0, int(m.over[i])
     if resets:
         if over != ASKED:
@@ -191,7 +178,7 @@ def _step_row(
         if constants.mode != NEXT_STEP:
             return
     else:
-        copy_into(constants.switches, thread_arrays.switches)
+        copy_into(constants.switches, row.switches)
         done = _run_row(row, m.actions[i], constants)
         reward, terminated, truncated = read_ends(row.report)
         m.rewards[i], m.terminated[i], m.truncated[i] = reward, int(terminated), int(truncated)
@@ -384,7 +371,10 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
             own_packets = cuda.local.array(packets_shape, floats)[:, :, 0]
         own_flags = cuda.local.array(flags, types.int64)
         own_window = cuda.local.array(window_shape, floats)
-        thread_arrays = _ThreadArrays(own_flags, own_window, own_rows, own_packets)
-        step(i, resets, constants, memory, thread_arrays)
+        row = EpisodeArrays(
+            memory.params[:, i], memory.states[:, i], own_flags, memory.obs[i], own_rows,
+            own_packets, memory.reports[:, i], memory.bounds, own_window,
+        )  # fmt: skip
+        step(i, resets, constants, memory, row)
 
     return step_kernel

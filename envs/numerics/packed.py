@@ -29,7 +29,6 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.base import BaseContext
 from numba.core.typing.templates import signature
 from numba.np.arrayobj import load_item, make_array, populate_array, store_item
 
@@ -202,19 +201,8 @@ def allocate_scratch(template: Matrix, rows: int, columns: int) -> Matrix:
     return np.empty((rows, columns))
 
 
-def locate_element(
-    context: BaseContext, builder: ir.IRBuilder, kind: types.Array, array: ir.Value,
-    index: Sequence[ir.Value],
-) -> ir.Value:  # fmt: skip
-    """Compute the pointer to an array's number, or lanes where the index leaves out the last axis.
-
-    Args:
-        context: Target of the compiler.
-        builder: Builder of LLVM's instructions.
-        kind: Type of the array.
-        array: Machine value of the array.
-        index: Machine values of the index.
-    """
+def _locate_element(context, builder, kind, array, index):
+    """Pointer to an array's number, or to lanes where the index leaves out the last axis."""
     made = make_array(kind)(context, builder, array)
     shape = cgutils.unpack_tuple(builder, made.shape)
     strides = cgutils.unpack_tuple(builder, made.strides)
@@ -225,14 +213,14 @@ def locate_element(
 
 
 def _read(context, builder, kind, array, index):
-    pointer = locate_element(context, builder, kind, array, index)
+    pointer = _locate_element(context, builder, kind, array, index)
     if kind.ndim > len(index):
         return builder.load(pointer, align=8)
     return load_item(context, builder, kind, pointer)
 
 
 def _write(context, builder, kind, array, index, value, value_type):
-    pointer = locate_element(context, builder, kind, array, index)
+    pointer = _locate_element(context, builder, kind, array, index)
     if kind.ndim > len(index):
         builder.store(context.cast(builder, value, value_type, FLOATS), pointer, align=8)
     elif value_type == FLOATS and kind.ndim == 2 and kind.layout == "C":
@@ -313,7 +301,7 @@ def _infer_load_lanes(array, where, first):
 def _lower_load_lanes(context, builder, sig, args):
     entries = []
     for i in cgutils.unpack_tuple(builder, args[1]):
-        first = locate_element(context, builder, sig.args[0], args[0], [i, args[2]])
+        first = _locate_element(context, builder, sig.args[0], args[0], [i, args[2]])
         entries.append(builder.load(builder.bitcast(first, FLOATS.value.as_pointer()), align=8))
     return context.make_tuple(builder, sig.return_type, entries)
 
@@ -344,7 +332,7 @@ def _infer_load8(array, *index):
 
 
 def _lower_load8(context, builder, sig, args):
-    pointer = locate_element(context, builder, sig.args[0], args[0], args[1:])
+    pointer = _locate_element(context, builder, sig.args[0], args[0], args[1:])
     return builder.load(builder.bitcast(pointer, sig.return_type.value.as_pointer()), align=8)
 
 
@@ -374,7 +362,7 @@ def _infer_store8(array, values, *index):
 
 
 def _lower_store8(context, builder, sig, args):
-    pointer = locate_element(context, builder, sig.args[0], args[0], args[2:])
+    pointer = _locate_element(context, builder, sig.args[0], args[0], args[2:])
     builder.store(args[1], builder.bitcast(pointer, sig.args[1].value.as_pointer()), align=8)
     return context.get_dummy_value()
 
@@ -391,7 +379,7 @@ def _lower_mirror(context, builder, sig, args):
 
     def locate_row(first, k, column):
         at_k = builder.add(first, context.get_constant(types.intp, k))
-        pointer = locate_element(context, builder, sig.args[0], array, [at_k, column])
+        pointer = _locate_element(context, builder, sig.args[0], array, [at_k, column])
         return builder.bitcast(pointer, FLOATS8.value.as_pointer())
 
     def shuffle(x, y, places):
