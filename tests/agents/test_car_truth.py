@@ -12,7 +12,7 @@ from sideslip.agents.controllers.lqr import TRUE_PARAMETERS, Lqr
 from sideslip.agents.controllers.mpc import Nmpc
 from sideslip.agents.design.sampled_model import SPEEDS, make_design_model
 from sideslip.agents.rollout import evaluate_episodes
-from sideslip.envs.engine import views
+from sideslip.envs.engine import layout
 from sideslip.envs.vehicle.tyres import fit_fiala
 from sideslip.estimators.vector import estimate
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruth
@@ -65,7 +65,7 @@ def test_what_is_constant_of_a_sensor_costs_an_oracle_nothing() -> None:
     assert bits(costs[0]) == bits(costs[1])
 
 
-real = views.CarTruth
+real = layout.CarTruth
 
 
 def drive_uneven(world: dict[str, Any]) -> np.ndarray:
@@ -78,7 +78,7 @@ def drive_uneven(world: dict[str, Any]) -> np.ndarray:
 def test_uneven_motors_are_commanded_accordingly(monkeypatch: pytest.MonkeyPatch) -> None:
     even, uneven = drive_uneven({}), {"torque_scale": 0.5, "torque_left": 1.3}
     np.testing.assert_allclose(drive_uneven(uneven), even, 0.004)
-    monkeypatch.setattr(views, "CarTruth", lambda *x: real(x[0], x[1], 1.0, 1.0, x[-1]))
+    monkeypatch.setattr(layout, "CarTruth", lambda *x: real(x[0], x[1], 1.0, 1.0, x[-1]))
     assert np.abs(drive_uneven(uneven) / even - 1.0).max() > 0.02  # who does not know it
 
 
