@@ -23,7 +23,7 @@ def batch(env_id: str, count: int, **arguments: Any) -> StabilityVectorEnv:
 
 def sync(env_id: str, count: int, mode: str, **arguments: Any) -> SyncVectorEnv[Any, Any]:
     """The same of single environments."""
-    how = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    how: dict[str, Any] = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
     env = gymnasium.make_vec(env_id, num_envs=count, **how, **arguments)
     assert isinstance(env, SyncVectorEnv)
     return env

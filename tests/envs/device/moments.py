@@ -89,9 +89,8 @@ def in_flight(states: np.ndarray) -> list[np.ndarray]:
     found = []
     for state in states:
         queue = state[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH)[: int(state[Z.under_way])]
-        found.append(
-            queue[np.lexsort(queue[:, [PACKET.sensor, PACKET.captured, PACKET.arrived]].T)]
-        )
+        order = np.lexsort(queue[:, [PACKET.sensor, PACKET.captured, PACKET.arrived]].T)
+        found.append(queue[order])
     return found
 
 

@@ -28,8 +28,6 @@ from sideslip.envs.numerics import kernel_cache
 H200 = (9, 0)
 STEPS = Path(__file__).with_name("test_cuda_steps.py")
 ARITHMETIC = re.compile(r"^\t(?:@!?%\w+ )?(?:add|sub|mul|fma|div|rcp|sqrt)\S*\.(f32|f64)\s", re.M)
-
-
 OPCODE = re.compile(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", re.M)
 
 

@@ -88,16 +88,14 @@ CASES: list[dict[str, Any]] = [
     {"scenario": {"base": "tie-vision-fig7", "duration": 0.1}, "sensors": "vision"},
     {"scenario": {"base": "sensor-outage", "duration": 0.3}, "reference": "lagged"},
     {"scenario": {"base": "stiffness-step", "duration": 0.04}, "fast": "all"},
-    {
-        "scenario": {"base": "gust", "duration": 0.04, "tyres": "magic-formula"},
-        "vehicle": {"base": "coms", "relaxation": 0.3},
-    },
+    {"scenario": {"base": "gust", "duration": 0.04, "tyres": "magic-formula"},
+     "vehicle": {"base": "coms", "relaxation": 0.3}},
     {"scenario": {"base": "straight", "curvature": 0.01, "curve_start": 0.0}, "with_map": True},
     {"control_period": 33, "camera": {"loss": 0.2, "duplicate": 0.3, "jitter": 0.02}},
     {"control_period": 1, "yaw_first": False},
     {"scenario": {**WANDER, "duration": 0.04}},
     {"scenario": {**WANDER, "steering": "trace", "trace": [0.0, 0.02, -0.01], "trace_step": 0.01}},
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", CASES, ids=str)
@@ -198,9 +196,8 @@ def test_a_snapshot_of_another_env_is_refused() -> None:
         {"scenario": {"base": "random-steering", "tyres": "dugoff"}},
     ]
     for arguments in others:
-        other = CudaVectorEnv(
-            **{"num_envs": N, "device": DEVICE, "record": True, **FUSION, **arguments}
-        )
+        told = {"num_envs": N, "device": DEVICE, "record": True, **FUSION, **arguments}
+        other = CudaVectorEnv(**told)
         other.reset(seed=5)
         with pytest.raises(ValueError, match="the snapshot is of other rows"):
             ours.set_state(other.get_state())

@@ -168,13 +168,11 @@ KINDS: list[dict[str, Any]] = [
 def test_neighbours_of_other_kinds(mode: str) -> None:
     """Every row has another text than the next, and episodes end within steps, at several times."""
     count = 5 * len(KINDS) + 3
-    scenarios = [
-        KINDS[i % len(KINDS)] | {"duration": (0.2, 0.255, 0.301)[i % 3]} for i in range(count)
-    ]
+    ends = (0.2, 0.255, 0.301)
+    scenarios = [KINDS[i % len(KINDS)] | {"duration": ends[i % 3]} for i in range(count)]
     alone, together = pair(FUSION, count, mode)
-    told = [{"scenario": scenario} for scenario in scenarios]
     for i, car in enumerate(alone.envs):  # sync hands one set of options to all
-        car.reset(seed=i, options=told[i])
+        car.reset(seed=i, options={"scenario": scenarios[i]})
     together.reset(seed=0, options={"scenario": scenarios})
     same_cars(alone, together)
     rng = np.random.default_rng(2)

@@ -24,13 +24,9 @@ from ..helpers import LINEAR, fast_rows, packets, play
 
 NOISE = Noise()
 FAST_SIZES = {
-    FAST.gyro: NOISE.gyro,
-    FAST.accel_y: NOISE.accel,
-    FAST.accel_x: NOISE.accel,
-    FAST.roll_rate: NOISE.roll_rate,
-    FAST.wheel_left: NOISE.wheel,
-    FAST.wheel_right: NOISE.wheel,
-}
+    FAST.gyro: NOISE.gyro, FAST.accel_y: NOISE.accel, FAST.accel_x: NOISE.accel,
+    FAST.roll_rate: NOISE.roll_rate, FAST.wheel_left: NOISE.wheel, FAST.wheel_right: NOISE.wheel,
+}  # fmt: skip
 SPEED = 25.0 / 3.6  # m/s
 SLOW_SIZES = {
     CAMERA: [NOISE.camera_psi, NOISE.camera_y],

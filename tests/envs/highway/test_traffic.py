@@ -31,12 +31,6 @@ def traffic(hazard: Hazard | None = None, others: int = 0, road: str = "straight
     return Traffic(road, START, hazard, others, 5)
 
 
-def coasting(around: Traffic, seconds: float) -> None:
-    """Drive straight on."""
-    for k in range(round(1000.0 * seconds) // PERIOD):
-        around.step_road(AHEAD._replace(X=V * 1e-3 * PERIOD * (k + 1)))
-
-
 def test_our_car_is_where_its_body_is() -> None:
     """y to the left is highway-env's minus y, the box is centred between the bumpers."""
     ours = traffic().ego
@@ -86,14 +80,6 @@ def test_those_behind_see_our_car_and_brake_or_pass() -> None:
         slowest = min([slowest, *(v.speed for v in behind)])
     assert len(behind) == 1 and slowest < 0.6 * V
     assert not any(v.crashed for v in (ours, *others))
-
-
-def test_a_car_that_drives_on_into_the_braking_one_crashes() -> None:
-    around = traffic(Hazard(headway=0.5, onset=0.0, braking=1.0))
-    coasting(around, 1.0)
-    assert not around.crashed
-    coasting(around, 4.0)
-    assert around.crashed
 
 
 def test_an_impact_that_highway_env_foresees_is_a_crash_to_both() -> None:

@@ -63,8 +63,7 @@ print(compute_path_offset(TrackPath(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
 
 
 def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Path) -> None:
-    """Numba alone would answer from the stale kernel: `compute_path_offset` itself did not
-    change."""
+    """Numba alone would answer from the stale kernel: the function itself did not change."""
     cache = tmp_path / "cache"
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = 0.25**2 * (3.0 - 2.0 * 0.25)

@@ -53,13 +53,8 @@ def driven(env: Any) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_every_id_keeps_gymnasiums_contract(name: str) -> None:
-    env = gym.make(name, **SHORT).unwrapped
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", ".*is out of date")
-        check_env(env)
-        check_env(gym.make(name, **DRAWN).unwrapped)
+def test_every_id_keeps_gymnasiums_contract(no_warnings: None, name: str) -> None:
+    check_env(gym.make(name, **DRAWN).unwrapped)
 
 
 def test_gymnasiums_wrappers(no_warnings: None, tmp_path: Path) -> None:
@@ -148,8 +143,6 @@ def test_render_fps_is_real_time() -> None:
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown render_mode 'ansi'; known: human, rgb_array"):
-        StabilityEnv(render_mode="ansi")
     drawn: dict[str, Any] = {"render_mode": "rgb_array"}
     for env in (StabilityEnv(**drawn), StabilityVectorEnv(2, **drawn)):
         with pytest.raises(ResetNeeded, match=r"nothing to draw yet: call reset\(\)"):

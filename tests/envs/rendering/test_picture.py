@@ -242,10 +242,7 @@ def _up(place: Any) -> Any:
 
 def still() -> CarScene:
     """A car at a standstill on which nothing acts."""
-    env = StabilityEnv(scenario="straight", render_mode="rgb_array")
-    env.reset(seed=0)
-    env.render()
-    now = make_car_scene(env.make_render_state())
+    now: CarScene = scene(started())
     wheels = tuple(each._replace(angle=0.0, F_x=0.0, F_y=0.0) for each in now.wheels)
     return now._replace(wheels=wheels, wind=0.0, torques=(0.0, 0.0))
 

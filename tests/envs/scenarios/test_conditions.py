@@ -8,7 +8,6 @@ import pytest
 
 from sideslip.envs import StabilityEnv
 from sideslip.envs.record import FAST, PACKET
-from sideslip.estimators import EstimateObservation
 
 from ..helpers import FULL, LINEAR, bits, fast_rows, play
 
@@ -79,16 +78,6 @@ def test_gps_packets_arrive_later_by_one_latency_and_keep_their_stamps(
         assert min(gps.delays) == pytest.approx(min(delays) + 0.1, abs=1e-12)
         assert gps.longest_delay == pytest.approx(max(delays) + 0.3, abs=1e-12)
     assert len(latencies) > 8
-
-
-@pytest.mark.compiled
-def test_filters_take_whatever_latency_is_drawn() -> None:
-    env = StabilityEnv("fusion", scenario=FULL | {"gps_latency": (0.1, 0.3), "noise": {}})
-    estimate = EstimateObservation(env, "exact-kf", outputs=["beta"])
-    estimate.reset(seed=0)
-    for _ in range(300):
-        obs, *_ = estimate.step(np.zeros(1, np.float32))
-    assert abs(obs[-1]) < 0.05
 
 
 def test_more_packets_under_way_than_the_queue_holds_are_refused_by_the_worst_case() -> None:

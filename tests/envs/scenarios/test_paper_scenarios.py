@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
-from sideslip.envs.engine.layout import P, Z
-from sideslip.envs.numerics.packed import read
+from sideslip.envs.engine.layout import Z
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import ROAD_TESTS, SIMULATIONS
 
@@ -98,16 +97,6 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
         soft = {each: 1.3 * getattr(COMS, each) for each in ROLL} if rolls else {}
         assert env.nominal == COMS.replace(front_stiffness=told, rear_stiffness=told, **soft)
         assert env.packed_state[Z.clock.redraws] == 0
-
-
-@pytest.mark.plain
-def test_ou_disturbance_has_the_stated_size_and_time() -> None:
-    env = StabilityEnv(scenario="tie-vision-fig7")
-    env.reset(seed=0)
-    force, moment, keep, fresh = read(env.get_state()["params"], P.disturbance)
-    assert (force, moment) == (50.0, 20.0)
-    assert keep == math.exp(-0.001 / 0.3)
-    assert fresh**2 + keep**2 == pytest.approx(1.0, abs=1e-15)  # stationary
 
 
 def uncontrolled(name: str, seed: int = 0) -> tuple[StabilityEnv, Any, Any]:

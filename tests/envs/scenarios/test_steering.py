@@ -23,7 +23,7 @@ from sideslip.envs.scenarios.driver import (
 )
 from sideslip.envs.scenarios.world import DRAWS_WIDTH, Draws, _is_stable
 
-from ..helpers import FULL, LINEAR, fast_rows, packets, play
+from ..helpers import FULL, fast_rows, packets, play
 
 pytestmark = pytest.mark.plain
 
@@ -124,19 +124,6 @@ def test_lane_change_and_step_end_on_the_old_heading(kind: str) -> None:
     # both are odd about their middle: the sum of the samples cancels to roundings of 500 rad
     assert abs(angle.sum()) < 1e-10
     assert angle.max() == pytest.approx(-angle.min(), rel=1e-12)
-
-
-@pytest.mark.compiled
-@pytest.mark.parametrize("kind", ["lane-change", "step"])
-def test_so_the_linear_car_does_too(kind: str) -> None:
-    turning = LINEAR | {"steering": kind, "onset": 0.5, "amplitude": 0.05, "duration": 12.0}
-    env = StabilityEnv(scenario=turning)
-    env.reset(seed=0)
-    moments = play(env, [0.0] * 1200)
-    psi = np.array([moment.info["psi"] for moment in moments])
-    assert np.abs(psi).max() > 0.05
-    # psi integrates what the plant makes of a signal whose integral is zero; exp(-6 x 7 s) is left
-    assert abs(psi[-1]) < 1e-12
 
 
 @given(st.floats(0.1, 3.0), st.floats(0.3, 3.0))

@@ -7,7 +7,6 @@ import pytest
 
 from sideslip.envs import FAILURES, StabilityEnv
 
-from ..batches import batch
 from ..helpers import FULL, play
 
 pytestmark = pytest.mark.plain
@@ -33,25 +32,6 @@ def test_more_than_half_a_radian_of_slip_is_a_spin(state: dict[str, float]) -> N
     assert slips[:-1].max() <= SPIN_LIMIT < slips[-1] < SPIN_LIMIT + 0.02
     assert [FAILURES[moment.info["failure"]] for moment in moments[-2:]] == ["none", "spin"]
     assert moments[-1].terminated and not moments[-2].terminated
-
-
-@pytest.mark.parametrize("count", [2, 5])
-def test_so_it_is_in_a_batch(count: int) -> None:
-    """A row that spins beside others that turn the other way and one that does not turn."""
-    scenario, ends = FULL | {"duration": 1.0}, dict[int, tuple[float, float, str]]()
-    env = batch("sideslip/YawFusion-v0", count, scenario=scenario, control_period=1)
-    states = [TURNING, *[mirrored(TURNING)] * (count - 2), {"v_x": 8.0}]
-    env.reset(seed=0, options={"state": states})
-    slips = np.zeros(count)
-    for _ in range(900):
-        _, _, terminated, _, infos = env.step(np.zeros((count, 1), np.float32))
-        for i in np.flatnonzero(terminated).tolist():
-            ends.setdefault(i, (slips[i], abs(infos["beta"][i]), FAILURES[infos["failure"][i]]))
-        slips = np.abs(infos["beta"])
-    assert sorted(ends) == list(range(count - 1))
-    for before, at_the_end, failure in ends.values():
-        assert failure == "spin"
-        assert before <= SPIN_LIMIT < at_the_end < SPIN_LIMIT + 0.02
 
 
 @pytest.mark.parametrize("state", [LEAVING, mirrored(LEAVING)], ids=["left", "right"])

@@ -51,8 +51,9 @@ ROWS: list[tuple[Any, list[int]]] = [
     (np.array([[np.inf], [0], [-np.inf]]), [0, 2]),
     *(([[0.0], action, [0.0]], [1]) for action, _ in BAD_ACTIONS),
     ([["left"], [0.0], {}], [0, 2]),
-    *((bad, [0, 1, 2]) for bad in (np.zeros((3, 2)), np.zeros((2, 1)), None, {}, "left")),
-]
+    (np.zeros((3, 2)), [0, 1, 2]), (np.zeros((2, 1)), [0, 1, 2]), (None, [0, 1, 2]),
+    ({}, [0, 1, 2]), ("left", [0, 1, 2]),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("actions", "rows"), ROWS, ids=lambda told: str(told)[:40])

@@ -112,14 +112,12 @@ def test_matrices_are_the_plants_jacobian(
 def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
     m, I, l_f, l_r, C_f, C_r, l_pre = 380.0, 136.08, 0.8, 0.6, 6000.0, 6000.0, 5.135  # noqa: E741
     D = C_f * l_f**2 + C_r * l_r**2
-    A = np.array(
-        [
-            [-2 * (C_f + C_r) / (m * V_x), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V_x**2), 0, 0],
-            [-2 * (C_f * l_f - C_r * l_r) / I, -2 * D / (I * V_x), 0, 0],
-            [0, 1, 0, 0],
-            [V_x, l_pre, V_x, 0],
-        ]
-    )
+    A = np.array([
+        [-2 * (C_f + C_r) / (m * V_x), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V_x**2), 0, 0],
+        [-2 * (C_f * l_f - C_r * l_r) / I, -2 * D / (I * V_x), 0, 0],
+        [0, 1, 0, 0],
+        [V_x, l_pre, V_x, 0],
+    ])  # fmt: skip
     B = np.array([[2 * C_f / (m * V_x), 2 * C_f * l_f / I, 0, 0], [0, 1 / I, 0, 0]]).T
     C = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     model = make_vision_model(COMS, V_x)
@@ -214,32 +212,6 @@ def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicl
         moved = second_layer(x + step[:4], u + step[4:], gamma, vehicle) - start
         expected = model.A @ step[:4] + model.B @ moved[4:]
         np.testing.assert_allclose(moved[:4], expected, rtol=0.0, atol=1e-11)  # rates up to 100
-    body = make_roll_model(vehicle)
-    np.testing.assert_array_equal(model.A[2:, 2:], body.A)
-    np.testing.assert_array_equal(model.A[:2, :2], [[0.0, gamma], [-gamma, 0.0]])
-    np.testing.assert_array_equal(model.B[2:, 1:], body.B)
-    assert model.states == ("v_x", "v_y", *body.states)
-    for each in (model, body):
-        assert each.C.shape == (len(each.outputs), len(each.states))
-        assert each.B.shape == (len(each.states), len(each.inputs))
-        names = [each.states[int(np.argmax(row))] for row in each.C]
-        assert tuple(names) == each.outputs
-        G, H = each.discretise(0.001)
-        for exact, first in ((G - np.eye(len(G)), 0.001 * each.A), (H, 0.001 * each.B)):
-            assert np.abs(exact - first).max() <= 2e-2 * np.abs(first).max()
-
-
-def test_slip_cannot_be_seen_from_the_wheels_alone_at_zero_yaw_rate() -> None:
-    """double-layer-gps, 5.2: the kinematic observer is blind there, the second layer is not."""
-
-    def rank(gamma: float, states: int, outputs: int) -> int:
-        model = make_velocity_roll_model(COMS, gamma)
-        A, C = model.A[:states, :states], model.C[:outputs, :states]
-        powers = [np.linalg.matrix_power(A, k) for k in range(states)]
-        return int(np.linalg.matrix_rank(np.vstack([C @ power for power in powers])))
-
-    assert (rank(0.0, 2, 1), rank(0.1, 2, 1)) == (1, 2)  # v_x and v_y by the wheels alone
-    assert rank(0.0, 4, 3) == 4
 
 
 @pytest.mark.parametrize("name", MODELS)

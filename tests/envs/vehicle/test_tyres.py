@@ -116,10 +116,8 @@ def test_all_laws_are_the_linear_one_at_small_slip(u: float, C: float, limit: fl
 @pytest.mark.parametrize("car", CARS)
 def test_initial_slope_is_the_cornering_stiffness(car: CarParams, law: int) -> None:
     load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, PlantVariant(0, LINEAR))
-    for C, limit, slope in (
-        (car.C_f, load.limit_f, load.slope_f),
-        (car.C_r, load.limit_r, load.slope_r),
-    ):
+    front, rear = (car.C_f, load.limit_f, load.slope_f), (car.C_r, load.limit_r, load.slope_r)
+    for C, limit, slope in (front, rear):
         h = 1e-9  # Fiala's F = C t (1 - z + ...) departs from its tangent by z = slope h
         force = lateral_force(h, limit, slope, law)
         assert force / h == pytest.approx(C, rel=2.0 * slope * h)
