@@ -97,17 +97,3 @@ def bits(value: Any) -> Any:
         array = np.asarray(value)
         return array.dtype.str, array.shape, array.tobytes()
     return value
-
-
-def drive_alike(together: Any, alone: list[StabilityEnv], steps: int) -> None:
-    """Assert that rows of a vector env observe what single ones do, over episodes' ends."""
-    obs, _ = together.reset(seed=5)
-    over = np.zeros(len(alone), np.bool_)
-    assert bits(list(obs)) == bits([env.reset(seed=5 + i)[0] for i, env in enumerate(alone)])
-    for step in range(steps):
-        action = np.random.default_rng(step).uniform(-1, 1, (len(alone), 1)).astype(np.float32)
-        obs, _, terminated, truncated, _ = together.step(action)
-        for i, env in enumerate(alone):
-            expected = env.reset()[0] if over[i] else env.step(action[i])[0]
-            assert bits(obs[i]) == bits(expected), (step, i)
-        over = terminated | truncated

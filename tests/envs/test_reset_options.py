@@ -115,10 +115,6 @@ def test_options_combine(env: StabilityEnv) -> None:
     assert options["state"] == {"y": 49.99}  # the caller's mapping is not emptied
 
 
-def test_empty_options_are_none(env: StabilityEnv) -> None:
-    assert bits(env.reset(seed=0, options={})) == bits(env.reset(seed=0))
-
-
 def test_nominal_is_what_the_references_use() -> None:
     turning = LINEAR | {"steering": "sine", "amplitude": 0.05}
     seen = []

@@ -1,17 +1,12 @@
 """The gradient engine refuses bad input at the border, and steps nothing."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
-import sideslip
-
+from .. import processes
 from ..helpers import bits
 
 torch = pytest.importorskip("torch")
@@ -158,21 +153,9 @@ def test_what_was_not_started_or_is_over_waits_for_a_reset() -> None:
         env.step(torch.zeros(2, 1))
 
 
-def python(code: str) -> str:
-    """What a fresh interpreter prints."""
-    home = str(Path(sideslip.__file__ or "").parent.parent)
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": home},
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
-
-
 def test_torch_is_loaded_by_the_device_engine_alone() -> None:
     code = "import sys, sideslip.envs, sideslip.agents; print('torch' in sys.modules)"
-    assert python(code) == "False\n"
+    assert processes.finish(processes.start(code, {}))[0] == ["False"]
 
 
 def test_without_torch_the_extra_is_named() -> None:
@@ -181,4 +164,5 @@ def test_without_torch_the_extra_is_named() -> None:
         "try:\n    import sideslip.envs.device\n"
         "except ModuleNotFoundError as error:\n    print(error)"
     )
-    assert "the device engine needs torch: pip install 'sideslip[train]'" in python(code)
+    (line,), _ = processes.finish(processes.start(code, {}))
+    assert "the device engine needs torch: pip install 'sideslip[train]'" in line

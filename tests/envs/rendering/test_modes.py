@@ -2,7 +2,6 @@
 
 import copy
 import importlib
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -21,6 +20,7 @@ from sideslip.envs import StabilityEnv, StabilityVectorEnv
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as EstimateObservations
 
+from .. import processes
 from ..helpers import IDS
 
 FRAME = (540, 960, 3)
@@ -178,8 +178,7 @@ def test_who_draws_nothing_loads_nothing() -> None:
         "gymnasium.make('sideslip/YawVision-v0', render_mode='rgb_array'); "
         "print([name for name in ('pygame', 'moviepy', 'cv2', 'PIL') if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]", done.stderr
+    assert processes.finish(processes.start(program, {}))[0] == ["[]"]
 
 
 def test_a_masked_reset_leaves_the_others_charts() -> None:

@@ -1,18 +1,21 @@
 """A recorded steering trace is driven again, and a driver wanders, alone and in a batch."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents.clairvoyant.forecast import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device import make_device_env
 from sideslip.envs.record import FAST
 
-from ..helpers import bits, drive_alike
+from .. import batches
+from ..helpers import bits
 from ..recordings.drives import drive, saved
 
 VISION = "sideslip/YawVision-v0"
@@ -133,9 +136,11 @@ def test_rows_of_a_batch_are_the_environment_alone() -> None:
     longer = {**TRACE, "trace": [0.05 * np.sin(k) for k in range(30)], "mirror": True}
     slalom = {"base": "slalom", "duration": 0.3}
     rows: list[Any] = [TRACE, slalom, longer, "car-iso-3888-1", WANDER, WANDER | {"hold": 0.05}] * 4
-    together = gym.make_vec(VISION, len(rows), scenario=rows, control_period=7)
-    alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
-    drive_alike(together, alone, 100)
+    told: dict[str, Any] = {"control_period": 7, "on_bad_action": "fail"}
+    alone = SyncVectorEnv([partial(gym.make, VISION, scenario=each, **told) for each in rows])
+    together = batches.batch(VISION, len(rows), scenario=rows, **told)
+    batches.same(alone.reset(seed=5), together.reset(seed=5))
+    batches.drive(alone, together, 100)
 
 
 @pytest.mark.parametrize("scenario", [TRACE, WANDER], ids=["trace", "wander"])
