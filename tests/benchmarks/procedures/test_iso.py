@@ -28,6 +28,14 @@ def straight(y: float = 0.0, psi: float = 0.0, end: float = 60.0) -> Array:
     return iso._compute_corners(series(X, np.full_like(X, y), np.full_like(X, psi)), CAR)
 
 
+def follow_lanes(track: str, speed: float) -> tuple[Array, Array]:
+    """X and Y (m) of a path down the middle of every lane of a track."""
+    lanes = iso._make_lanes(CAR, track, speed)
+    X = np.arange(0.0, lanes[-1].start + lanes[-1].length + 10.0, 0.1)
+    knots = [[lane.start - 5.0, lane.start + lane.length + 4.0] for lane in lanes]
+    return X, np.interp(X, np.ravel(knots), np.repeat([lane.offset for lane in lanes], 2))
+
+
 def test_corners_are_those_of_the_body() -> None:
     front = PASSENGER_CAR.front_arm + 0.8
     at = iso._compute_corners(
@@ -76,10 +84,7 @@ def test_a_lane_that_was_not_driven_through_has_no_margin() -> None:
 
 def test_a_path_down_the_lanes_centres_passes_and_straight_on_does_not() -> None:
     speed = 20.0
-    lanes = iso._make_lanes(CAR, "iso-3888-1", speed)
-    X = np.arange(0.0, lanes[-1].start + lanes[-1].length + 10.0, 0.1)
-    knots = [[lane.start - 6.0, lane.start + lane.length + 4.0] for lane in lanes]
-    Y = np.interp(X, np.ravel(knots), np.repeat([lane.offset for lane in lanes], 2))
+    X, Y = follow_lanes("iso-3888-1", speed)
     followed = iso._evaluate_run(series(X, Y, 0.0 * X), CAR, "iso-3888-1", speed)
     assert followed.passed
     straight_on = iso._evaluate_run(series(X, 0.0 * X, 0.0 * X), CAR, "iso-3888-1", speed)
@@ -92,10 +97,7 @@ def test_the_highest_speed_is_that_of_a_clean_run_of_any_driver(track: str) -> N
 
     def drive(fields: Fields) -> Series:
         driven.append((fields["speed"], fields["driver_gain"]))
-        lanes = iso._make_lanes(CAR, track, fields["speed"])
-        X = np.arange(0.0, lanes[-1].start + lanes[-1].length + 10.0, 0.1)
-        knots = [[lane.start - 5.0, lane.start + lane.length + 4.0] for lane in lanes]
-        Y = np.interp(X, np.ravel(knots), np.repeat([lane.offset for lane in lanes], 2))
+        X, Y = follow_lanes(track, fields["speed"])
         skilled = fields["speed"] < 11.5 or (fields["speed"] < 12.5 and fields["driver_gain"] > 0.9)
         return series(X, Y if skilled else 0.0 * Y, 0.0 * X)
 
@@ -211,11 +213,8 @@ def steady(vehicle: Vehicle, steer: float, fastest: float) -> Series:
     """The linear car's steady states at rising speeds."""
     t = np.arange(0.0, 30.0, 0.01)
     zero, speed = np.zeros_like(t), np.linspace(2.0, fastest, len(t))
-    states = [
-        -np.linalg.solve(make_bicycle_model(vehicle, v).A, make_bicycle_model(vehicle, v).B)[:, 0]
-        for v in speed
-    ]
-    beta, gamma = steer * np.array(states).T
+    models = [make_bicycle_model(vehicle, v) for v in speed]
+    beta, gamma = steer * np.array([-np.linalg.solve(x.A, x.B)[:, 0] for x in models]).T
     return Series(t, zero + steer, speed, speed * beta, gamma, zero, zero, zero, zero)
 
 

@@ -10,8 +10,6 @@ import pytest
 
 pytest.importorskip("optuna")
 
-import pytest
-
 from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
 from sideslip.benchmarks.control.entries import ControlCase
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
@@ -62,10 +60,8 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert log["start"] == log["trials"][0]["objective"]
     assert log["best"]["objective"] < log["start"] - 0.5
     assert log["best"]["numbers"]["grip"] > 0.1
-    best = log["options"]["controller"]
-    assert _compute_objective(planted, SEEDS, best) == pytest.approx(
-        log["best"]["objective"], abs=1e-4
-    )
+    objective = _compute_objective(planted, SEEDS, log["options"]["controller"])
+    assert objective == pytest.approx(log["best"]["objective"], abs=1e-4)
     assert "score" in controllers.make_suite(planted, log).text
 
 
@@ -168,17 +164,12 @@ def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None
 
 
 def test_numbers_become_options() -> None:
-    numbers = (
-        SearchNumber("bandwidth.0", 5.0, 1.0, 9.0),
-        SearchNumber("bandwidth.1", 5.0, 1.0, 9.0),
-        SearchNumber("horizon", 30, 10, 60, is_integer=True),
-    )
+    bandwidths = [SearchNumber(f"bandwidth.{i}", 5.0, 1.0, 9.0) for i in (0, 1)]
+    numbers = (*bandwidths, SearchNumber("horizon", 30, 10, 60, is_integer=True))
     found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4}
     task = controllers.ControllerTuning("lqr", "car-yaw", (), (0,), numbers)
-    assert task._make_options(found) == {
-        "filter": {},
-        "controller": {"bandwidth": [2.0, 3.0], "horizon": 20},
-    }
+    options = {"bandwidth": [2.0, 3.0], "horizon": 20}
+    assert task._make_options(found) == {"filter": {}, "controller": options}
 
 
 def test_options_are_written_beside_others_and_read(tmp_path: Path) -> None:
@@ -234,13 +225,8 @@ def test_a_seed_is_a_drive_and_five_seeds_are_all_kinds_of_sensors() -> None:
     first, again = (_draw_drive(3, 4.0) for _ in range(2))
     assert np.array_equal(first.log.record.fast, again.log.record.fast)
     drives = [_draw_drive(seed, 4.0) for seed in range(5)]
-    assert [" ".join(sorted(x.log.slow)) for x in drives] == [
-        "camera",
-        "gps",
-        "camera gps",
-        "gps",
-        "",
-    ]
+    sensors = [" ".join(sorted(x.log.slow)) for x in drives]
+    assert sensors == ["camera", "gps", "camera gps", "gps", ""]
     assert [x.log.record.dt for x in drives] == [0.001] * 3 + [0.01] * 2
     assert all(x.facts["vehicle"] != drives[0].facts["vehicle"] for x in drives[1:])
     for drive in drives:  # the levels in use are the defaults
