@@ -240,7 +240,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
         P: Output for the covariance, zeros of shape (n, n), or (0, 0).
     """
     offset, f = 0, layers[0]
-    if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
+    if len(P) > 0 and gains[f.cell, 0, 0] == 0.0:
         return False
     for layer in range(len(layers)):
         f = layers[layer]
@@ -248,8 +248,8 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
         for i in range(f.n):
             x[offset + i] = f.x[i]
             for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
-                row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
-                P[offset + i, offset + j] = growth * _read_covariance(f, gains, row, column)
+                variance = _read_covariance(f, gains, minimum(i, j), maximum(i, j))
+                P[offset + i, offset + j] = growth * variance
         offset += f.n
     return True
 

@@ -57,16 +57,6 @@ def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @inline
-def predict_between(f: FilterRecord, s: int) -> None:
-    """Predict what a sample would read now, and its pseudo-residual."""
-    if f.intersample_rule == PSEUDO:
-        for i in range(f.rows[s]):
-            is_cloned = f.frames[s] > 0
-            f.expected[i] = f.x[f.first_clone[s] + i] if is_cloned else predict_measurement(f, s, i)
-            f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # pseudo-residual C G e, tie-vision (22)
-
-
-@inline
 def predict_error(f: FilterRecord) -> None:
     """Predict the estimated error by a step."""
     if f.intersample_rule == PSEUDO:
@@ -74,13 +64,13 @@ def predict_error(f: FilterRecord) -> None:
 
 
 @inline
-def correct_error(f: FilterRecord, i: int, residual: float) -> None:
-    """Correct the estimated error by a fast measurement with its gain in f.share."""
+def predict_between(f: FilterRecord, s: int) -> None:
+    """Predict what a sample would read now, and its pseudo-residual."""
     if f.intersample_rule == PSEUDO:
-        projected = dot(f.C_fast[i], f.e, f.n)
-        f.eps[i] = residual
-        for j in range(f.total):
-            f.e[j] -= f.share[i, j] * projected
+        for i in range(f.rows[s]):
+            is_cloned = f.frames[s] > 0
+            f.expected[i] = f.x[f.first_clone[s] + i] if is_cloned else predict_measurement(f, s, i)
+            f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # pseudo-residual C G e, tie-vision (22)
 
 
 @jit
@@ -97,16 +87,27 @@ def _correct_x_and_e(f: FilterRecord, gains: GainTables, s: int) -> None:
             e[j] -= K[j] * projected  # tie-vision (21): (I - K C) G e
 
 
+@jit
+def _correct_by_shares(f: FilterRecord, s: int) -> None:
+    """Correct e as fast rows did x, then both by the even fraction of the last sample's gain."""
+    for i in range(f.fasts):
+        projected = dot(f.C_fast[i], f.e, f.n)
+        for j in range(f.total):
+            f.e[j] -= f.share[i, j] * projected
+    for i in range(f.fasts, f.fasts + f.rows[s]):
+        for j in range(f.total):
+            f.x[j] += f.share[i, j] * f.eps[i]
+            f.e[j] -= f.share[i, j] * f.eps[i]
+
+
 @inline
 def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct as if a part of the last sample came now, after the fast measurements."""
-    if f.intersample_rule == PSEUDO and f.periodic == 1:
-        _correct_x_and_e(f, gains, s)
-    elif f.intersample_rule == PSEUDO:  # the even fraction of the last sample's gain
-        for i in range(f.fasts, f.fasts + f.rows[s]):
-            for j in range(f.total):
-                f.x[j] += f.share[i, j] * f.eps[i]
-                f.e[j] -= f.share[i, j] * f.eps[i]
+    if f.intersample_rule == PSEUDO:
+        if f.periodic == 1:
+            _correct_x_and_e(f, gains, s)
+        else:
+            _correct_by_shares(f, s)
     elif f.intersample_rule == DUAL_RATE and f.since >= 0:
         f.since += 1
         if f.since < f.cycle:

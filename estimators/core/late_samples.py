@@ -4,6 +4,8 @@ In this room `packets` besides filters the past anew for "buffer", and `update` 
 WEIGHED. `design.assemble` allocates what a rule stores; `vector.batch` lists those that lanes have.
 """
 
+from typing import NamedTuple
+
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.primitives import Scalar, Vector, maximum
 from ...envs.record import PACKET
@@ -17,7 +19,33 @@ from .covariance import (
 from .model import PSI, compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 
-RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
+# what a sample measures, where it is no clone (its place, positive)
+DIRECT = -1  # the states as they are
+DROPPED = -2  # nothing: it is not used
+PREDICTED = -3  # the states as they were predicted for its capture
+ASSUMED = -4  # the same, for the capture that `assumed` supposes
+WEIGHED = -5  # what the covariance has taken already; LARSEN
+
+
+class DelayRule(NamedTuple):
+    """What a rule does with samples; frames that it stores come before `late`."""
+
+    late: int = DROPPED  # what a sample measures that was captured before this tick
+    fresh: int = DIRECT  # what one of this tick does
+    max_age: int = 1 << 62  # ticks from which one is refused
+    snapshots: int = 0  # states of the past, which is redone
+
+
+RULES = {
+    "clone": DelayRule(),
+    "ignore": DelayRule(DIRECT),
+    "stored": DelayRule(PREDICTED, max_age=WINDOW),
+    "constant": DelayRule(ASSUMED, ASSUMED),
+    "larsen": DelayRule(),
+    "buffer": DelayRule(snapshots=N_SNAPSHOTS + 1),
+    "literal": DelayRule(DIRECT),
+    "lag": DelayRule(DIRECT),
+}
 """Rules for late samples; what is older than a rule stores is refused and counted.
 
 clone: what is measured is cloned in the step after each capture, so a late sample measures its
@@ -29,11 +57,7 @@ is filtered anew (`packets`), exact. literal, lag: late states follow by one ste
 # codes of the field `delay_rule`, places in RULES; the last two are IGNORE with late states
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 
-# what a sample measures, where it is no clone (its place, positive)
-DIRECT = -1  # the states as they are
-DROPPED = -2  # nothing: it is not used
-PREDICTED = -3  # the states as they were predicted for its capture
-WEIGHED = -4  # what the covariance has taken already; LARSEN
+_LATE, _FRESH, _MAX_AGE, _SNAPSHOTS = zip(*RULES.values(), strict=True)  # by code
 
 
 @jit
@@ -140,17 +164,13 @@ def find_target(f: FilterRecord, s: int, captured: int) -> int:
     if is_duplicate(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]
-    target = DROPPED
-    if f.delay_rule == CONSTANT:
-        target = PREDICTED
-    elif f.delay_rule == IGNORE or captured == f.tick:
-        target = DIRECT
-    elif f.delay_rule == STORED and f.tick - captured < WINDOW:
-        target = PREDICTED
-    elif f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
+    target: int = _LATE[f.delay_rule] if captured < f.tick else _FRESH[f.delay_rule]
+    if f.tick - captured >= _MAX_AGE[f.delay_rule]:
+        target = DROPPED
+    elif captured < f.tick and f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
         slot = frame % f.frames[s]
         f.stamp[s, slot] = -1
-        target = WEIGHED if f.delay_rule == LARSEN else f.first_clone[s] + slot * f.rows[s]
+        target = f.first_clone[s] + slot * f.rows[s]
     if target == DROPPED:
         f.counts[COUNTERS.refused] += 1
     else:
@@ -163,9 +183,9 @@ def predict_sample(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
     """Predict row i of the sample in f.sample."""
     if target == WEIGHED:
         return f.larsen_expected[s, i]
-    if target == PREDICTED:
+    if target in (PREDICTED, ASSUMED):
         captured = int(f.sample[PACKET.captured])
-        stored = maximum(f.tick - f.assumed, f.start) if f.delay_rule == CONSTANT else captured
+        stored = maximum(f.tick - f.assumed, f.start) if target == ASSUMED else captured
         stored_prediction = dot(f.C[s, i], f.predicted[stored % WINDOW], f.n)  # uneven-delay (15)
         turn = f.past_road_turn[stored % WINDOW]
         return stored_prediction + turn if f.ground[s, i] == 1 else stored_prediction
@@ -183,9 +203,8 @@ def turn_heading(f: FilterRecord, s: int, turn: float) -> None:
         for slot in range(f.frames[s]):
             f.x[f.first_clone[s] + slot * f.rows[s]] += turn
     f.larsen_expected[s, 0] += turn
-    if f.delay_rule == BUFFER:
-        for i in range(N_SNAPSHOTS + 1):
-            f.snapshot_x[i, PSI] += turn
+    for i in range(_SNAPSHOTS[f.delay_rule]):
+        f.snapshot_x[i, PSI] += turn
 
 
 @jit
@@ -202,6 +221,5 @@ def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
     for i in range(f.total):
         for j in range(f.total):
             f.P[i, j] += variance * (v[i] * v[j])
-    if f.delay_rule == BUFFER:
-        for i in range(N_SNAPSHOTS + 1):
-            f.snapshot_P[i, state, state] += variance
+    for i in range(_SNAPSHOTS[f.delay_rule]):
+        f.snapshot_P[i, state, state] += variance

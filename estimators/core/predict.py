@@ -124,13 +124,12 @@ def _scale_beta(f: FilterRecord) -> None:
     """Scale beta = v_y / V to the model's new speed V, since v_y is what stays."""
     f.x[BETA] *= f.beta_scale
     f.e[BETA] *= f.beta_scale
-    if f.periodic == 0:
-        for i in range(f.total):
-            f.P[BETA, i] *= f.beta_scale
-            f.P[i, BETA] *= f.beta_scale
-        for s in range(N_SLOW):
-            for i in range(f.rows[s]):
-                f.larsen_gain[s, i, BETA] *= f.beta_scale
+    for i in range(f.total):
+        f.P[BETA, i] *= f.beta_scale
+        f.P[i, BETA] *= f.beta_scale
+    for s in range(N_SLOW):
+        for i in range(f.rows[s]):
+            f.larsen_gain[s, i, BETA] *= f.beta_scale
     f.beta_scale = 1.0
 
 

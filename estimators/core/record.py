@@ -36,7 +36,7 @@ N_RECENT = 64  # packets within the window
 
 FilterRecord = Any  # one record of the dtype `FILTER`; `f` in all compiled code
 FilterRecords = npt.NDArray[Any]  # (layers,) or (filters, layers) of the dtype `FILTER`
-GainTables = Any  # (cells of speed, rows, columns), see `design.periodic`; zeros where P gives them
+GainTables = Any  # (cells of speed, rows, columns), see `design.periodic`; ones where P gives them
 
 
 class SkipCounters(NamedTuple):
@@ -173,12 +173,17 @@ _FIELDS: list[tuple[Any, ...]] = [
     # the rule for late samples: codes stand in `late_samples`, and in `intersample`
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
-    ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; 0: it has none
+    (
+        "first_clone",
+        _INT,
+        (N_SLOW,),
+    ),  # where its clones start in x; 0, WEIGHED: it has none
     ("stored", _INT),  # states whose predictions are stored; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains
     ("periodic", _INT),
-    ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
+    ("joint", _INT),  # 1: all fast residuals of a tick are taken before its corrections
+    ("placed", _INT),  # fast rows that then correct by the table: an observer's
     ("intersample_rule", _INT),  # code of the rule between slow samples, such as PSEUDO
     ("cycle", _INT),  # steps after which the schedule repeats
     ("pattern", _INT),  # frames in the schedule's cycle
@@ -239,6 +244,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
     ("innovation", _FLOAT, (N_ROWS,)),  # innovation of the last sample; DUAL_RATE
     ("since", _INT),  # steps since the last sample; -1: there was none; DUAL_RATE
+    ("to_line", _INT, (7,)),  # unused: with it the matrices, sorted behind, begin on cache lines
     # scratch
     ("u_new", _FLOAT, (N_INPUTS,)),
     ("PC", _FLOAT, (N_TOTAL,)),  # P C^T

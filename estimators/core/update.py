@@ -14,13 +14,12 @@ from .intersample import (
     PSEUDO,
     add_gain,
     correct_between,
-    correct_error,
     locate_frame_row,
     locate_step_row,
     predict_between,
     start_between,
 )
-from .late_samples import PREDICTED, WEIGHED, correct_late, predict_sample, turn_heading
+from .late_samples import ASSUMED, PREDICTED, WEIGHED, correct_late, predict_sample, turn_heading
 from .model import MIN_SPEED, is_finite
 from .predict import compute_residual
 from .record import COUNTERS, FilterRecord, GainTables
@@ -32,7 +31,7 @@ _HEADING_TOLERANCE = 0.5  # rad, residual of the first heading fix above which i
 @jit
 def _compute_residuals(f: FilterRecord, s: int, target: int) -> None:
     """Compute f.residual of every row, wrapped where it is an angle; a heading fix may set psi."""
-    has_expected = f.intersample_rule == PSEUDO and target != PREDICTED
+    has_expected = f.intersample_rule == PSEUDO and target not in (PREDICTED, ASSUMED)
     for i in range(f.rows[s]):  # `expected`: before this tick's corrections
         prediction = f.expected[i] if has_expected else predict_sample(f, s, i, target)
         residual = f.sample[PACKET.value + i] - prediction
@@ -159,9 +158,8 @@ def _correct_by_table(f: FilterRecord, gains: GainTables) -> None:
         f.eps[i] = residual if is_finite(residual) else 0.0
         if f.joint == 0:
             add_gain(f, gains, locate_step_row(f) + i, f.eps[i])
-    if f.joint == 1 and f.intersample_rule == NONE:
-        for i in range(f.fasts):
-            add_gain(f, gains, locate_step_row(f) + i, f.eps[i])
+    for i in range(f.placed):
+        add_gain(f, gains, locate_step_row(f) + i, f.eps[i])
 
 
 @inline
@@ -171,6 +169,8 @@ def _correct_by_covariance(f: FilterRecord) -> None:
         residual = compute_residual(f, i)
         if not is_finite(residual):
             f.eps[i] = 0.0
+            for j in range(f.total):
+                f.share[i, j] = 0.0
             continue
         projected = project(f, f.C_fast[i])
         if f.r_share > 0.0:
@@ -179,9 +179,9 @@ def _correct_by_covariance(f: FilterRecord) -> None:
         if f.r_share > 0.0:
             note_surprise(f, 0, residual * residual / variance, f.step / f.fasts)
         correct_scalar(f, variance, residual)
+        f.eps[i] = residual
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
-        correct_error(f, i, residual)
         correct_late(f, f.C_fast[i])
     if f.r_share > 0.0:
         f.block_rows += 1

@@ -30,7 +30,7 @@ def _refuse(label: str, *checks: tuple[object, str]) -> None:
 def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     delay = config.delay
-    f.delay_rule = rule.IGNORE if delay in ("literal", "lag") else rule.RULES.index(delay)
+    f.delay_rule = rule.IGNORE if delay in ("literal", "lag") else [*rule.RULES].index(delay)
     if delay == "buffer":  # it filters the past anew while f.tick stands still
         f.linearise_every = 1
     f.total = f.n
@@ -43,9 +43,8 @@ def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
         )
         _refuse(config.name, (frames > max_frames, text))
         f.frames[s] = frames
-        if delay == "clone":
-            f.first_clone[s] = f.total
-            f.total += frames * f.rows[s]
+        f.first_clone[s] = f.total if delay == "clone" else rule.WEIGHED
+        f.total += frames * f.rows[s] * (delay == "clone")
     is_twice = delay == "larsen" and f.frames.sum() > 1
     text = (
         f"{f.n} states and {f.total - f.n} clones are more than the {size.N_TOTAL} of "
@@ -81,7 +80,7 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
     for name, sensor in sensors.items() if f.delay_rule in (rule.BUFFER, rule.STORED) else ():
         text = (
             f"the {name} can be {sensor.longest_delay:g} s late; "
-            f"delay={rule.RULES[f.delay_rule]!r} has a window of {window * dt:g} s ({window} ticks)"
+            f"delay={config.delay!r} has a window of {window * dt:g} s ({window} ticks)"
         )
         checks.append((sensor.longest_delay > (window + 1e-6) * dt, text))
         longest = sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt
@@ -329,7 +328,8 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     shared = config.row.family == "dual-rate"
     f.intersample_rule = PSEUDO if pseudo else DUAL_RATE if shared else NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
-    f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
+    f.placed = f.fasts if config.row.gains == "placed" else 0
+    f.joint = f.placed > 0 or (pseudo and f.periodic)
     f.stored = f.n if f.delay_rule in (rule.STORED, rule.CONSTANT) or config.row.second else 0
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING

@@ -230,7 +230,7 @@ def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) ->
         if chosen["between"] == "hold" and len(used) > 1:
             raise reader.make_error("slow", "is one sensor for between='hold'", used)
     inverse = reader.read_choice("inverse", INVERSES[0], INVERSES)
-    delay = reader.read_choice("delay", row.delay, RULES)
+    delay = reader.read_choice("delay", row.delay, tuple(RULES))
     if delay in ("literal", "lag") and "camera" not in used:
         raise reader.make_error("delay", "needs the camera for tie-vision's rules", delay)
     if delay == "constant":

@@ -125,9 +125,10 @@ def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]
 
 
 def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
-    """Allocate zeros for gains (cells of speed, rows, columns); (1, 1, 1) where P gives them."""
+    """Allocate zeros for gains (cells of speed, rows, columns); a one where P gives them."""
     cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
-    return np.zeros((cells, *_compute_table_shape(f, schedule)) if f.periodic else (1, 1, 1))
+    shape = cells, *_compute_table_shape(f, schedule)
+    return np.zeros(shape) if f.periodic else np.ones((1, 1, 1))
 
 
 def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> FilterRecords:
