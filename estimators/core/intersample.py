@@ -10,7 +10,7 @@ last innovation from a table. In a table of gains the rows K^T between samples b
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, Vector, maximum
-from .covariance import apply_transition, correct_scalar, dot, predict_measurement, project_row
+from .covariance import correct_scalar, dot, predict_measurement, project_row
 from .innovation import compute_sample_variance
 from .record import FilterRecord, GainTables
 
@@ -54,13 +54,6 @@ def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     first_row = locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
         add_gain(f, gains, first_row + i, f.innovation[i])
-
-
-@inline
-def predict_error(f: FilterRecord) -> None:
-    """Predict the estimated error by a step."""
-    if f.intersample_rule == PSEUDO:
-        apply_transition(f, f.e)
 
 
 @inline

@@ -9,13 +9,7 @@ from typing import NamedTuple
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.primitives import Scalar, Vector, maximum
 from ...envs.record import PACKET
-from .covariance import (
-    apply_transition,
-    correct_scalar,
-    dot,
-    predict_measurement,
-    project,
-)
+from .covariance import apply_transition, correct_scalar, dot, predict_measurement, project
 from .model import PSI, compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 

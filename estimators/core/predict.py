@@ -8,17 +8,9 @@ from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minim
 from ...envs.record import FAST
 from .covariance import apply_transition, predict_covariance
 from .innovation import MAX_SURPRISE, note_surprise
-from .intersample import predict_error
+from .intersample import PSEUDO
 from .late_samples import predict_late
-from .model import (
-    BETA,
-    MIN_SPEED,
-    SPEED_TOLERANCE,
-    VELOCITY,
-    build_model,
-    expand,
-    is_finite,
-)
+from .model import BETA, MIN_SPEED, SPEED_TOLERANCE, VELOCITY, build_model, expand, is_finite
 from .record import COUNTERS, N_SLOW, FilterRecord
 
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
@@ -141,7 +133,8 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
     if f.tyre_states > 0 and f.tick % f.linearise_every == 0:
         expand(f, u[0])
     propagate(f, u)
-    predict_error(f)
+    if f.intersample_rule == PSEUDO:
+        apply_transition(f, f.e)
     predict_late(f)
 
 
