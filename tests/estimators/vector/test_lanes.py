@@ -13,7 +13,7 @@ from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.late_samples import RULES
-from sideslip.estimators.core.record import FILTER
+from sideslip.estimators.core.record import FILTER, N_CORE, N_TOTAL
 from sideslip.estimators.vector.batch import BLOCK, _read_shape
 from sideslip.estimators.vector.lanes import MIN_LANES
 from tests.estimators.dense import WITH_TYRES
@@ -154,7 +154,10 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     copies = [batch, copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
     for array in (many, *(each.filters for each in copies), *(each._lanes for each in copies)):
         assert array.dtype.itemsize % 64 == 0 and array.ctypes.data % 64 == 0
-    for kind, names in ((BLOCK, ("x", "P", "GT", "row")), (FILTER, ("x", "P"))):
+    by_state = [
+        name for name in FILTER.names or () if FILTER[name].shape[-1:] in ((N_CORE,), (N_TOTAL,))
+    ]
+    for kind, names in ((BLOCK, ["x", "P", "GT", "row"]), (FILTER, by_state)):
         assert kind.fields is not None
         assert all(kind.fields[name][1] % 64 == 0 for name in names)
 
