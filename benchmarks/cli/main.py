@@ -13,11 +13,11 @@ from rich.table import Table
 
 from ... import __version__
 from ...envs.validation import check_choice
-from .. import SALTED, SUITES, Request, run_suites
 from ..harness.parallel import report_user_errors, use_engine
 from ..harness.results import check_writable
 from ..report.html import check_page, write_page
 from ..report.tables import print_suite
+from ..suites import SALTED, SUITES, Request, run_suites
 from . import common, data, live, policies  # noqa: F401  # they register their commands
 from .common import File, Text, Texts, app, register, take, take_argument
 from .names import KINDS

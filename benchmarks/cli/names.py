@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 
 from ...envs.validation import check_choice
-from .. import SUITES
+from ..suites import SUITES
 
 _ENVIRONMENTS = {
     "YawVision": "camera every 33 ms, 30 ms late",

@@ -235,7 +235,10 @@ def _format_explorer(explorer: Explorer) -> str:
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
-        "panels": [{"label": x, "lines": list(map(list, y))} for x, y in explorer.panels.items()],
+        "panels": [
+            {"label": label, "lines": [list(line) for line in lines]}
+            for label, lines in explorer.panels.items()
+        ],
         "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
         "colours": {key[-1]: find_colour(key[-1]) for key in explorer.cells},
         "cells": cells,

@@ -1,8 +1,8 @@
 """One env-step on packed numbers: layout, reset, tick, step, outputs; batch and lanes.
 
-`layout` names every number of a packed car, `config` packs a scenario into them, `tick` is one
-millisecond, `step` one env-step of one car, `outputs` its packets and observation, `batch` the step
-of many cars, side by side in SIMD registers.
+`layout` names every number of a packed car and has the views of an episode, `config` packs a
+scenario into them, `tick` is one millisecond, `step` one env-step of one car, `outputs` its packets
+and observation, `batch` the step of many cars, side by side in SIMD registers.
 
 Args:
     row: `EpisodeArrays` of an episode, read and written; those of a block have one axis more.

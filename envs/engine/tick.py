@@ -215,8 +215,10 @@ def _update_tyres(
         left, right = (params.car.mu * factor,), (params.car.mu_r * factor,)  # fields 10 and 19
         car = CarParams(*(car[:10] + left + car[11:19] + right + car[20:]))
         start = compute_tyre_load(state.drive, car, variant)
-    present = (start, state.driver, car)  # fields 2 to 4
-    return StepState(*(state[:2] + present + state[5:]))
+    return StepState(
+        state.motion, state.drive, start, state.driver, car, state.refs, state.nominal_motion,
+        state.errors,
+    )  # fmt: skip
 
 
 @inline

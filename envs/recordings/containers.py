@@ -339,7 +339,7 @@ def _read_bag(path: Path, mapping: Mapping[str, str]) -> LogTable:
         if missing := [topic for topic in fields if topic not in topics]:
             raise ValueError(f"no topic {missing[0]!r}; the bag has {join_names(topics)}")
         used = [connection for connection in reader.connections if connection.topic in fields]
-        decoders = {connection.id: _make_decoder(connection) for connection in used}
+        decoders = {x.id: _make_decoder(x) for x in used if x.msgcount}  # the others define nothing
         for connection, logged, data in reader.messages(used) if used else ():
             message = decoders[connection.id](data)
             stamp = getattr(getattr(message, "header", None), "stamp", None)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks import SUITES
 from sideslip.benchmarks.cli import main as cli
 from sideslip.benchmarks.cli.common import show_episode
 from sideslip.benchmarks.cli.names import KINDS, complete
@@ -22,6 +21,7 @@ from sideslip.benchmarks.control.calibration import (
     _read_calibration,
 )
 from sideslip.benchmarks.control.tasks import list_scored_tasks
+from sideslip.benchmarks.suites import SUITES
 from tests.benchmarks.conftest import Run
 
 LQR = ("run", "--agent", "lqr", "--estimator", "exact-kf")
@@ -105,7 +105,7 @@ def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None
 def test_bench_without_a_name_runs_all_suites(run: Run, monkeypatch: Any) -> None:
     names: list[str] = []
 
-    def run_suites(some: list[str], request: Any, comparison: Any) -> list[Any]:
+    def run_suites(some: list[str], request: Any, study: Any) -> list[Any]:
         names.extend(some)
         return []
 

@@ -12,7 +12,7 @@ import pytest
 import sideslip
 from sideslip.agents.learned.network import SUFFIX
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import SALTED, SUITES, Request, readme, run_suites
+from sideslip.benchmarks import readme
 from sideslip.benchmarks.control import calibration, run, tasks
 from sideslip.benchmarks.control.entries import ControlCase, Entry
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, measure
@@ -26,6 +26,7 @@ from sideslip.benchmarks.control.tasks import (
     make_tuning_seeds,
 )
 from sideslip.benchmarks.report import study
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suites
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}

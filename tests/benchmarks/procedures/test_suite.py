@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("vehiclemodels")
-from sideslip.benchmarks import SUITES, Request
 from sideslip.benchmarks.procedures import fmvss126, outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID, ProcedureCase
 from sideslip.benchmarks.report.tables import format_columns
+from sideslip.benchmarks.suites import SUITES, Request
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 

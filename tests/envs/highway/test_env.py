@@ -213,6 +213,10 @@ def test_what_is_out_of_place_is_refused(changes: dict[str, Any], words: str) ->
         made(**changes)
 
 
+def test_steering_is_added_where_it_is_asked_for() -> None:
+    assert made(steering=True).action_space.shape == (2,)
+
+
 def test_without_highway_env_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("highway_env", "highway_env.road.lane"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -113,6 +113,7 @@ def test_wrap_takes_whole_turns_away(angle: float) -> None:
     turns = (angle - wrapped) / (2.0 * PI)
     assert abs(turns - round(turns)) <= slack
     assert wrapped == angle or abs(angle) >= PI - slack
+    assert functions.wrap(PI) == -PI
 
 
 def test_smoothstep_is_the_c1_cubic() -> None:

@@ -212,6 +212,22 @@ def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicl
         moved = second_layer(x + step[:4], u + step[4:], gamma, vehicle) - start
         expected = model.A @ step[:4] + model.B @ moved[4:]
         np.testing.assert_allclose(moved[:4], expected, rtol=0.0, atol=1e-11)  # rates up to 100
+    body = make_roll_model(vehicle)
+    names = ("phi", "phi_dot"), ("a_y",), ("phi_dot",)
+    assert (body.states, body.inputs, body.outputs) == names and body.C.tolist() == [[0.0, 1.0]]
+
+
+def test_slip_cannot_be_seen_from_the_wheels_alone_at_zero_yaw_rate() -> None:
+    """double-layer-gps, 5.2: the kinematic observer is blind there, the second layer is not."""
+
+    def rank(gamma: float, states: int, outputs: int) -> int:
+        model = make_velocity_roll_model(COMS, gamma)
+        A, C = model.A[:states, :states], model.C[:outputs, :states]
+        powers = [np.linalg.matrix_power(A, k) for k in range(states)]
+        return int(np.linalg.matrix_rank(np.vstack([C @ power for power in powers])))
+
+    assert (rank(0.0, 2, 1), rank(0.1, 2, 1)) == (1, 2)  # v_x and v_y by the wheels alone
+    assert rank(0.0, 4, 3) == 4
 
 
 @pytest.mark.parametrize("name", MODELS)
