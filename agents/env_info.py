@@ -77,7 +77,7 @@ class EnvFacts:
         return tuple(entry.name for entry in self.layout)
 
 
-@dataclass
+@dataclass(frozen=True)
 class EnvView:
     """The spaces and facts of a vector environment, from which an agent is built elsewhere.
 
@@ -90,10 +90,30 @@ class EnvView:
     single_observation_space: gym.Space[npt.NDArray[np.float32]]
     single_action_space: gym.Space[npt.NDArray[np.float32]]
 
-    def __post_init__(self) -> None:
-        self.unwrapped, self.layout, self.nominal = self, self.facts.layout, self.facts.nominal
-        spaces = self.single_observation_space, self.single_action_space
-        self.observation_space, self.action_space = (batch_space(x, self.num_envs) for x in spaces)
+    @property
+    def unwrapped(self) -> "EnvView":
+        """The view itself, which has no wrappers."""
+        return self
+
+    @property
+    def observation_space(self) -> gym.Space[npt.NDArray[np.float32]]:
+        """Observation space of all rows."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def action_space(self) -> gym.Space[npt.NDArray[np.float32]]:
+        """Action space of all rows."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def layout(self) -> tuple[ObservationEntry, ...]:
+        """Entries of the observation: names, units and bounds."""
+        return self.facts.layout
+
+    @property
+    def nominal(self) -> Vehicle:
+        """The car as controllers know it."""
+        return self.facts.nominal
 
 
 def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:

@@ -172,16 +172,16 @@ def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
 
 
 @jit
-def integrate_antiwindup(integral: Scalar, step: Scalar, output: Scalar, limited: Scalar) -> Scalar:
+def integrate_antiwindup(integral: Scalar, step: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
     """Integrate a step, unless it would push the output further past its limit.
 
     Args:
         integral: Integral before the step.
         step: Increment of the integral.
-        output: Output before its limits.
+        raw: Output before its limits.
         limited: Output within its limits.
     """
-    if output == limited or (output > limited) != (step > 0.0):
+    if raw == limited or (raw > limited) != (step > 0.0):
         return integral + step
     return integral
 

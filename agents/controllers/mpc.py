@@ -281,8 +281,8 @@ def _prepare_prediction(
     a_x = (T_l + T_r) / (car.m * car.r)
     per_force = 1.0 / per[0], 1.0 / per[1]
     K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
-    T = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
-    return PredictionTask(model, start, car, driver, a_x, steady, max_moment, K, T, design.blocks)
+    end = _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
+    return PredictionTask(model, start, car, driver, a_x, steady, max_moment, K, end, design.blocks)
 
 
 @jit

@@ -336,10 +336,8 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         raise ValueError(f"{path} is no checkpoint of this format ({_FORMAT})")
     checkpoint = from_json(Checkpoint, state, f"{path}: the checkpoint")
     if checkpoint.sideslip != __version__:
-        text = (
-            f"{path} was made by sideslip {checkpoint.sideslip}, this is {__version__}, whose cars"
-        )
-        raise ValueError(f"{text} and costs may be others: train anew, in another folder")
+        text = f"{path} was made by sideslip {checkpoint.sideslip}, this is {__version__}"
+        raise ValueError(f"{text}, whose cars and costs may be others: train anew, elsewhere")
     task = from_json(TrainingTask, checkpoint.task, f"{path}: the task")
     try:
         check_names_no_code(task.env_id, task.estimator, task.estimator_options)

@@ -26,9 +26,10 @@ from ..learned.layers import MovingAverages
 from ..learned.network import Network
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
+from ..vec_env import Observations
 from .config import DistillConfig
 from .export import convert_cells, mix_inputs
-from .normalise import Single, Standardisation, compute_scale, compute_whitening
+from .normalise import Standardisation, compute_scale, compute_whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import Tensor, nn  # isort: skip
@@ -55,11 +56,11 @@ _MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, fo
 class Demonstrations(NamedTuple):
     """Episodes of a task, oldest step first."""
 
-    obs: Single  # observations, shape (N, T, k)
-    labels: Single  # the teacher's actions, shape (N, T, m)
-    privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
-    weights: Single  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
-    curvature: Single  # S (m, m), of the cost-to-go: an action's error e adds e'S e
+    obs: Observations  # observations, shape (N, T, k)
+    labels: Observations  # the teacher's actions, shape (N, T, m)
+    privileged: Observations  # the teacher's inputs that the observations lack, shape (N, T, q)
+    weights: Observations  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
+    curvature: Observations  # S (m, m), of the cost-to-go: an action's error e adds e'S e
     costs: Array  # costs J, shape (N,)
 
     @property

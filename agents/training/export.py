@@ -115,9 +115,8 @@ def _find_actor(policy: Any) -> _Actor:
     _check_known(type(policy))
     if hasattr(policy, "mlp_extractor"):  # on-policy
         layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
-        options = ("bidirectional", "proj_size", "batch_first")
-        if recurrent and (any(getattr(recurrent, x) for x in options) or not recurrent.bias):
-            raise ValueError(f"recurrent layers with further arguments are not known: {recurrent}")
+        if recurrent and recurrent.batch_first:
+            raise ValueError(f"recurrent layers take steps before rows, not {recurrent}")
         squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
         return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
     if not hasattr(policy, "actor"):  # a `GruPolicy`
@@ -131,13 +130,16 @@ def _find_actor(policy: Any) -> _Actor:
 
 
 def convert_cells(module: nn.RNNBase | None) -> list[MemoryLayer]:
-    """Convert the cells of a module of `TORCH_CELLS`; none for None.
+    """Convert the cells of a module of `TORCH_CELLS`; ValueError for any other, none for None.
 
     Args:
         module: Module, one direction of plain cells.
     """
     if module is None:
         return []
+    is_plain = module.bias and not (module.bidirectional or module.proj_size)
+    if type(module) not in TORCH_CELLS or not is_plain:
+        raise ValueError(f"recurrent layers with further arguments are not known: {module}")
     cell = TORCH_CELLS[type(module)]
     return [cell(*map(_to_array, weights)) for weights in module.all_weights]
 

@@ -22,7 +22,6 @@ with require_extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-Single = npt.NDArray[np.float32]
 Row = list[float] | Array  # JSON has lists
 
 CLIP = 10.0  # limit of a standardised entry (standard deviations)
@@ -39,7 +38,7 @@ class Standardisation(NamedTuple):
     clip: float | None  # limit (standard deviations), None for none
     mixing: list[list[float]] | Array | None = None  # shape (k, k), None for none
 
-    def transform(self, observations: Single) -> Single:
+    def transform(self, observations: Observations) -> Observations:
         """Standardise and mix observations, shape (..., k), as `Standardised` does.
 
         Args:
@@ -47,7 +46,7 @@ class Standardisation(NamedTuple):
         """
         mean, scale = np.array(self.mean, np.float32), np.array(self.scale, np.float32)
         limit = math.inf if self.clip is None else self.clip
-        z: Single = np.clip((observations - mean) * scale, -limit, limit)
+        z: Observations = np.clip((observations - mean) * scale, -limit, limit)
         return z if self.mixing is None else z @ np.array(self.mixing, np.float32)
 
 

@@ -1,7 +1,8 @@
 """What no estimator can do better: the least error, and which constant errors cannot be seen.
 
 The least error is the covariance of the optimal filter of the true, linear model (small angles,
-linear tyres, speed held); deterministic wind and biases do not change it. A direction v of the
+linear tyres, speed held), which knows vehicle, noise and the disturbances' statistics;
+deterministic wind and biases do not change it. A direction v of the
 states is unobservable where C F^k v = 0 for all k: no filter parts its states but by their priors.
 """
 

@@ -13,7 +13,7 @@ Args:
     i: Index of a row of its measurement, or of a fast measurement.
     row: Row of C, shape (n,).
     captured: Captured tick of a sample.
-    target: What a sample measures: its first clone, or DIRECT, DROPPED, PREDICTED, WEIGHED.
+    target: What a sample measures: its first clone, or a code of `late_samples`.
     k: Row of the present table of gains.
     residual: Measurement minus its prediction.
     fast_row: Fast row, shape (FAST_WIDTH,).

@@ -26,7 +26,7 @@ class DelayRule(NamedTuple):
 
     late: int = DROPPED  # what a sample measures that was captured before this tick
     fresh: int = DIRECT  # what one of this tick does
-    max_age: int = 1 << 62  # ticks from which one is refused
+    max_age: int = 1 << 62  # ticks from which one is refused; beyond any drive: none is
     snapshots: int = 0  # states of the past, which is redone
 
 

@@ -17,7 +17,7 @@ from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
 FIXED, LATERAL, VELOCITY = range(3)  # kinds: what makes A and B anew: nothing, speed, yaw rate
 BETA, GAMMA, PSI, Y_L = range(4)  # places of a bicycle's states
-CURVATURE = 2  # place of the road's curvature among a bicycle's inputs
+CURVATURE = 2  # place of the road's curvature among a bicycle's inputs; others have no third
 MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
 # limits of the estimated factors on the stiffness and of the reciprocal of friction
@@ -166,7 +166,7 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
 
 
 @jit
-def expand(f: FilterRecord, steer: Scalar) -> None:
+def rebuild_model(f: FilterRecord, steer: Scalar) -> None:
     """Build the model of estimated tyres at the present state."""
     linearise(f, steer)
     f.felt[f.accel_scale_state] = 0.0

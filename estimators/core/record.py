@@ -173,11 +173,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     # the rule for late samples: codes stand in `late_samples`, and in `intersample`
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
-    (
-        "first_clone",
-        _INT,
-        (N_SLOW,),
-    ),  # where its clones start in x; 0, WEIGHED: it has none
+    ("first_clone", _INT, (N_SLOW,)),  # where its clones start in x; 0 or WEIGHED: it has none
     ("stored", _INT),  # states whose predictions are stored; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains

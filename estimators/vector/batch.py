@@ -345,8 +345,9 @@ class BatchedRecords:
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """Make the specs of some rows' estimators."""
-        names = ("nominal", "slow_sensors", "held_speed", "scenario")
-        columns = {name: getattr(self._env, name) for name in names if hasattr(self._env, name)}
+        names = ["nominal", "slow_sensors", "held_speed"]
+        names += ["scenario"] * hasattr(self._env, "scenario")  # a foreign env has none
+        columns = {name: getattr(self._env, name) for name in names}
         cars = ({name: values[i] for name, values in columns.items()} for i in rows)
         return [make_spec(SimpleNamespace(**car)) for car in cars]
 

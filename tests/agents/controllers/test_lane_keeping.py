@@ -50,6 +50,16 @@ def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> Non
         assert np.abs(np.linalg.eigvals(G - B @ K)).max() < 1.0
 
 
+def test_a_period_longer_than_the_curvatures_filter_does_not_diverge() -> None:
+    env = gym.make("sideslip/YawVisionUneven-v0", steering=True, control_period=1000)
+    env = EstimateObservation(env, "uneven-delay-kf", outputs=OUTPUTS)
+    agent = LaneKeeping(env)
+    _, memory = agent.predict(observe(env))
+    for _ in range(50):
+        _, memory = agent.predict(observe(env, gamma_hat=0.1), memory)
+    assert memory[0, 1] == pytest.approx(0.1 / 7.0)
+
+
 def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
     """The integral leaves no offset; the car turns with the road."""
     d, speed, kappa = len(LANE_MOVED), 7.0, 0.02

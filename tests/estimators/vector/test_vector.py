@@ -161,6 +161,9 @@ def test_masks_and_other_scenarios_tell_the_filters(make: Any, mode: str) -> Non
         one = alone.reset(seed=k, options=dict(options))
         same(one, together.reset(seed=k, options=dict(options)))
     assert drive_both(alone, together, 30) > 3
+    options = {"scenario": "uneven-delay-fig5", "duration": 0.08}  # of all rows
+    same(alone.reset(seed=9, options=dict(options)), together.reset(seed=9, options=options))
+    assert drive_both(alone, together, 20) > 1
 
 
 @pytest.mark.parametrize(
