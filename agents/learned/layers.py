@@ -228,22 +228,25 @@ def step_layer(
     n = len(out)
     a, b = np.empty(_GATES[code] * n), np.empty(_GATES[code] * n)
     end = _compute_gates(z, memory[:n], numbers, offset, a, b)
-    for i in range(n):
-        out[i] = memory[i] = _update_unit(code, a, b, memory, n, i)
+    _update_units(code, a, b, memory, n)
+    out[:] = memory[:n]
     return end
 
 
 @jit
-def _update_unit(code: int, a: Vector, b: Vector, h: Vector, n: int, i: int) -> Scalar:
-    """Compute the output of recurrent unit i of n, by its gates' sums of input, a, and state, b."""
+def _update_units(code: int, a: Vector, b: Vector, h: Vector, n: int) -> None:
+    """Update recurrent outputs h[:n] by their gates' sums of input, a, and of state, b."""
     if code == GRU:
-        reset, update = _sigmoid(a[i] + b[i]), _sigmoid(a[n + i] + b[n + i])
-        candidate = _tanh(a[2 * n + i] + reset * b[2 * n + i])
-        return (1.0 - update) * candidate + update * h[i]
-    enter, forget = a[i] + b[i], a[n + i] + b[n + i]
-    candidate, leave = a[2 * n + i] + b[2 * n + i], a[3 * n + i] + b[3 * n + i]
-    h[n + i] = _sigmoid(forget) * h[n + i] + _sigmoid(enter) * _tanh(candidate)
-    return _sigmoid(leave) * _tanh(h[n + i])
+        for i in range(n):
+            reset, update = _sigmoid(a[i] + b[i]), _sigmoid(a[n + i] + b[n + i])
+            candidate = _tanh(a[2 * n + i] + reset * b[2 * n + i])
+            h[i] = (1.0 - update) * candidate + update * h[i]
+    elif code == LSTM:
+        for i in range(n):
+            enter, forget = a[i] + b[i], a[n + i] + b[n + i]
+            candidate, leave = a[2 * n + i] + b[2 * n + i], a[3 * n + i] + b[3 * n + i]
+            h[n + i] = _sigmoid(forget) * h[n + i] + _sigmoid(enter) * _tanh(candidate)
+            h[i] = _sigmoid(leave) * _tanh(h[n + i])
 
 
 @jit
