@@ -116,7 +116,7 @@ def _find_actor(policy: Any) -> _Actor:
     if hasattr(policy, "mlp_extractor"):  # on-policy
         layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
         if recurrent and recurrent.batch_first:
-            raise ValueError(f"recurrent layers take steps before rows, not {recurrent}")
+            raise ValueError(f"recurrent layers with further arguments are not known: {recurrent}")
         squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
         return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
     if not hasattr(policy, "actor"):  # a `GruPolicy`
