@@ -166,7 +166,7 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
 
 
 @jit
-def build_tyre_model(f: FilterRecord, steer: Scalar) -> None:
+def build_tyres(f: FilterRecord, steer: Scalar) -> None:
     """Build the model of estimated tyres at the present state."""
     linearise(f, steer)
     f.felt[f.accel_scale_state] = 0.0

@@ -10,15 +10,7 @@ from .covariance import apply_transition, predict_covariance
 from .innovation import MAX_SURPRISE, note_surprise
 from .intersample import PSEUDO
 from .late_samples import predict_late
-from .model import (
-    BETA,
-    MIN_SPEED,
-    SPEED_TOLERANCE,
-    VELOCITY,
-    build_model,
-    build_tyre_model,
-    is_finite,
-)
+from .model import BETA, MIN_SPEED, SPEED_TOLERANCE, VELOCITY, build_model, build_tyres, is_finite
 from .record import COUNTERS, N_SLOW, FilterRecord
 
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
@@ -139,7 +131,7 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
     if f.beta_scale != 1.0:
         _scale_beta(f)
     if f.tyre_states > 0 and f.tick % f.linearise_every == 0:
-        build_tyre_model(f, u[0])
+        build_tyres(f, u[0])
     propagate(f, u)
     if f.intersample_rule == PSEUDO:
         apply_transition(f, f.e)
