@@ -26,7 +26,6 @@ from ..learned.layers import MovingAverages
 from ..learned.network import Network
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from ..vec_env import Observations
 from .config import DistillConfig
 from .export import convert_cells, mix_inputs
 from .normalise import Standardisation, compute_scale, compute_whitening
@@ -41,6 +40,8 @@ _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
 _WINDOW = 50  # steps through which the gradient goes back in time, but for traces
 _SAMPLES = 512  # steps of a batch of a student without memory
 _LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
+Single = npt.NDArray[np.float32]
+
 _CLIP = 8.0  # limit of a normalised input (standard deviations)
 _UNREAD = ("gps_X", "gps_Y", "gps_satellites")  # without information for control
 # Beginnings of entries that a filter has read: behind it they would only shake the action.
@@ -56,11 +57,11 @@ _MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, fo
 class Demonstrations(NamedTuple):
     """Episodes of a task, oldest step first."""
 
-    obs: Observations  # observations, shape (N, T, k)
-    labels: Observations  # the teacher's actions, shape (N, T, m)
-    privileged: Observations  # the teacher's inputs that the observations lack, shape (N, T, q)
-    weights: Observations  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
-    curvature: Observations  # S (m, m), of the cost-to-go: an action's error e adds e'S e
+    obs: Single  # observations, shape (N, T, k)
+    labels: Single  # the teacher's actions, shape (N, T, m)
+    privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
+    weights: Single  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
+    curvature: Single  # S (m, m), of the cost-to-go: an action's error e adds e'S e
     costs: Array  # costs J, shape (N,)
 
     @property

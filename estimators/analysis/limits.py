@@ -2,8 +2,8 @@
 
 The least error is the covariance of the optimal filter of the true, linear model (small angles,
 linear tyres, speed held), which knows vehicle, noise and the disturbances' statistics;
-deterministic wind and biases do not change it. A direction v of the
-states is unobservable where C F^k v = 0 for all k: no filter parts its states but by their priors.
+deterministic wind and biases do not change it. A direction v of the states is unobservable where
+C F^k v = 0 for all k: no filter parts its states but by their priors.
 """
 
 import itertools

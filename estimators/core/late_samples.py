@@ -164,7 +164,7 @@ def find_target(f: FilterRecord, s: int, captured: int) -> int:
     elif captured < f.tick and f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
         slot = frame % f.frames[s]
         f.stamp[s, slot] = -1
-        target = f.first_clone[s] + slot * f.rows[s]
+        target = f.first_clone[s] + slot * f.rows[s]  # of LARSEN's one frame, WEIGHED
     if target == DROPPED:
         f.counts[COUNTERS.refused] += 1
     else:

@@ -15,9 +15,31 @@ from ..core.late_samples import RULES
 from ..core.model import LATERAL
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
-from . import options as tables
 from .gains import DUAL_RATE_GAINS, DUAL_RATE_RULES, INVERSES, check_covariance
-from .options import BIASES, FIND, SCALE, STATES, TYRES, FilterConfig, FilterModel, NumberRule
+from .options import (
+    BIASES,
+    COURSE_SPEED,
+    FAST_CHANNELS,
+    FIND,
+    INERTIAL,
+    LATE,
+    MEASUREMENTS,
+    MODELS,
+    NOISE,
+    NOT_NEGATIVE,
+    NUMBER,
+    OPTIONS,
+    POSITIVE,
+    SCALE,
+    STATES,
+    TUNINGS,
+    TYRES,
+    WANDER,
+    FilterConfig,
+    FilterModel,
+    NumberRule,
+    select_states,
+)
 
 _GATE_PROBABILITY = 1.0 - 1e-9
 _MAX_LATENCY = 0.5  # s, largest latency that may be configured
@@ -54,7 +76,7 @@ class _Reader:
         """Read options that are numbers or flags, by their defaults and limits."""
         values: _Values = {}
         for key in keys:
-            about, usual = tables.OPTIONS[key].metadata, tables.OPTIONS[key].default
+            about, usual = OPTIONS[key].metadata, OPTIONS[key].default
             value = self.read_raw(key, usual if default is None else default)
             limits, unit = about["limits"], about["unit"]
             if value is not None or usual is not None:
@@ -126,17 +148,17 @@ def parse_config(
         chosen |= {"disturbances": disturbances} | reader.read("steer_rate")
         first = _make_bicycle_model(used, chosen, rolls=chosen["fast"] != row.fast)
     else:
-        first = tables.MODELS[row.model]
-    layers = (first, tables.MODELS[row.second]) if row.second else (first,)
+        first = MODELS[row.model]
+    layers = (first, MODELS[row.second]) if row.second else (first,)
     states = [state for model in layers for state in model.names]
     if chosen["poles"] and len(chosen["poles"]) != len(states):
         text = f"are one for each of {', '.join(states)}"
         raise reader.make_error("poles", text, chosen["poles"])
-    rows = [row for sensor in tables.MEASUREMENTS.values() for row in sensor.rows]
+    rows = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
     growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in options]
     noise = {
-        key.removesuffix("_noise"): reader.read_number(key, sd, tables.POSITIVE)
-        for key, sd in tables.NOISE.items()
+        key.removesuffix("_noise"): reader.read_number(key, sd, POSITIVE)
+        for key, sd in NOISE.items()
     }
     if _DISTURBANCES & {*states}:
         chosen |= reader.read("leak")
@@ -145,7 +167,7 @@ def parse_config(
         chosen |= reader.read("force_share", "moment_share")
     if first.forces and TYRES[0] in states:
         chosen |= reader.read("model_error")
-    Q = _parse_covariance(states, tables.TUNINGS.get((name, ",".join(used)), {}), reader)
+    Q = _parse_covariance(states, TUNINGS.get((name, ",".join(used)), {}), reader)
     chosen |= {"noise": noise, "hdop_table": _parse_hdop_table(row, reader)}
     count = int(reader.read("wary")["wary"])
     wary = count if chosen["delay"] in ("clone", "buffer") else 0
@@ -154,16 +176,16 @@ def parse_config(
     chosen["latency"] = _parse_latency(reader, bool(used) and TYRES[0] in states)
     prior = _parse_prior(states, first.forces, chosen, reader)
     reader.check_unread()
-    chosen["noise_over_speed"] = {key: noise[key] * tables.COURSE_SPEED for key in growing}
+    chosen["noise_over_speed"] = {key: noise[key] * COURSE_SPEED for key in growing}
     chosen["sensors"] = {sensor: sensors[sensor] for sensor in used}
     return FilterConfig(name=name, row=row, models=layers, Q=Q, prior=prior, **chosen)
 
 
 def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) -> FilterModel:
     """Make the bicycle model with the states that slow sensors need; `rolls`: the body does."""
-    states = tables.select_states(sensors)
+    states = select_states(sensors)
     lags = chosen["delay"] in ("literal", "lag") and "camera" in sensors  # tie-vision (12)-(13)
-    late = tuple(tables.LATE[state] for state in states if lags and state in tables.LATE)
+    late = tuple(LATE[state] for state in states if lags and state in LATE)
     walking = tuple(pair for pair in _WALKS[chosen["disturbances"]] if pair[1] in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = chosen["disturbances"] == "forces", states + _BODY * rolls
@@ -248,13 +270,13 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
     """Parse the fast sensors, and the deviations and times of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return {"fast": row.fast, "bias_sds": {}}
-    value, known = reader.read_raw("fast", row.fast), tables.INERTIAL
+    value, known = reader.read_raw("fast", row.fast), INERTIAL
     words = list(value) if isinstance(value, list | tuple) else [value]
     fast = tuple(word for word in known if word in words)
     if len(fast) != len(words) or known[0] not in fast:
         raise reader.make_error("fast", f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
     biases = {
-        name: reader.read_number(f"{name}_sd", 0.0, tables.NOT_NEGATIVE, STATES[name].unit)
+        name: reader.read_number(f"{name}_sd", 0.0, NOT_NEGATIVE, STATES[name].unit)
         for name in BIASES
     }
     nominal = [name for name in TYRES if not biases[name] > 0.0]
@@ -268,9 +290,9 @@ def _parse_inertial(row: FilterDefinition, used: Sequence[str], reader: _Reader)
         option, usable = ("slow", used) if BIASES[name] in SLOW_NAMES else ("fast", fast)
         if BIASES[name] not in (*usable, ""):
             raise reader.make_error(f"{name}_sd", f"needs {BIASES[name]} among {option}", usable)
-        if name in tables.WANDER:
+        if name in WANDER:
             key = f"{name}_time"
-            times[name] = reader.read_number(key, 0.0, tables.NOT_NEGATIVE, "s")
+            times[name] = reader.read_number(key, 0.0, NOT_NEGATIVE, "s")
             if times[name] > 0.0 and f"q_{name}" in reader.passed:
                 text = f"q_{name} is not used beside {key}, {times[name]:g} s, and {name}_sd"
                 raise ValueError(f"{reader.name}: {text}")
@@ -283,8 +305,8 @@ def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]
     if not isinstance(value, Mapping):
         raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
     for channel in value:
-        if channel not in tables.FAST_CHANNELS:
-            expected = f"is of {', '.join(tables.FAST_CHANNELS)}"
+        if channel not in FAST_CHANNELS:
+            expected = f"is of {', '.join(FAST_CHANNELS)}"
             raise reader.make_error("latency", expected, dict(value))
     latencies: dict[str, float | str] = {}
     for channel, late in value.items():
@@ -320,7 +342,7 @@ def _parse_covariance(states: Sequence[str], tuning: Mapping[str, float], reader
         raise ValueError(f"{reader.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
     Q = np.diag(Q) if Q.ndim == 1 else Q
     for i, state in enumerate(states):
-        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]), tables.NUMBER)
+        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]), NUMBER)
     check_covariance(f"{reader.name}: Q", Q)
     return Q
 
