@@ -68,21 +68,19 @@ def draw_time_series(
         dots: Names that are drawn as dots, for packets with NaN between them.
         zero_line: Whether a line is drawn at zero, for errors.
     """
-    t = np.asarray(t, float)
-    figure = go.Figure()
-    for name, colour_and_dash in _choose_line_styles(series).items():
-        y = np.asarray(series[name], float)
+    t, lines = np.asarray(t, float), dict[str, tuple[Array, Array]]()
+    for name, values in series.items():
+        y = np.asarray(values, float)
         present = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
         x, y = t[present], y[present]
         shown = _find_peaks(y)
-        trace = _make_line(name, x[shown], y[shown], *colour_and_dash, name in dots)
-        if len(y) > 4 * POINTS and name not in (*dots, *FACTS):
-            trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
-        figure.add_trace(trace)
+        lines[name] = x[shown], y[shown]
+    width = 1.0 if len(t) > 4 * POINTS else 1.8  # a dense line is noisy: leave room for the others
+    figure = _draw_lines(lines, width=width, dots=dots)
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
     if zero_line:
         figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
-    return _finish(_sort_facts(figure), "time / s", unit_label, 380, hovermode="x unified")
+    return _finish(figure, "time / s", unit_label, 380, hovermode="x unified")
 
 
 def draw_curves(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> go.Figure:
@@ -94,11 +92,9 @@ def draw_curves(x: Array, series: Mapping[str, Array], x_label: str, y_label: st
         x_label: Quantity and unit of `x`.
         y_label: Quantity and unit of the values.
     """
-    figure = go.Figure()
-    for name, pen in _choose_line_styles(series).items():
-        trace = _make_line(name, np.asarray(x, float), np.asarray(series[name], float), *pen)
-        trace.mode = "lines+markers"
-        figure.add_trace(trace)
+    at = np.asarray(x, float)
+    lines = {name: (at, np.asarray(values, float)) for name, values in series.items()}
+    figure = _draw_lines(lines, "lines+markers")
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
@@ -108,13 +104,13 @@ def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
     Args:
         paths: Paths (x, y) (m) by name.
     """
-    figure = go.Figure()
-    for name, colour_and_dash in _choose_line_styles(paths).items():
-        x, y = (np.asarray(values, float) for values in paths[name])
+    lines = {}
+    for name, (x, y) in paths.items():
         shown = np.unique(np.linspace(0, len(y) - 1, min(len(y), POINTS)).round().astype(int))
-        figure.add_trace(_make_line(name, x[shown], y[shown], *colour_and_dash))
+        lines[name] = np.asarray(x, float)[shown], np.asarray(y, float)[shown]
+    figure = _draw_lines(lines)
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
-    return _finish(_sort_facts(figure), "x / m", "y / m", 400, hovermode="closest")
+    return _finish(figure, "x / m", "y / m", 400, hovermode="closest")
 
 
 def draw_groups(
@@ -160,17 +156,19 @@ def draw_groups(
     return figure
 
 
-def _make_line(
-    name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False
-) -> go.Scatter:
-    if dots:
-        return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
-    pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else 1.8}
-    return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
-
-
-def _sort_facts(figure: go.Figure) -> go.Figure:
-    """Sort the truth above the estimates; the legend names it first."""
+def _draw_lines(
+    lines: Mapping[str, tuple[Array, Array]], mode: str = "lines", width: float = 1.8,
+    dots: Collection[str] = (),
+) -> go.Figure:  # fmt: skip
+    """Draw places (x, y) by name, the truth above the others and thicker, first in the legend."""
+    figure = go.Figure()
+    for name, (colour, dash) in _choose_line_styles(lines).items():
+        x, y = lines[name]
+        pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else width}
+        look = {"mode": mode, "line": pen}
+        if name in dots:
+            look = {"mode": "markers", "marker": {"color": colour, "size": 4}}
+        figure.add_trace(go.Scatter(x=x, y=y, name=name, **look))
     figure.data = sorted(figure.data, key=lambda trace: trace.name in FACTS)
     figure.update_traces(legendrank=1, selector=lambda trace: trace.name in FACTS)
     return figure

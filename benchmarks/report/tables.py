@@ -84,11 +84,9 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
     """
     is_short = len(suites) <= _FEW
     for suite in suites:
-        _print_title(console, suite)
         lines = suite.headlines
-        if not is_short:
-            lines = lines[1:2] or lines  # a verdict's second line is the answer
-        console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
+        # a verdict's second line is the answer
+        _print_head(console, suite, lines if is_short else lines[1:2] or lines)
         shown = [table for table in suite.tables if not table.detail]
         for table in shown[: int(is_short)]:  # the first table of a short run, else none
             max_rows = _ROWS // len(suites)
@@ -104,11 +102,14 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
     console.print(f"{text} {where}.", highlight=False)
 
 
-def _print_title(console: Console, suite: Suite) -> None:
+def _print_head(console: Console, suite: Suite, lines: Sequence[str]) -> None:
+    """Print the title and some lines of the verdict."""
     if len(suite.title) + 4 <= console.width:
         console.rule(f"[bold]{escape(suite.title)}")
     else:  # a rule would cut it
         console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
+    if lines:
+        console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
 
 
 def print_suite(console: Console, suite: Suite) -> None:
@@ -118,9 +119,7 @@ def print_suite(console: Console, suite: Suite) -> None:
         console: Console to print to.
         suite: Results.
     """
-    _print_title(console, suite)
-    if suite.verdict:
-        console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
+    _print_head(console, suite, suite.headlines)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     shown = [table for table in suite.tables if not table.detail]
     for table in shown:
