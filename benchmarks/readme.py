@@ -39,8 +39,8 @@ from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, Suite, read_json, write_json, write_text
 from .harness.stats import Estimate, interval, ratio_of_roots
 from .papers import dakf_stability, double_layer, dual_rate, tie_vision, uneven_delay
-from .papers.ledger import PaperFilter
-from .papers.manoeuvres import EstimationSimulation
+from .papers.ledger import join_numbers
+from .papers.manoeuvres import EstimationSimulation, PaperFilter
 
 README, PAGE = Path("README.md"), Path("docs/results/benchmark.md")
 ROWS, TRANSFER = Path("docs/first.json"), Path("docs/procedures.json")
@@ -255,7 +255,7 @@ class _System:
         (drives,) = (x for x in self.simulations if x.name == self.task.scenario)
         paper_filters = [x for x in drives.filters if x.label == self.label]
         filters = (*paper_filters, _RECOMMENDED, _INFORMED)
-        numbers = replace(drives, filters=filters).measure(tuple(seeds)).numbers
+        numbers = join_numbers(list(replace(drives, filters=filters).run(seeds)))
         original, recommended, rival = (numbers[x.label, self.metric] for x in filters)
         return original, recommended, rival
 

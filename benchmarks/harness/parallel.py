@@ -84,16 +84,6 @@ def _call(function: Callable[[Case], Result], case: Case) -> Result:
     return function(case)
 
 
-def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
-    """Split the seeds 0 .. seeds-1 into runs of consecutive seeds.
-
-    Args:
-        seeds: Number of seeds.
-        size: Maximum of seeds in a run.
-    """
-    return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
-
-
 class Bar(progress.Progress):
     """A progress bar, or where none can be drawn a line on standard error every `_EVERY`.
 

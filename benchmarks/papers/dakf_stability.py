@@ -5,8 +5,8 @@ from functools import partial
 
 from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
-from .ledger import Analysis, Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import EstimationSimulation, FollowingSimulation
+from .ledger import Analysis, Claim, ClaimPart, compare
+from .manoeuvres import PAPER_TUNINGS, ControlSimulation, Driver, EstimationSimulation, PaperFilter
 
 PAPER = "dakf-stability"
 FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"
@@ -14,19 +14,25 @@ FIG7, LARGER, FIG9 = "dakf-fig7", "dakf-fig7-larger", "dakf-fig9"
 BIAS, RANKS = "dakf-bias", "dakf-rank"
 DAKF, KF, LOB = "dakf", "course-kf", "lob"
 WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no rejection"
-_ERRORS = ("rms_beta", "rms_gamma")
+_ERRORS = ("rms_slip_error", "rms_yaw_error")
 _GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 _ENV = "sideslip/YawGps-v0"
 _FILTERS = tuple(PaperFilter(name, name) for name in (DAKF, KF, LOB))
-_AGENTS = {WITHOUT: {"agent": "none"}, WITH: {}}
+_FOLLOWING = "model-following"
+_DRIVERS = {WITHOUT: Driver("none", DAKF), WITH: Driver(_FOLLOWING, DAKF)}
+_PARTLY = {FEEDBACK: Driver(_FOLLOWING, DAKF, {"rejection": False})}
+_BY_WIRE = "sideslip/AfsYawFusion-v0"
+_ESTIMATE = {
+    "outputs": ("beta", "gamma", "d1", "d2"), "options": {"slow": "gps"} | PAPER_TUNINGS[DAKF]
+}  # fmt: skip
 
 # fmt: off
 SIMULATIONS = (
-    FollowingSimulation(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
-    FollowingSimulation(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS,
-        share=0.25),
-    FollowingSimulation(FIG9, FIG9, _AGENTS, share=0.5),
+    ControlSimulation(FIG7, _BY_WIRE, FIG7, _DRIVERS | _PARTLY, _ESTIMATE),
+    ControlSimulation(LARGER, _BY_WIRE, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _DRIVERS,
+        _ESTIMATE, share=0.25),
+    ControlSimulation(FIG9, _BY_WIRE, FIG9, _DRIVERS, _ESTIMATE, share=0.5),
     EstimationSimulation(FIG6, _ENV, FIG6, _FILTERS),
     EstimationSimulation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
     EstimationSimulation(FIG8, _ENV, FIG8, _FILTERS),
@@ -69,10 +75,10 @@ CLAIMS = (
         "d1 and d2."),
     claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
         *_make_tracking_parts(FIG7, 0.80, 0.50),
-        compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_beta"),
-        ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
+        compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_slip"),
+        ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "full_command",
             metric="share"),
-        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
+        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "full_command", metric="share")),
     claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
         *(
             compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,

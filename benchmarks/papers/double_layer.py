@@ -4,8 +4,8 @@ from functools import partial
 
 from ...estimators.filters import FILTERS
 from ..harness.stats import Bound
-from .ledger import Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import EstimationSimulation
+from .ledger import Claim, ClaimPart, compare
+from .manoeuvres import EstimationSimulation, PaperFilter
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"

@@ -20,8 +20,8 @@ from ...envs.vehicle.linear import make_course_model, make_vision_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design import gains
 from ..harness.stats import Bound
-from .ledger import Analysis, Claim, ClaimPart, Numbers, PaperFilter, compare
-from .manoeuvres import EstimationSimulation
+from .ledger import Analysis, Claim, ClaimPart, Numbers, compare
+from .manoeuvres import EstimationSimulation, PaperFilter
 
 
 def _make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
@@ -79,8 +79,7 @@ def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[int]]) -> int:
     """Compute the rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D, for the continuous A."""
     # exact sampling cannot raise it, since e^(A T) keeps every A-invariant subspace, nor lower it
     # but for special sampling times
-    blocks = [np.full((len(C), len(A)), Fraction(0))]
-    blocks[0][:, : len(C[0])] += np.array(C)
+    blocks = [np.array(C) + Fraction(0)]
     for _ in range(len(A) - 1):
         blocks.append(blocks[-1] @ A)
     return _rank(np.concatenate(blocks))
@@ -105,8 +104,8 @@ def compute_coms_ranks(seed: int) -> Numbers:
     vision: Matrix = np.array([[Fraction(entry) for entry in row] for row in A])
     course = vision[:3, :3]
     models: dict[str, tuple[Matrix, list[list[int]]]] = {
-        "dakf": (_add_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
-        "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1]]),
+        "dakf": (_add_disturbances(course, 2), [[0, 1, 0, 0, 0], [1, 0, 1, 0, 0]]),  # gyro, course
+        "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1, 0, 0, 0]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
     return {(x, "rank"): float(_compute_observability_rank(*y)) for x, y in models.items()}

@@ -5,47 +5,19 @@ implementation: the median has to meet it, but it has no part in the verdict.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...envs.record import Array
-from ...estimators.design.options import read_tunings
-from ...estimators.estimator import Estimator
-from ...estimators.make import make_estimator
-from ...estimators.wrappers.estimate import make_spec
-from ..harness.drives import call_quietly, make_filter_arguments
 from ..harness.stats import Bound, Estimate
 
-if TYPE_CHECKING:
-    from ...envs.stability import StabilityEnv
-
-
-class Example(NamedTuple):
-    """Signals of the first seed, for figures."""
-
-    time: Array  # s, (K,)
-    curves: dict[str, dict[str, Array]]  # (K,) by subject (truth, reference, ...) and signal
-
-
-@dataclass
-class SimulationResult:
-    """The result of a simulation or an analysis."""
-
-    numbers: dict[tuple[str, str], Array]  # (seeds,) by subject and quantity
-    example: Example | None = None  # of the chunk with the first seed
-
-    def __add__(self, later: "SimulationResult") -> "SimulationResult":
-        """Join it with the result of later seeds."""
-        joint = {x: np.concatenate([self.numbers[x], later.numbers[x]]) for x in self.numbers}
-        return SimulationResult(joint, self.example or later.example)
-
-
-Results = Mapping[str, SimulationResult]  # by the name of the simulation or analysis
+Results = Mapping[str, Mapping[tuple[str, str], Array]]
+"""Numbers (seeds,) by subject and quantity, by the name of the simulation or analysis."""
 _MIN_AGREEMENT = 0.9  # of the seeds
+CHUNK = 5  # seeds of a simulation in one process
 
 
 @dataclass(frozen=True)
@@ -64,13 +36,20 @@ class ClaimPart:
     pick: Callable[..., Array] = np.min  # the best of the rivals; `np.max`: the poorest
     is_pooled: bool = False  # RMS values over all seeds together are divided
 
-    def _measure(self, results: Results) -> Array:
-        numbers = results[self.scenario].numbers
-        one = numbers[self.subject, self.quantity]
+    def measure(self, results: Results) -> "MeasuredPart":
+        """Measure the part.
+
+        Args:
+            results: Results of the part's simulation at least.
+        """
+        numbers = results[self.scenario]
+        values = numbers[self.subject, self.quantity]
         others = [numbers[rival, self.quantity] for rival in self.rivals]
         if self.is_pooled:
-            return np.array([np.sqrt(np.mean(one**2) / np.mean(others[0] ** 2))])
-        return np.asarray(one / self.pick(others, axis=0)) if others else one
+            values = np.array([np.sqrt(np.mean(values**2) / np.mean(others[0] ** 2))])
+        elif others:
+            values = values / self.pick(others, axis=0)
+        return MeasuredPart(self, values)
 
 
 def compare(
@@ -133,22 +112,13 @@ class Claim:
         self.paper, self.source, self.text = paper, source, text
         self.parts, self.note = parts, note
 
-    def measure(self, results: Results) -> "MeasuredClaim":
-        """Measure every part.
-
-        Args:
-            results: Results of all simulations that the parts name.
-        """
-        parts = tuple(MeasuredPart(part, part._measure(results)) for part in self.parts)
-        return MeasuredClaim(self, parts)
-
 
 @dataclass(frozen=True)
 class MeasuredClaim:
     """A claim with the numbers of its parts."""
 
     claim: Claim
-    parts: tuple[MeasuredPart, ...]
+    parts: Sequence[MeasuredPart]
 
     @property
     def source(self) -> str:
@@ -172,33 +142,54 @@ class MeasuredClaim:
 
 
 Numbers = dict[tuple[str, str], float | Array]  # of one seed, by subject and quantity
-Outcomes = Iterator[tuple[Numbers, Example | None]]  # numbers and signals, seed by seed
+
+
+class Example(NamedTuple):
+    """Signals of the first seed, for figures."""
+
+    time: Array  # s, (K,)
+    curves: dict[str, dict[str, Array]]  # (K,) by subject (truth, reference, ...) and signal
+
+
+class SeedResult(NamedTuple):
+    """What a seed gives."""
+
+    numbers: Numbers
+    example: Example | None = None
+
+
+def join_numbers(results: Sequence[SeedResult]) -> dict[tuple[str, str], Array]:
+    """Join the numbers of all seeds, shape (seeds,), or longer where one has several.
+
+    Args:
+        results: Results of a simulation, seed by seed.
+    """
+    lines = [result.numbers for result in results]
+    return {x: np.concatenate([np.atleast_1d(line[x]) for line in lines]) for x in lines[0]}
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation with a unique name; `_run` yields what each seed gives."""
+    """A simulation with a unique name."""
 
-    size: ClassVar[int] = 5  # seeds of a case
     name: str
     _: KW_ONLY
     share: float = 1.0  # of the seeds; 0: once; above 1 where a ratio is close to its threshold
 
-    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Measure numbers by subject and quantity, shape (seeds,) each, and the signals of seed 0.
-
-        Args:
-            seeds: Seeds of the case.
-        """
-        lines, example = list[Numbers](), None
-        for seed, (line, signals) in zip(seeds, self._run(seeds), strict=True):
-            lines.append(line)
-            example = signals if seed == 0 else example
-        numbers = {x: np.concatenate([np.atleast_1d(at[x]) for at in lines]) for x in lines[0]}
-        return SimulationResult(numbers, example)
-
-    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
+    def run(self, seeds: Iterable[int]) -> Iterator[SeedResult]:
+        """Run seeds: the numbers and signals of each."""
         raise NotImplementedError
+
+
+def run_simulation(case: tuple[Simulation, Sequence[int]]) -> list[SeedResult]:
+    """Run a simulation on some seeds; only seed 0 leaves its signals.
+
+    Args:
+        case: Simulation and seeds.
+    """
+    simulation, seeds = case
+    results = zip(seeds, simulation.run(seeds), strict=True)
+    return [result if seed == 0 else SeedResult(result.numbers) for seed, result in results]
 
 
 @dataclass(frozen=True)
@@ -207,38 +198,6 @@ class Analysis(Simulation):
 
     function: Callable[[int], Numbers]  # of a seed
 
-    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
-        return ((self.function(seed), None) for seed in seeds)
-
-
-PAPER_TUNINGS: dict[str, dict[str, float]] = {
-    entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
-    for entry in read_tunings(Path(__file__).with_name("tunings.toml"))
-}  # options by which a filter is tuned for its paper's simulation, by its name
-
-
-@dataclass(frozen=True)
-class PaperFilter:
-    """A filter of a simulation."""
-
-    label: str  # its name in tables
-    name: str  # of `make_estimator`
-    options: Mapping[str, Any] = field(default_factory=dict)  # of `make_estimator`
-    vehicle: str = "nominal"  # or "true", for which it is built
-
-
-def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[str, Estimator]:
-    """Make filters, tuned for their papers, for the running episode of an env.
-
-    Args:
-        filters: Filters of a simulation.
-        base: Env without wrappers, in an episode.
-    """
-    facts, present = make_filter_arguments(base), make_spec(base)
-    cars = {"nominal": present.vehicle, "true": present.replace_vehicle(base.vehicle).vehicle}
-    by_label = {}
-    for spec in filters:
-        options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}
-        facts["vehicle"] = cars[spec.vehicle]
-        by_label[spec.label] = call_quietly(make_estimator, spec.name, **facts | options)
-    return by_label
+    def run(self, seeds: Iterable[int]) -> Iterator[SeedResult]:
+        """Compute the numbers of each seed."""
+        return (SeedResult(self.function(seed)) for seed in seeds)

@@ -1,8 +1,10 @@
 """Filters and controllers over the papers' manoeuvres."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,31 +16,74 @@ from ...envs.record import PACKET, Array, Log
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.scenarios.scenario import Scenario
 from ...estimators.analysis.limits import compute_error_bound
-from ..harness.drives import SETTLED, make_env, make_filter_arguments
-from . import ledger
-from .ledger import Example, Numbers, Outcomes, PaperFilter, Simulation
+from ...estimators.design.options import read_tunings
+from ...estimators.estimator import Estimator
+from ...estimators.make import make_estimator
+from ...estimators.wrappers.estimate import make_spec
+from ..harness.drives import SETTLED, call_quietly, make_env, make_filter_arguments
+from .ledger import Example, Numbers, SeedResult, Simulation
 
 if TYPE_CHECKING:
-    from ...estimators.estimator import Estimator
+    from ...envs.stability import StabilityEnv
+
+BOUND = "the bound"
+PAPER_TUNINGS: dict[str, dict[str, float]] = {
+    entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
+    for entry in read_tunings(Path(__file__).with_name("tunings.toml"))
+}  # options by which a filter is tuned for its paper's simulation, by its name
+
+
+@dataclass(frozen=True)
+class PaperFilter:
+    """A filter of a simulation."""
+
+    label: str  # its name in tables
+    name: str  # of `make_estimator`
+    options: Mapping[str, Any] = field(default_factory=dict)  # of `make_estimator`
+    vehicle: str = "nominal"  # or "true", for which it is built
+
+
+def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[str, Estimator]:
+    """Make filters, tuned for their papers, for the running episode of an env.
+
+    Args:
+        filters: Filters of a simulation.
+        base: Env without wrappers, in an episode.
+    """
+    facts, present = make_filter_arguments(base), make_spec(base)
+    cars = {"nominal": present.vehicle, "true": present.replace_vehicle(base.vehicle).vehicle}
+    by_label = {}
+    for spec in filters:
+        options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}
+        facts["vehicle"] = cars[spec.vehicle]
+        by_label[spec.label] = call_quietly(make_estimator, spec.name, **facts | options)
+    return by_label
 
 
 @dataclass(frozen=True)
 class EstimationSimulation(Simulation):
     """Filters over the drives of a scenario, without control.
 
-    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
-    "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
-    in which a packet arrives; "last", the mean of beta's error over the last second, its size.
+    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on, and
+    "square", the mean square of beta's error (rad2); "outage", beta's RMSE while the GPS is out;
+    "jump", the RMS change of beta in the milliseconds in which a packet arrives; "last", the mean
+    of beta's error over the last second, its size; "us_per_tick" of CPU time, in the first seed's
+    with the design of gains.
     """
 
     env_id: str
     scenario: str | Mapping[str, Any]
-    filters: tuple[PaperFilter, ...]
-    bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
+    filters: Sequence[PaperFilter]
+    bound: bool = False  # whether to add `BOUND`, whose error is beta's optimal standard deviation
     control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
-    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
-        env = gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
+    def make_env(self) -> gym.Env[Any, Any]:
+        """Make the env in which all seeds are driven."""
+        return gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
+
+    def run(self, seeds: Iterable[int]) -> Iterator[SeedResult]:
+        """Drive, and run the filters; RuntimeError where a car fails."""
+        env = self.make_env()
         base: Any = env.unwrapped
         estimators: dict[str, Estimator] = {}
         for seed in seeds:
@@ -46,26 +91,26 @@ class EstimationSimulation(Simulation):
             if drive.failed:
                 raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
             log, truth = drive.log, drive.log.truth
-            numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], log)}
+            settled = log.time >= SETTLED - 1e-9
+            numbers: Numbers = {("truth", "beta"): _rms(truth["beta"][settled])}
             curves = {"truth": truth}
-            estimators = estimators or ledger.make_filters(self.filters, base)
+            estimators = estimators or make_filters(self.filters, base)
             for label, estimator in estimators.items():
+                start = time.process_time()
                 estimates = estimator.run(log)
+                numbers[label, "us_per_tick"] = (time.process_time() - start) / len(settled) * 1e6
                 curves[label] = {name: estimates[name] for name in estimates.names}
                 numbers |= _compute_errors(label, curves[label], log, base.scenario)
             if self.bound:
                 facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
                 std = compute_error_bound(record=log.record, **facts)
-                numbers["bound", "beta"] = _compute_settled_rms(std, log)
-            yield numbers, Example(log.time, curves)
+                numbers[BOUND, "beta"] = _rms(std[settled])
+                numbers[BOUND, "square"] = float(np.mean(std[settled] ** 2))
+            yield SeedResult(numbers, Example(log.time, curves))
 
 
 def _rms(values: npt.ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _compute_settled_rms(values: Array, log: Log) -> float:
-    return _rms(values[log.time >= SETTLED - 1e-9])
 
 
 def _compute_errors(
@@ -73,10 +118,12 @@ def _compute_errors(
 ) -> Numbers:
     truth = log.truth
     errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
-    numbers: Numbers = {(label, x): _compute_settled_rms(y, log) for x, y in errors.items()}
+    t, settled = log.time, log.time >= SETTLED - 1e-9
+    numbers: Numbers = {(label, x): _rms(y[settled]) for x, y in errors.items()}
     if "beta" not in estimates:
         return numbers
-    t, beta = log.time, estimates["beta"]
+    beta = estimates["beta"]
+    numbers[label, "square"] = float(np.mean(errors["beta"][settled] ** 2))
     numbers[label, "last"] = float(abs(np.mean(errors["beta"][t >= t[-1] - 1.0])))
     arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
     arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
@@ -87,94 +134,69 @@ def _compute_errors(
     return numbers
 
 
-_ENTRIES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "none": ("none", "", {}),
-    "feedforward": ("feedforward", "", {}),
-    "single-rate": ("two-dof", "single-rate-kf", {"rate": "camera"}),
-    "multirate": ("two-dof", "multirate-kf", {"rate": "control"}),
-    "multirate-residual": ("two-dof", "multirate-residual-kf", {"rate": "control"}),
-}
-"""tie-vision Fig. 8, by label: agent, the estimator it reads ("" for none) and its options."""
-_NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
+_NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}  # a scenario's, and an option
+
+
+class Driver(NamedTuple):
+    """A controller of a simulation."""
+
+    agent: str  # name of `make_agent`
+    estimator: str = ""  # that it reads, "" for none
+    options: Mapping[str, Any] = {}  # of the agent
 
 
 @dataclass(frozen=True)
-class _AgentSimulation(Simulation):
-    """Controllers on each seed; `_run_episode` gives the numbers of one."""
+class ControlSimulation(Simulation):
+    """Controllers at 1 ms over the drives of a scenario; their filters know the camera's noise.
 
-    size: ClassVar[int] = 2
+    Numbers of each: RMS of the slip, and of slip's and yaw rate's errors; peak of the slip; of the
+    yaw moment the largest change in 1 ms, the sum of all changes, and the fractions of time at
+    its limit and with a command of all of it.
+    """
+
+    env_id: str
     scenario: str | Mapping[str, Any]
-    entries: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
+    drivers: Mapping[str, Driver]  # by label
+    estimate: Mapping[str, Any] = field(default_factory=dict)  # to `EstimateObservation`
 
-    def _run(self, seeds: tuple[int, ...]) -> Outcomes:
+    def run(self, seeds: Iterable[int]) -> Iterator[SeedResult]:
+        """Let every controller drive; RuntimeError where a car fails."""
         for seed in seeds:
             numbers: Numbers = {}
             curves: dict[str, dict[str, Array]] = {}
-            for label in self.entries:
-                episode, values = self._run_episode(label, seed)
+            for label in self.drivers:
+                episode, values = self.drive(label, seed)
                 if episode.failed:  # fewer ticks are no better drive
                     raise RuntimeError(f"{label}: the car of seed {seed} failed")
                 numbers |= {(label, name): value for name, value in values.items()}
                 curves[label] = {name: episode[name] for name in ("beta", "gamma", "yaw_moment")}
             curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
-            yield numbers, Example(episode["t"], curves)
+            yield SeedResult(numbers, Example(episode["t"], curves))
 
-    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        raise NotImplementedError
+    def drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
+        """Drive an episode, and measure its numbers by quantity.
 
-
-@dataclass(frozen=True)
-class SlipSimulation(_AgentSimulation):
-    """tie-vision's controllers on a lane change, each with a filter that knows the camera's noise.
-
-    Entries are those of `_ENTRIES`, or have a remark behind a comma. Numbers of each: RMS
-    and peak of the slip, the largest change of the yaw moment in 1 ms, the sum of all its changes
-    and the fraction of time at its limit.
-    """
-
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # more ones of the agent
-
-    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        agent, estimator, options = _ENTRIES[label.partition(",")[0]]
+        Args:
+            label: Label of the controller.
+            seed: Seed of the reset.
+        """
+        agent, estimator, options = self.drivers[label]
         noise = make_scenario(self.scenario).noise
         known = {option: noise[name] for name, option in _NOISE.items() if name in noise}
         how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
-        env = make_env("sideslip/YawVision-v0", estimator, {"options": known}, **how)
-        more = self.options.get(label, {})
-        drive = rollout(env, make_agent(agent, env, **{**options, **more}), seed)
+        env = make_env(self.env_id, estimator, {"options": known} | dict(self.estimate), **how)
+        drive = rollout(env, make_agent(agent, env, **options), seed)
         base: Any = env.unwrapped
         slip, moment, limit = drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit
         change = np.abs(np.diff(moment))
+        command = next(x for name, x in drive.columns.items() if name.startswith("action"))
         return drive, {
             "rms_slip": _rms(slip),
+            "rms_slip_error": _rms(slip - drive["beta_ref"]),
+            "rms_yaw_error": _rms(drive["gamma"] - drive["gamma_ref"]),
             "peak_slip": float(np.max(np.abs(slip))),
             "largest_step": float(np.max(change)),
             "total_variation": float(np.sum(change)),
             "saturation": float(np.mean(np.abs(moment) >= 0.999 * limit)),
-        }
-
-
-@dataclass(frozen=True)
-class FollowingSimulation(_AgentSimulation):
-    """dakf-stability's controller by wire on the GPS, with and without parts of it.
-
-    Entries are options of the controller by label, "agent" another controller, at 1 ms. Numbers of
-    each: RMS errors of slip and yaw rate, peak of the slip, and the fraction of ticks that command
-    the whole yaw moment.
-    """
-
-    entries: Mapping[str, Mapping[str, Any]]
-
-    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        options = {"agent": "model-following", **self.entries[label]}
-        tuned = {"slow": "gps"} | ledger.PAPER_TUNINGS["dakf"]
-        estimate = {"outputs": ("beta", "gamma", "d1", "d2"), "options": tuned}
-        how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
-        env = make_env("sideslip/AfsYawFusion-v0", "dakf", estimate, **how)
-        drive = rollout(env, make_agent(options.pop("agent"), env, **options), seed)
-        return drive, {
-            "rms_beta": _rms(drive["beta"] - drive["beta_ref"]),
-            "rms_gamma": _rms(drive["gamma"] - drive["gamma_ref"]),
-            "peak_beta": float(np.abs(drive["beta"]).max()),
-            "saturated": float(np.mean(np.abs(drive["action_0"]) >= 1.0)),
+            "full_command": float(np.mean(np.abs(command) >= 1.0)),
         }

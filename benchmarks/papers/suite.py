@@ -3,13 +3,20 @@
 from collections import Counter
 from itertools import product
 from types import ModuleType
-from typing import NamedTuple
 
-from ..harness.parallel import split_seeds
 from ..harness.results import VERDICTS, Column, Line, ResultTable, Suite
 from ..report.study import Request, Study, format_verdict, summarise_names
 from . import dakf_stability, double_layer, dual_rate, tie_vision, tie_vision_theory, uneven_delay
-from .ledger import Claim, Example, MeasuredClaim, MeasuredPart, Simulation, SimulationResult
+from .ledger import (
+    CHUNK,
+    Claim,
+    Example,
+    MeasuredClaim,
+    MeasuredPart,
+    Simulation,
+    join_numbers,
+    run_simulation,
+)
 
 _MODULES = (
     tie_vision, tie_vision_theory, uneven_delay, double_layer, dual_rate, dakf_stability,
@@ -32,36 +39,21 @@ _TEXT = (
 )
 
 
-class LedgerResults(NamedTuple):
-    """The measured claims, and the signals of simulations by name."""
-
-    ledger: list[MeasuredClaim]
-    examples: dict[str, Example | None]
+Results = tuple[list[MeasuredClaim], dict[str, Example]]  # signals by the simulation's name
 
 
-def _split_seeds(simulation: Simulation, seeds: int) -> list[tuple[int, ...]]:
-    """Split a simulation's share of some seeds into cases."""
-    return split_seeds(max(1, round(simulation.share * seeds)), simulation.size)
-
-
-def _measure_case(case: tuple[str, tuple[int, ...]]) -> SimulationResult:
-    """Measure one simulation on a few of its seeds; case: its name and the seeds."""
-    name, seeds = case
-    return SIMULATIONS[name].measure(seeds)
-
-
-def _measure(request: Request) -> LedgerResults:
+def _measure(request: Request) -> Results:
     seeds = request.episodes or 0
-    cases = [(name, part) for name, x in SIMULATIONS.items() for part in _split_seeds(x, seeds)]
-    results: dict[str, SimulationResult] = {}
-    for (name, _), result in zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True):
-        results[name] = results[name] + result if name in results else result
-    ledger = [claim.measure(results) for claim in CLAIMS]
-    return LedgerResults(ledger, {name: result.example for name, result in results.items()})
+    counts = [max(1, round(x.share * seeds)) for x in SIMULATIONS.values()]
+    outcomes = request.run_seeds(run_simulation, list(SIMULATIONS.values()), counts, CHUNK, NAME)
+    by_name = dict(zip(SIMULATIONS, outcomes, strict=True))
+    results = {name: join_numbers(items) for name, items in by_name.items()}
+    ledger = [MeasuredClaim(x, [part.measure(results) for part in x.parts]) for x in CLAIMS]
+    return ledger, {name: x.example for name, (x, *_) in by_name.items() if x.example is not None}
 
 
-def _compose_verdict(results: LedgerResults) -> str:
-    ledger = results.ledger
+def _compose_verdict(results: Results) -> str:
+    ledger, _ = results
     counted = Counter(entry.verdict for entry in ledger)
     papers = dict.fromkeys(entry.claim.paper for entry in ledger)
     held = []
@@ -88,9 +80,9 @@ _RANGE_NOTE = (
 )
 
 
-def _add_tables(suite: Suite, results: LedgerResults) -> None:
+def _add_tables(suite: Suite, results: Results) -> None:
     verdicts, remarks, numbers = [], [], dict[str, list[Line]]()
-    for entry in results.ledger:
+    for entry in results[0]:
         claim = entry.claim
         columns = {"verdict": entry.verdict, "paper": f"{entry.source}: {claim.text}"}
         for item in entry.parts:
@@ -127,10 +119,9 @@ def _make_line(source: str, item: MeasuredPart) -> Line:
 _SIGNALS = {"beta": "sideslip angle / rad", "yaw_moment": "yaw moment / (N m)"}
 
 
-def _add_figures(suite: Suite, results: LedgerResults, draw: ModuleType) -> None:
+def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
     """Draw the signals of the first seed of each simulation."""
-    examples = {name: x for name, x in results.examples.items() if x is not None}
-    for (name, example), (signal, label) in product(examples.items(), _SIGNALS.items()):
+    for (name, example), (signal, label) in product(results[1].items(), _SIGNALS.items()):
         curves = example.curves.items()
         if series := {subject: x[signal] for subject, x in curves if signal in x}:
             figure = draw.draw_time_series(example.time, series, label)

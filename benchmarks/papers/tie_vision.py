@@ -9,7 +9,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,8 +27,8 @@ from ...envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design.gains import kalman_gain
 from ..harness.stats import Bound
-from .ledger import Analysis, Claim, ClaimPart, Numbers, PaperFilter, compare
-from .manoeuvres import EstimationSimulation, SlipSimulation
+from .ledger import Analysis, Claim, ClaimPart, Numbers, compare
+from .manoeuvres import BOUND, ControlSimulation, Driver, EstimationSimulation, PaperFilter
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -37,6 +37,7 @@ Parts = tuple[Array, Array, Array, Array]
 _Complex = npt.NDArray[np.complex128]
 
 PRINTED = (5.92, 22.8)  # dB, single-rate and multirate: Table II of tie-vision
+_PERIODS = (CAMERA_PERIOD, TICK)  # s, of the two
 SENSORS = ("gyro", "vision", "vision-delayed")
 INTEGRALS = {"forward-euler": 0.0, "tustin": 0.5, "backward-euler": 1.0}  # share of this sample
 
@@ -57,7 +58,7 @@ def _make_plain_loop(design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of PI and plant with beta measured without delay; moment held over dt (s)."""
     import control
 
-    pi = _pi(COMS, design.speed, POLE, design.placement)
+    pi = design_pi(COMS, design.speed, POLE, design.placement)
     G, H = make_bicycle_model(COMS, design.speed).discretise(dt)
     plant = control.StateSpace(G, H[:, 1:], [[1.0, 0.0]], 0.0, dt)
     direct = pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
@@ -81,16 +82,13 @@ def _make_filter(speed: float, sensors: str, q_ratio: float, noise: float, dt: f
     return G, H, C, kalman_gain(solve_discrete_are(G.T, C.T, Q, R), C, R)
 
 
-_pi = lru_cache(maxsize=256)(design_pi)
-
-
 def _make_estimator_loop(design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant."""
     # The filter's input is the moment that the PI commands: opened behind both, a filter with the
     # right model would not show in the loop at all.
     import control
 
-    pi = _pi(COMS, design.speed, POLE, design.placement)
+    pi = design_pi(COMS, design.speed, POLE, design.placement)
     G, H, C, K = _make_filter(design.speed, design.sensors, design.q_ratio, design.noise, dt)
     # the integral's sum grows by k_i dt error in all three forms
     F, direct = np.eye(len(G)) - K @ C, pi.k_p + INTEGRALS[design.integral] * pi.k_i * dt
@@ -111,22 +109,18 @@ _GRID: dict[str, tuple[float | str, ...]] = {
 }
 
 
-class _LoopMatch(NamedTuple):
-    """A design, and the larger difference (dB) of its margins to the printed ones."""
+def _search() -> dict[LoopDesign, float]:
+    """Search the grid's designs with both margins near Table II's, as stable, best first.
 
-    design: LoopDesign
-    off: float
-
-
-def _search() -> list[_LoopMatch]:
-    """Search the grid's designs with both margins near Table II's, as stable, best first."""
+    Each has the larger difference (dB) of its margins to the printed ones.
+    """
     import control
 
-    hits = []
+    hits = dict[LoopDesign, float]()
     for values in itertools.product(*_GRID.values()):
         options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
         design, differences = LoopDesign(**options), []
-        for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
+        for dt, printed in zip(_PERIODS, PRINTED, strict=True):
             loop = _make_estimator_loop(design, dt)
             end = _compute_response(loop, np.array([-1.0 + 0.0j]))[0].real  # before all crossings
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
@@ -136,9 +130,9 @@ def _search() -> list[_LoopMatch]:
             if abs(omega * dt - math.pi) > 1e-9 or not is_stable:  # as in the paper
                 break
             differences.append(abs(decibels - printed))
-        if len(differences) == len(PRINTED):
-            hits.append(_LoopMatch(design, max(differences)))
-    return sorted(hits, key=lambda hit: hit.off)
+        else:
+            hits[design] = max(differences)
+    return dict(sorted(hits.items(), key=lambda item: item[1]))
 
 
 # Gain margins: how much the loops of the paper's Table II may grow until they reach -1.
@@ -197,6 +191,7 @@ RESIDUAL_KF, EXACT = "multirate-residual-kf", "exact-kf, true model"
 NO_DELAY = "multirate-kf, delay ignored"
 RETUNED = "multirate-kf, delay ignored, tuned for it"
 
+_ENV = "sideslip/YawVision-v0"
 _FILTERS = tuple(PaperFilter(name, name) for name in (BICYCLE, SINGLE_KF, MULTI_KF, RESIDUAL_KF))
 # as tunings.toml, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
 _Q = {"q_beta": 8.8e-3, "q_gamma": 0.15, "q_psi": 2.9e-8, "q_y_l": 1.3e-7}
@@ -211,44 +206,50 @@ def _measure_static_slip(_: int) -> Numbers:
             "base": FIG8, "name": "static", "steering": "step", "onset": 0.0, "amplitude": 0.001,
             "hold": 60.0, "duration": 10.0, "speed": kmh * KMH, "noise": {"wheel": 0.0},
         }  # fmt: skip
-        env = gym.make("sideslip/YawVision-v0", scenario=scenario)
+        env = gym.make(_ENV, scenario=scenario)
         left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))
     return {("feedforward", "static_slip"): np.array(left)}
 
 
 def _measure_table_two(_: int) -> Numbers:
     """Measure the loops of the search that fit Table II, and the best of 25 km/h."""
-    matches = _search()
-    at_25 = [hit for hit in matches if math.isclose(hit.design.speed, 25.0 * KMH)]
-    periods, margins = (CAMERA_PERIOD, TICK), []  # margins in dB, the same PI on the true slip
+    matches, margins = _search(), []  # margins in dB, the same PI on the true slip
+    at_25 = [x for x in matches if math.isclose(x.speed, 25.0 * KMH)]
     for design in (LoopDesign(placement=name) for name in ("real", "radius")):
-        loops = (_make_plain_loop(design, dt) for dt in periods)
+        loops = (_make_plain_loop(design, dt) for dt in _PERIODS)
         margins.append([_compute_gain_margin(loop)[0] for loop in loops])
     numbers: Numbers = {
         ("loops", "count"): float(len(matches)),
-        ("loops", "off"): min((hit.off for hit in matches), default=np.inf),
-        ("25 km/h", "off"): at_25[0].off if at_25 else np.inf,
+        ("loops", "off"): min(matches.values(), default=np.inf),
+        ("25 km/h", "off"): matches[at_25[0]] if at_25 else np.inf,
         ("same PI", "raised"): np.diff(margins)[:, 0],
     }
-    design = at_25[0].design if at_25 else LoopDesign()
-    for label, dt in zip((SINGLE, MULTI), periods, strict=True):
+    design = at_25[0] if at_25 else LoopDesign()
+    for label, dt in zip((SINGLE, MULTI), _PERIODS, strict=True):
         omega = _compute_gain_margin(_make_estimator_loop(design, dt))[1]
         numbers[label, "crossover"] = round(omega / (2.0 * math.pi), 2)
     return numbers
 
 
-_LABELS = ("none", "feedforward", SINGLE, MULTI, PROPOSED)
+_DRIVERS = {
+    "none": Driver("none"),
+    "feedforward": Driver("feedforward"),
+    SINGLE: Driver("two-dof", SINGLE_KF, {"rate": "camera"}),
+    MULTI: Driver("two-dof", MULTI_KF, {"rate": "control"}),
+    PROPOSED: Driver("two-dof", RESIDUAL_KF, {"rate": "control"}),
+}
+_STRONGER = Driver("two-dof", MULTI_KF, {"rate": "control", "gain": 10.0 ** (28.8 / 20.0)})
 # fmt: off
 SIMULATIONS = (
-    EstimationSimulation(FIG7, "sideslip/YawVision-v0", FIG7,
+    EstimationSimulation(FIG7, _ENV, FIG7,
         (*_FILTERS, PaperFilter(NO_DELAY, MULTI_KF, {"delay": "ignore"}),
             PaperFilter(RETUNED, MULTI_KF, {"delay": "ignore", **_FOR_NO_DELAY}),
             PaperFilter(EXACT, "exact-kf", vehicle="true")), bound=True, share=5.0),
-    EstimationSimulation(FIG9, "sideslip/YawVision-v0", FIG9, _FILTERS),
+    EstimationSimulation(FIG9, _ENV, FIG9, _FILTERS),
     Analysis(TABLE2, _measure_table_two, share=0.0),
-    SlipSimulation(FIG8, FIG8, (*_LABELS, EQUAL), {EQUAL: {"gain": 10.0 ** (28.8 / 20.0)}}),
-    SlipSimulation(STIFF, STIFF, _LABELS),
-    SlipSimulation(FIG10, FIG10, ("none", SINGLE, MULTI, PROPOSED)),
+    ControlSimulation(FIG8, _ENV, FIG8, _DRIVERS | {EQUAL: _STRONGER}),
+    ControlSimulation(STIFF, _ENV, STIFF, _DRIVERS),
+    ControlSimulation(FIG10, _ENV, FIG10, _DRIVERS),
     Analysis(STATIC, _measure_static_slip, share=0.0),
 )
 # fmt: on
@@ -280,8 +281,8 @@ CLAIMS = (
         "adds no information, it is a change of gain."),
     claim("Fig. 7", "how far from the best possible, and what the delay costs",
         ClaimPart("exact filter of the true model / bound, pooled", FIG7, EXACT,
-            threshold=Bound("<=", 1.03), rivals=("bound",), is_pooled=True),
-        ClaimPart("multirate / bound: the stiffness error", FIG7, MULTI_KF, rivals=("bound",)),
+            threshold=Bound("<=", 1.03), rivals=(BOUND,), is_pooled=True),
+        ClaimPart("multirate / bound: the stiffness error", FIG7, MULTI_KF, rivals=(BOUND,)),
         ClaimPart("delay ignored / multirate", FIG7, NO_DELAY, rivals=(MULTI_KF,)),
         ClaimPart("delay ignored, tuned for it / multirate", FIG7, RETUNED, rivals=(MULTI_KF,)),
         note="What ignoring the delay costs is a matter of tuning: more than twice the error with "

@@ -5,7 +5,7 @@ docs/reference/papers.md corrects it; the one-step lines of cases 1 and 2 are no
 vectors. Of the gains that (16) and (21) leave open two are tried: of (13), and the shipped one.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial, reduce
 from typing import Any
 
@@ -27,35 +27,17 @@ STEPS = 6
 STATES, OUTPUTS = 4, 3
 
 
-@dataclass
-class _RandomSystem:
-    """Steps 0 .. n of a random system: G, w of the step to i+1; K, v of step i (0 unused)."""
-
-    G: list[Array]
-    C: Array
-    K: list[Array]
-    w: list[Array]
-    v: list[Array]
-    e: Array  # at step 0
-
-
-def _draw_system(seed: int) -> _RandomSystem:
-    """Draw a system with gains that make the error neither vanish nor explode."""
-    rng = np.random.default_rng(seed)
-
-    def draw_arrays(*shape: int) -> list[Array]:
-        return [rng.normal(size=shape) for _ in range(STEPS + 1)]
-
-    G = [np.eye(STATES) + 0.2 * g for g in draw_arrays(STATES, STATES)]
-    K = [0.2 * k for k in draw_arrays(STATES, OUTPUTS)]
-    C = rng.normal(size=(OUTPUTS, STATES))
-    w, v = draw_arrays(STATES), draw_arrays(OUTPUTS)
-    return _RandomSystem(G, C, K, w, v, rng.normal(size=STATES))
-
-
-def _compute_product(factors: list[Array]) -> Array:
+def _multiply(factors: Sequence[Array]) -> Array:
     """Multiply factors, the newest on the left, as the appendix has it."""
     return reduce(lambda total, factor: factor @ total, factors, np.eye(STATES))
+
+
+def _add_terms(total: Array, maps: Sequence[Array], *sums: tuple[Sequence[Array], ...]) -> Array:
+    """Add sums over the steps: a factor times an input, times the maps of all later steps."""
+    for factors, inputs in sums:
+        for p, (factor, x) in enumerate(zip(factors, inputs, strict=True), 1):
+            total = total + _multiply(maps[p:]) @ factor @ x
+    return total
 
 
 def _compute_residual(formula: Array, simulated: Array) -> float:
@@ -63,66 +45,42 @@ def _compute_residual(formula: Array, simulated: Array) -> float:
     return float(np.abs(formula - simulated).max() / np.abs(simulated).max())
 
 
-def _check_ideal(d: _RandomSystem) -> dict[str, float]:
-    """Check case 1: a measurement at every step."""
-    n, e = STEPS, d.e
-    for i in range(1, n + 1):
-        predicted = d.G[i - 1] @ e + d.w[i - 1]
-        e = predicted - d.K[i] @ (d.C @ predicted + d.v[i])  # (17)-(18)
-    M = [np.eye(STATES) - K @ d.C for K in d.K]
-    closed = _compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
-    for p in range(n):
-        after = _compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
-        closed = closed + after @ M[p + 1] @ d.w[p]
-    for p in range(1, n + 1):
-        after = _compute_product([M[i] @ d.G[i - 1] for i in range(p + 1, n + 1)])
-        closed = closed - after @ d.K[p] @ d.v[p]
-    return {"case 1": _compute_residual(closed, e)}
-
-
-def _check_predicted(d: _RandomSystem) -> dict[str, float]:
-    """Check case 2: no correction between samples."""
-    e = d.e
-    for i in range(STEPS):
-        e = d.G[i] @ e + d.w[i]
-    closed = _compute_product(d.G[:STEPS]) @ d.e
-    for p in range(STEPS):
-        closed = closed + _compute_product(d.G[p + 1 : STEPS]) @ d.w[p]
-    return {"case 2": _compute_residual(closed, e)}
-
-
-def _check_compensated(d: _RandomSystem) -> dict[str, float]:
-    """Check case 3: any pseudo-residual; then the exact one, C G e."""
-    n, e = STEPS, d.e
-    for i in range(1, n + 1):  # v stands for any pseudo-residual: the first form is an identity
-        e = d.G[i - 1] @ e + d.w[i - 1] - d.K[i] @ d.v[i]
-    sums = {}
-    for label, is_printed in (("case 3 (a)", False), ("case 3 (a), printed", True)):
-        G = [d.G[1] if is_printed else g for g in d.G]
-        closed = _compute_product(d.G[:n]) @ d.e
-        for p in range(n):
-            closed = closed + _compute_product(G[p + 1 : n]) @ d.w[p]
-        for p in range(1, n + 1):
-            closed = closed - _compute_product(G[p:n]) @ d.K[p] @ d.v[p]
-        sums[label] = _compute_residual(closed, e)
-    M = [np.eye(STATES) - K @ d.C for K in d.K]
-    e = d.e
-    for i in range(1, n + 1):
-        e = M[i] @ d.G[i - 1] @ e + d.w[i - 1]  # with the exact residual C G e
-    start = _compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
-    for label, is_printed in (("case 3 (b)", False), ("case 3 (b), printed", True)):
-        closed = start
-        for p in range(n):
-            after = _compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
-            closed = closed + after @ (M[p + 1] @ d.w[p] if is_printed else d.w[p])
-        sums[label] = _compute_residual(closed, e)
-    return sums
-
-
 def _compute_residuals(seed: int) -> Numbers:
-    d = _draw_system(seed)
-    by_case = _check_ideal(d) | _check_predicted(d) | _check_compensated(d)
-    return {(label, "residual"): value for label, value in by_case.items()}
+    """Compare each case's sum to its recursion, on a random system of random gains.
+
+    Its error neither vanishes nor explodes. Step i has G and w into it, and K and v at its end.
+    """
+    rng = np.random.default_rng(seed)
+
+    def draw_arrays(*shape: int) -> list[Array]:
+        return [rng.normal(size=shape) for _ in range(STEPS + 1)]
+
+    G = [np.eye(STATES) + 0.2 * g for g in draw_arrays(STATES, STATES)][:STEPS]
+    K = [0.2 * k for k in draw_arrays(STATES, OUTPUTS)][1:]
+    C = rng.normal(size=(OUTPUTS, STATES))
+    w, v = draw_arrays(STATES)[:STEPS], draw_arrays(OUTPUTS)[1:]
+    start = rng.normal(size=STATES)
+    M, ones = [np.eye(STATES) - k @ C for k in K], [np.eye(STATES)] * STEPS
+    corrected = [m @ g for m, g in zip(M, G, strict=True)]
+    ideal = predicted = compensated = exact = start
+    for g, w_i, k, v_i, m in zip(G, w, K, v, M, strict=True):
+        moved = g @ ideal + w_i
+        ideal = moved - k @ (C @ moved + v_i)  # (17)-(18), a measurement at every step
+        predicted = g @ predicted + w_i  # no correction between samples
+        compensated = g @ compensated + w_i - k @ v_i  # v stands for any pseudo-residual
+        exact = m @ g @ exact + w_i  # with the exact residual C G e
+    free, damped = _multiply(G) @ start, _multiply(corrected) @ start
+    minus_v, printed = [-x for x in v], [G[1]] * STEPS
+    Mw = [m @ x for m, x in zip(M, w, strict=True)]
+    cases = {
+        "case 1": (_add_terms(damped, corrected, (M, w), (K, minus_v)), ideal),
+        "case 2": (_add_terms(free, G, (ones, w)), predicted),
+        "case 3 (a)": (_add_terms(free, G, (ones, w), (K, minus_v)), compensated),
+        "case 3 (a), printed": (_add_terms(free, printed, (ones, w), (K, minus_v)), compensated),
+        "case 3 (b)": (_add_terms(damped, corrected, (ones, w)), exact),
+        "case 3 (b), printed": (_add_terms(damped, corrected, (ones, Mw)), exact),
+    }
+    return {(name, "residual"): _compute_residual(*pair) for name, pair in cases.items()}
 
 
 PAPER = "tie-vision"

@@ -4,8 +4,8 @@ from functools import partial
 
 from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
-from .ledger import Analysis, Claim, ClaimPart, PaperFilter, compare
-from .manoeuvres import EstimationSimulation
+from .ledger import Analysis, Claim, ClaimPart, compare
+from .manoeuvres import EstimationSimulation, PaperFilter
 
 PAPER = "uneven-delay"
 FIG5, NOISY, FIG7 = "uneven-delay-fig5", "uneven-delay-fig5-noisy", "uneven-delay-fig7"

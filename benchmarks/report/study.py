@@ -9,19 +9,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Generic, TypeVar
 
 from rich.console import Console
 
-from ..harness.parallel import run_cases, split_seeds
+from ..harness.parallel import run_cases
 from ..harness.results import Suite
 from ..harness.stats import Estimate
 
 LINES, LETTERS = 5, 110  # lines of a verdict, letters of a line with the package's names
-_MAX_NAMES = 2  # names in a sentence; the others are counted
 MAX_NIS = 3.0  # mean squared innovation over its variance, beyond which a filter is lost
 _MIN_TIE = 0.995  # a ratio below it is a lead
 
@@ -60,7 +58,7 @@ class Request:
         self,
         function: Callable[[tuple[Condition, Sequence[int]]], Sequence[Result]],
         conditions: Sequence[Condition],
-        seeds: int,
+        seeds: int | Sequence[int],
         chunk: int,
         title: str,
     ) -> list[list[Result]]:
@@ -68,15 +66,16 @@ class Request:
 
         Args:
             function: Function of a condition and some seeds, importable by workers.
-            conditions: Conditions, which share the seeds 0 .. seeds-1.
-            seeds: Number of seeds.
+            conditions: Conditions; each has the seeds 0 .. seeds-1.
+            seeds: Number of seeds, of all or of each.
             chunk: Maximum of seeds in a call.
             title: Title of the progress bar.
         """
-        chunks = split_seeds(seeds, chunk)
-        cases = list(product(conditions, chunks))
+        counts = [seeds] * len(conditions) if isinstance(seeds, int) else seeds
+        chunks = [[range(k, min(k + chunk, n)) for k in range(0, n, chunk)] for n in counts]
+        cases = [(x, part) for x, parts in zip(conditions, chunks, strict=True) for part in parts]
         results = iter(self.run_cases(function, cases, title))
-        return [[item for _ in chunks for item in next(results)] for _ in conditions]
+        return [[item for _ in parts for item in next(results)] for parts in chunks]
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def format_percent(ratio: Estimate) -> str:
     return f"{value} % [{low}, {high}]" if math.isfinite(ratio.low) else f"{value} %"
 
 
-def summarise_names(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
+def summarise_names(names: Sequence[str], limit: int = 2) -> str:
     """Join names for a sentence; of many the later ones are counted.
 
     Args:

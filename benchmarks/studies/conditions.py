@@ -145,8 +145,8 @@ CONDITIONS = _IN_V1 + tuple(
 )
 
 
-def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tuple[Log, Any, Any]:
-    """Log without the edit, env and its `car_truth`; a car moves alike without constant errors."""
+def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tuple[Log, Any]:
+    """Log without the edit, and env; a car moves alike without constant errors."""
     rng = np.random.default_rng([46, seed])
     speed = float(rng.uniform(*condition.speed))
     amplitude = condition.amplitude * min(1.0, (16.0 / speed) ** 1.2)
@@ -159,9 +159,7 @@ def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tupl
         absent = {name: getattr(IDEAL, name) for name in CONSTANT_ERRORS}
         options["world"] = replace(env.unwrapped.config.world, **absent)
         env = gym.make(condition.env_id, scenario=scenario, **options)
-    env.reset(seed=seed)
-    truth = env.unwrapped.car_truth
-    return record_drive(env, seed), env.unwrapped, truth
+    return record_drive(env, seed), env.unwrapped
 
 
 _KNOWN: dict[str, float] = dict.fromkeys(
@@ -173,8 +171,10 @@ _NOISE = {"": ("gyro_noise", "accel_y_noise"), "camera": ("psi_noise", "y_l_nois
 
 def _run_informed_filter(condition: Condition, seed: int) -> Estimates:
     """Run the filter that is told what the seed draws, on a record without errors of sensors."""
-    log, base, truth = _drive_car(condition, seed, has_errors=False)
-    record, scenario, options = log.record, base.scenario, _KNOWN | {"inverse_friction_sd": 0.1}
+    log, base = _drive_car(condition, seed, has_errors=False)
+    base.reset(seed=seed)  # to the tyres of the start
+    record, scenario, truth = log.record, base.scenario, base.car_truth
+    options = _KNOWN | {"inverse_friction_sd": 0.1}
     if base.config.world.is_ideal:  # its errors are noise and disturbances alone
         options |= {name: NOISE[name] for key in ("", *log.slow) for name in _NOISE.get(key, ())}
         if "gps" in log.slow:
@@ -203,7 +203,7 @@ class Outcome(NamedTuple):
 
 def _measure_drive(condition: Condition, seed: int) -> Outcome | None:
     """Run the filters over a drive; None where the car spins before errors count."""
-    log, base, _ = _drive_car(condition, seed)
+    log, base = _drive_car(condition, seed)
     beta, dt, wrong = log.truth["beta"], log.record.dt, _apply_edit(condition.edit, log, seed)
     driven = np.cumsum(np.abs(beta) > _SPIN) == 0
     rows = driven & (log.time >= SETTLED - 1e-9) & (log.record.fast[:, FAST.wheel_left] > _SLOW)
@@ -235,13 +235,13 @@ Results = dict[str, dict[str, Any]]  # cells of the table by condition and colum
 
 
 def _measure(request: Request) -> Results:
-    seeds, results = request.episodes or 0, Results()
-    for count, group in ((_BASE_FACTOR * seeds, CONDITIONS[:1]), (seeds, CONDITIONS[1:])):
-        drives = request.run_seeds(_measure_seeds, group, count, 8, "conditions")
-        for condition, outcomes in zip(group, drives, strict=True):
-            filled = [item for item in outcomes if item is not None]
-            results[condition.name] = _summarise_outcomes(filled)
-    return results
+    seeds = request.episodes or 0
+    counts = [seeds * (_BASE_FACTOR if x.name == BASE else 1) for x in CONDITIONS]
+    drives = request.run_seeds(_measure_seeds, CONDITIONS, counts, 8, "conditions")
+    return {
+        condition.name: _summarise_outcomes([item for item in outcomes if item is not None])
+        for condition, outcomes in zip(CONDITIONS, drives, strict=True)
+    }
 
 
 def _summarise_outcomes(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -262,10 +262,9 @@ def _summarise_outcomes(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
+    for x in CONDITIONS:
+        suite.add_rows([results[x.name]], x.env_id, scenario=x.name, estimator=NAME)
     records = [{"condition": name} | numbers for name, numbers in results.items()]
-    for condition, record in zip(CONDITIONS, records, strict=True):
-        where = {"scenario": condition.name, "estimator": NAME}
-        suite.add_rows([record], condition.env_id, **where)
     suite.tables = [ResultTable(f"{NAME} in each condition", _COLUMNS, records, _NOTE)]
 
 

@@ -3,117 +3,95 @@
 On the papers' simulations tie-vision-fig7 and dakf-fig6.
 """
 
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from ...agents.rollout import rollout
 from ...envs.record import Array
-from ...estimators.analysis.limits import compute_error_bound
-from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
-from ..papers.ledger import PaperFilter, make_filters
+from ..papers.ledger import CHUNK, Example, join_numbers, run_simulation
+from ..papers.manoeuvres import BOUND, EstimationSimulation, PaperFilter
 from ..report.study import Request, Study, describe_leader, format_verdict
 
-_CHUNK = 5
 _COLUMNS = (
     "estimator",
     Column("rmse", "RMSE / mrad", 1e3, ".2f"),
     Column("rmse_over_bound", "over the bound", form=".2f"),
     Column("us_per_tick", "us per tick", form=".3f"),
 )
-BOUND = "the bound"
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
-Results = list[dict[str, Array]]  # of each experiment by filter and `BOUND`, shape (seeds, 2)
+Numbers = Mapping[tuple[str, str], Array]  # (seeds,) by filter or `BOUND` and quantity
+Results = list[tuple[Numbers, Example | None]]  # of each experiment
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A paper's simulation, its env and filters; brief: what is hard about it, in a few words."""
+    """A paper's simulation; brief: what is hard about it, in a few words."""
 
     brief: str
-    scenario: str
-    env_id: str
     paper: str
     text: str
-    filters: tuple[PaperFilter, ...]
+    simulation: EstimationSimulation
 
 
-def _make_filters(*names: str) -> tuple[PaperFilter, ...]:
-    true = PaperFilter(TRUE_MODEL, "exact-kf", vehicle="true")
-    return (*(PaperFilter(name, name) for name in (*names, "exact-kf", "joint")), true)
+def _make_simulation(scenario: str, env_id: str, *names: str) -> EstimationSimulation:
+    filters = [PaperFilter(name, name) for name in (*names, "exact-kf", "joint")]
+    filters.append(PaperFilter(TRUE_MODEL, "exact-kf", vehicle="true"))
+    return EstimationSimulation(scenario, env_id, scenario, filters, bound=True, control_period=1)
 
 
 EXPERIMENTS = (
     Experiment(
-        "Late camera", "tie-vision-fig7", "sideslip/YawVision-v0", "tie-vision Fig. 7",
+        "Late camera", "tie-vision Fig. 7",
         "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe; camera every "
         "33 ms, 30 ms late.",
-        _make_filters("bicycle-kf", "single-rate-kf", "multirate-kf", "multirate-residual-kf"),
+        _make_simulation("tie-vision-fig7", "sideslip/YawVision-v0", _UNAIDED, "single-rate-kf",
+                         "multirate-kf", "multirate-residual-kf"),
     ),
     Experiment(
-        "GPS, side wind", "dakf-fig6", "sideslip/YawGps-v0", "dakf-stability Fig. 6",
+        "GPS, side wind", "dakf-stability Fig. 6",
         "Lane change at 25 km/h with a side wind from 4 to 8 s and no GPS from 4 to 6 s; the "
         "filters believe in tyres 1.4 times stiffer than they are.",
-        _make_filters("bicycle-kf", "single-rate-kf", "course-kf", "dakf"),
+        _make_simulation("dakf-fig6", "sideslip/YawGps-v0", _UNAIDED, "single-rate-kf",
+                         "course-kf", "dakf"),
     ),
 )  # fmt: skip
 
 
-def _make_env(experiment: Experiment) -> Any:
-    return gym.make(experiment.env_id, scenario=experiment.scenario, control_period=1)
-
-
-def _run_filters(case: tuple[Experiment, Sequence[int]]) -> list[dict[str, tuple[float, float]]]:
-    """Drive some seeds, and run filters: MSE of beta (rad2) and CPU time a tick (us), by name."""
-    experiment, seeds = case
-    env, results = _make_env(experiment), []
-    base = env.unwrapped
-    for seed in seeds:
-        log = rollout(env, seed=seed).log
-        settled, numbers = log.time >= SETTLED - 1e-9, {}
-        for label, estimator in make_filters(experiment.filters, base).items():
-            estimator.run(log)  # gains are designed when they are first asked for
-            start = time.process_time()
-            beta = estimator.run(log)["beta"]
-            us = (time.process_time() - start) / len(settled) * 1e6
-            numbers[label] = float(np.mean((beta - log.truth["beta"])[settled] ** 2)), us
-        facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
-        std = compute_error_bound(record=log.record, **facts)
-        numbers[BOUND] = float(np.mean(std[settled] ** 2)), np.nan
-        results.append(numbers)
-    return results
-
-
 def _measure(request: Request) -> Results:
+    simulations = [experiment.simulation for experiment in EXPERIMENTS]
     seeds = request.episodes or 0
-    drives = request.run_seeds(_run_filters, EXPERIMENTS, seeds, _CHUNK, "estimation")
-    return [{name: np.array([x[name] for x in run]) for name in run[0]} for run in drives]
+    runs = request.run_seeds(run_simulation, simulations, seeds, CHUNK, "estimation")
+    return [(join_numbers(run), run[0].example) for run in runs]
 
 
-def _make_records(numbers: Mapping[str, Array]) -> list[dict[str, Any]]:
-    bound = numbers[BOUND][:, 0]
-    records = []
-    for label, (squares, us) in ((label, columns.T) for label, columns in numbers.items()):
+def _get_squares(numbers: Numbers) -> dict[str, Array]:
+    """Squared errors (rad2) by filter, the bound's last."""
+    return {label: x for (label, quantity), x in numbers.items() if quantity == "square"}
+
+
+def _make_records(numbers: Numbers) -> list[dict[str, Any]]:
+    records, bound = [], numbers[BOUND, "square"]
+    for label, squares in _get_squares(numbers).items():
         record = {"estimator": label, "rmse": interval(squares, root_mean)}
         record |= {"rmse_over_bound": interval(squares, ratio_of_roots, bound)}
+        us = numbers.get((label, "us_per_tick"), np.nan)
         records.append(record | {"us_per_tick": float(np.median(us))})
     return records
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
-    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
+    for experiment, (numbers, _) in zip(EXPERIMENTS, results, strict=True):
         *records, bound = _make_records(numbers)
-        spec, n = _make_env(experiment).spec.to_json(), len(numbers[BOUND])
-        where = {"scenario": experiment.scenario, "spec": spec, "paper": experiment.paper}
-        suite.add_rows(records, experiment.env_id, n=n, **where)
+        simulation, n = experiment.simulation, len(numbers[BOUND, "square"])
+        spec = simulation.make_env().spec
+        where = {"scenario": simulation.name, "spec": spec.to_json() if spec else ""}
+        suite.add_rows(records, simulation.env_id, n=n, paper=experiment.paper, **where)
         title = f"{experiment.paper}: error of the sideslip angle ({n} seeds)"
         records = sorted([bound, *records], key=lambda record: record["rmse"].value)
         suite.tables.append(ResultTable(title, _COLUMNS, records, experiment.text))
@@ -121,8 +99,8 @@ def _add_tables(suite: Suite, results: Results) -> None:
 
 def _compose_verdict(results: Results) -> str:
     firsts, unaided, known = [], [], []
-    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
-        squares = {label: columns[:, 0] for label, columns in numbers.items()}
+    for experiment, (numbers, _) in zip(EXPERIMENTS, results, strict=True):
+        squares = _get_squares(numbers)
         known_labels = [label for label in squares if label not in (TRUE_MODEL, BOUND)]
         leader, *rivals = sorted(known_labels, key=lambda name: squares[name].mean())
         smallest = squares[leader]
@@ -143,23 +121,19 @@ def _compose_verdict(results: Results) -> str:
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
     groups = {}
-    for experiment, numbers in zip(EXPERIMENTS, results, strict=True):
+    for experiment, (numbers, example) in zip(EXPERIMENTS, results, strict=True):
         records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)
         ratios = {record["estimator"]: record["rmse_over_bound"] for record in records}
         groups[f"{experiment.brief} ({experiment.paper})"] = ratios
+        if example is not None:
+            lines = {name: 1e3 * curves["beta"] for name, curves in example.curves.items()}
+            figure = draw.draw_time_series(example.time, lines, "sideslip angle / mrad")
+            title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
+            suite.figures.append((title, figure, experiment.text))
     ratio = "error / the least possible: less is better"
     bars = draw.draw_groups(groups, ratio, {1.0: BOUND})
     text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
     suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
-    for experiment in EXPERIMENTS:
-        env = _make_env(experiment)
-        log = rollout(env, seed=0).log
-        filters = make_filters(experiment.filters, env.unwrapped).items()
-        lines = {"truth": 1e3 * log.truth["beta"]}
-        lines |= {label: 1e3 * filter_.run(log)["beta"] for label, filter_ in filters}
-        figure = draw.draw_time_series(log.time, lines, "sideslip angle / mrad")
-        title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
-        suite.figures.append((title, figure, experiment.text))
 
 
 STUDY = Study(

@@ -139,7 +139,8 @@ def _find_env(
     estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
     """Find an env that suits; its id, its facts, and the untuned estimator."""
-    first = [experiment.env_id for experiment in EXPERIMENTS if experiment.scenario in scenarios]
+    drives = (experiment.simulation for experiment in EXPERIMENTS)
+    first = [simulation.env_id for simulation in drives if simulation.name in scenarios]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
     ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
     refused: dict[str, str] = {}

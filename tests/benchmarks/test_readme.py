@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ from sideslip.benchmarks import readme
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult
 from sideslip.benchmarks.control.tasks import STEERING, TITLES, list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, read_json
-from sideslip.benchmarks.papers.ledger import make_filters
+from sideslip.benchmarks.papers.ledger import join_numbers
+from sideslip.benchmarks.papers.manoeuvres import BOUND, make_filters
 from sideslip.benchmarks.report.study import LETTERS, LINES, Request
 from sideslip.benchmarks.studies import estimation, traffic
 from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
@@ -90,7 +90,7 @@ def test_a_paper_filter_is_measured_as_its_own_simulation_has_it() -> None:
     system = next(x for x in readme.SYSTEMS if x.paper == "dual-rate")
     shown, joint, informed = system.measure(range(2), None)
     (drives,) = (x for x in system.simulations if x.name == "dual-rate-fig4")
-    numbers = drives.measure((0, 1)).numbers
+    numbers = join_numbers(list(drives.run((0, 1))))
     np.testing.assert_array_equal(shown, numbers["pseudo measurement", "beta"])
     assert (informed < np.minimum(shown, joint)).all()
 
@@ -110,33 +110,32 @@ def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPat
         readme._measure_entries("ab12")
 
 
-def _ratio(squares: Mapping[str, Any], of: str, to: str) -> float:
-    return float(np.sqrt(squares[of][:, 0].mean() / squares[to][:, 0].mean()))
+def _ratio(numbers: estimation.Numbers, of: str, to: str) -> float:
+    return float(np.sqrt(numbers[of, "square"].mean() / numbers[to, "square"].mean()))
 
 
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
-    drives = estimation._run_filters((estimation.EXPERIMENTS[1], range(8)))
-    squares = {name: np.array([drive[name] for drive in drives]) for name in drives[0]}
-    assert _ratio(squares, "dakf", "course-kf") <= 0.75
+    numbers = join_numbers(list(estimation.EXPERIMENTS[1].simulation.run(range(8))))
+    assert _ratio(numbers, "dakf", "course-kf") <= 0.75
 
 
 @pytest.mark.long
 def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
     """tie-vision-fig7: within 3 % of the bound; the others in the paper's order where true."""
-    squares, _ = estimation.STUDY.measure(Request(episodes=40))
-    assert _ratio(squares, estimation.TRUE_MODEL, estimation.BOUND) == pytest.approx(1.0, rel=0.03)
+    (numbers, _), _ = estimation.STUDY.measure(Request(episodes=40))
+    assert _ratio(numbers, estimation.TRUE_MODEL, BOUND) == pytest.approx(1.0, rel=0.03)
     for other in ("single-rate-kf", "multirate-kf", "multirate-residual-kf"):
-        assert _ratio(squares, "bicycle-kf", other) >= 1.05
-    assert _ratio(squares, "multirate-residual-kf", "multirate-kf") <= 1.10
+        assert _ratio(numbers, "bicycle-kf", other) >= 1.05
+    assert _ratio(numbers, "multirate-residual-kf", "multirate-kf") <= 1.10
 
 
 @pytest.mark.parametrize("experiment", estimation.EXPERIMENTS)
 def test_an_experiments_filters_exist_at_its_speed(experiment: estimation.Experiment) -> None:
-    base: Any = gym.make(experiment.env_id, scenario=experiment.scenario).unwrapped
+    base: Any = experiment.simulation.make_env().unwrapped
     assert base.held_speed == pytest.approx(25 / 3.6)
-    made = make_filters(experiment.filters, base)
-    assert list(made) == [each.label for each in experiment.filters]
+    made = make_filters(experiment.simulation.filters, base)
+    assert list(made) == [each.label for each in experiment.simulation.filters]
     assert {"exact-kf", "joint"} < {each.name for each in made.values()}
 
 
@@ -152,7 +151,6 @@ def made(*ends: int) -> np.ndarray:
 
 def test_an_episode_is_that_of_the_environment() -> None:
     """Everybody drives the same seeds; without control the first numbers are the env's own."""
-    import gymnasium as gym
 
     env = gym.make(traffic.ID, on_bad_action="fail")
     env.reset(seed=traffic.FIRST_SEED)

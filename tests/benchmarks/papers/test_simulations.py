@@ -1,22 +1,25 @@
 """The ledger's simulations: what they take from a drive, and how dakf-stability's car tracks."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.rollout import Rollout, rollout
+from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
-from sideslip.benchmarks.harness.parallel import split_seeds
-from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS, PaperFilter, make_filters
+from sideslip.benchmarks.papers import dakf_stability, tie_vision
+from sideslip.benchmarks.papers.ledger import join_numbers, run_simulation
 from sideslip.benchmarks.papers.manoeuvres import (
+    BOUND,
+    PAPER_TUNINGS,
+    ControlSimulation,
     EstimationSimulation,
-    FollowingSimulation,
-    SlipSimulation,
+    PaperFilter,
+    make_filters,
 )
-from sideslip.benchmarks.papers.suite import _split_seeds
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
@@ -26,7 +29,8 @@ SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration":
 
 def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
     filters = (PaperFilter("a", "multirate-kf"), PaperFilter("b", "bicycle-kf", vehicle="true"))
-    found = EstimationSimulation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
+    simulation = EstimationSimulation("short", VISION, SHORT, filters, bound=True)
+    found = join_numbers(list(simulation.run((3, 5))))
     env = gym.make(VISION, scenario=SHORT, control_period=10)
     base: Any = env.unwrapped
     for i, seed in enumerate((3, 5)):
@@ -40,49 +44,51 @@ def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
                 name, vehicle=car, sensors=drive.log.slow, speed=base.held_speed
             ).run(drive.log)
             error = (run["gamma"] - truth["gamma"])[late]
-            assert found.numbers[label, "gamma"][i] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert ("a", "y_l") in found.numbers
-    assert ("b", "y_l") not in found.numbers
-    assert found.example is None  # the first seed's, which is in another chunk
-    assert (found.numbers["bound", "beta"] > 0.0).all()
+            assert found[label, "gamma"][i] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert ("a", "y_l") in found and ("b", "y_l") not in found
+    assert (found[BOUND, "beta"] > 0.0).all()
+
+
+def test_the_first_seed_leaves_its_signals() -> None:
+    short = EstimationSimulation("short", VISION, SHORT, (PaperFilter("a", "bicycle-kf"),))
+    first, second = run_simulation((short, (0, 1)))
+    assert first.example is not None and set(first.example.curves) == {"truth", "a"}
+    assert second.example is None and second.numbers.keys() == first.numbers.keys()
 
 
 def test_a_car_that_fails_is_no_estimation() -> None:
     scenario = SHORT | {"half_width": 0.3}
     with pytest.raises(RuntimeError, match="narrow: the car of seed 0 failed"):
-        EstimationSimulation("narrow", VISION, scenario, (PaperFilter("a", "bicycle-kf"),)).measure(
-            (0,)
-        )
+        next(EstimationSimulation("narrow", VISION, scenario, ()).run((0,)))
 
 
 def test_options_of_a_contestant_reach_its_agent() -> None:
-    label = "multirate, stronger"
-    slip = SlipSimulation(
-        "s", "tie-vision-fig8", ("none", "multirate", label), {label: {"gain": 5.0}}
-    )
-    numbers = slip.measure((0,)).numbers
+    names, label = ("none", "multirate"), "multirate, stronger"
+    drivers = {name: tie_vision._DRIVERS[name] for name in names}
+    drivers[label] = drivers["multirate"]._replace(options={"rate": "control", "gain": 5.0})
+    slip = ControlSimulation("s", VISION, "tie-vision-fig8", drivers)
+    numbers = join_numbers(list(slip.run((0,))))
     assert numbers["none", "saturation"] == 0.0
     assert numbers[label, "rms_slip"] < 0.9 * numbers["multirate", "rms_slip"]
     assert numbers[label, "total_variation"] > 2.0 * numbers["multirate", "total_variation"]
 
 
+def follow(scenario: Any) -> ControlSimulation:
+    drawn = next(x for x in dakf_stability.SIMULATIONS if isinstance(x, ControlSimulation))
+    return replace(drawn, scenario=scenario)
+
+
 @QUIET
 def test_following_has_the_reference_beside_the_car() -> None:
-    scenario = {"base": "dakf-fig7", "name": "short", "duration": 1.5}
-    found = FollowingSimulation("f", scenario, {"without": {"agent": "none"}}).measure((0,))
-    assert found.example is not None
-    curves = found.example.curves
-    error = curves["without"]["gamma"] - curves["reference"]["gamma"]
+    label = dakf_stability.WITHOUT
+    simulation = follow({"base": "dakf-fig7", "name": "short", "duration": 1.5})
+    outcome = next(replace(simulation, drivers={label: simulation.drivers[label]}).run((0,)))
+    assert outcome.example is not None
+    curves = outcome.example.curves
+    error = curves[label]["gamma"] - curves["reference"]["gamma"]
     expected = np.sqrt(np.mean(error**2))
-    assert found.numbers["without", "rms_gamma"] == pytest.approx(expected)
-    assert found.numbers["without", "saturated"] == 0.0
-
-
-def test_seeds_are_split_and_shared() -> None:
-    assert split_seeds(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
-    following = FollowingSimulation("f", "dakf-fig7", {}, share=0.25)
-    assert _split_seeds(following, 8) == [(0, 1)]
-    assert _split_seeds(following, 1) == [(0,)]
+    assert outcome.numbers[label, "rms_yaw_error"] == pytest.approx(expected)
+    assert outcome.numbers[label, "full_command"] == 0.0
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:
@@ -118,37 +124,36 @@ FIG7: dict[str, Any] = {
 }
 
 
-def drive(seed: int, scenario: Any, **options: Any) -> tuple[Rollout, dict[str, float]]:
-    return FollowingSimulation("f", scenario, {"a": options})._run_episode("a", seed)
-
-
-def compared(seeds: Iterable[int], scenario: Any, **options: Any) -> dict[str, Any]:
+def compared(seeds: Iterable[int], scenario: Any) -> dict[str, Any]:
     """With control over without it, (seeds,) each: RMS errors of beta and gamma, peak of beta.
 
-    `saturated` and `failed` are those with control. options: of the controller.
+    `full_command` and `failed` are those with control.
     """
     rows = []
     for seed in seeds:
-        _, none = drive(seed, scenario, agent="none")
-        episode, ours = drive(seed, scenario, **options)
+        _, none = follow(scenario).drive(dakf_stability.WITHOUT, seed)
+        episode, ours = follow(scenario).drive(dakf_stability.WITH, seed)
         ours["failed"] = episode.failed
-        ratios = {x: ours[x] / none[x] for x in ("rms_beta", "rms_gamma", "peak_beta")}
+        ratios = {x: ours[x] / none[x] for x in ("rms_slip_error", "rms_yaw_error", "peak_slip")}
         rows.append(ours | ratios)
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 @QUIET
 def test_the_numbers_are_those_of_the_episode() -> None:
-    episode, found = drive(0, FIG7 | {"duration": 2.0})
-    assert found["rms_beta"] == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
-    assert found["rms_gamma"] == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
-    assert found["peak_beta"] == np.max(np.abs(episode["beta"]))
+    simulation = follow(FIG7 | {"duration": 2.0})
+    episode, found = simulation.drive(dakf_stability.WITH, 0)
+    assert found["rms_slip_error"] == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
+    assert found["rms_yaw_error"] == np.sqrt(
+        np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2)
+    )
+    assert found["peak_slip"] == np.max(np.abs(episode["beta"]))
     assert not episode.failed
     assert episode["t"][-1] == 2.0
     assert len(episode["t"]) == 2001
     assert 0.0 < np.abs(episode["action_1"]).max() < 1.0
-    _, none = drive(0, FIG7 | {"duration": 2.0}, agent="none")
-    assert none["saturated"] == 0.0
+    _, none = simulation.drive(dakf_stability.WITHOUT, 0)
+    assert none["full_command"] == 0.0
 
 
 @QUIET
@@ -156,8 +161,8 @@ def test_the_numbers_are_those_of_the_episode() -> None:
 def test_control_tracks_better_than_none() -> None:
     """Worst of ten seeds: beta at most 0.80 of the error without control, gamma 0.50."""
     found = compared(range(10), FIG7)
-    assert found["rms_beta"].max() <= 0.80
-    assert found["rms_gamma"].max() <= 0.50
+    assert found["rms_slip_error"].max() <= 0.80
+    assert found["rms_yaw_error"].max() <= 0.50
     assert not found["failed"].any()
 
 
@@ -165,5 +170,5 @@ def test_control_tracks_better_than_none() -> None:
 @pytest.mark.long
 def test_a_larger_step_saturates_the_motors() -> None:
     small, large = (compared(range(3), FIG7 | {"amplitude": a}) for a in (0.06, 0.1))
-    assert (large["saturated"] > 3.0 * small["saturated"]).all()
-    assert (large["saturated"] > 0.02).all()
+    assert (large["full_command"] > 3.0 * small["full_command"]).all()
+    assert (large["full_command"] > 0.02).all()

@@ -9,6 +9,7 @@ from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Bound, Estimate
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.ledger import Claim, ClaimPart, MeasuredClaim, MeasuredPart
+from sideslip.benchmarks.papers.manoeuvres import BOUND
 from sideslip.benchmarks.procedures import iso
 from sideslip.benchmarks.procedures import suite as procedures
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ProcedureCase
@@ -52,10 +53,10 @@ def test_an_interval_that_reaches_one_is_a_tie() -> None:
 def errors(levels: dict[str, float], experiment: estimation.Experiment) -> Any:
     """Squared errors of 50 seeds, of those not named 16."""
     common = RNG.lognormal(0.0, 0.3, 50)
-    labels = [each.label for each in experiment.filters]
+    labels = [each.label for each in experiment.simulation.filters]
     scales = {label: levels.get(label, 16.0) * RNG.lognormal(0.0, 0.05, 50) for label in labels}
-    scales[estimation.BOUND] = np.ones(50)
-    return {label: np.stack([scale * common, scale], 1) for label, scale in scales.items()}
+    scales[BOUND] = np.ones(50)
+    return {(label, "square"): scale * common for label, scale in scales.items()}, None
 
 
 def test_the_best_estimator_is_named_for_each_experiment() -> None:
@@ -79,7 +80,7 @@ def claim(paper: str, stated: str, value: float) -> Any:
 
 def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
     ledger = [claim("one", "<", 0.5), claim("one", ">", 0.5), claim("two", "<", 0.1)]
-    counts, by, failed, missed, _ = fits(papers._compose_verdict(papers.LedgerResults(ledger, {})))
+    counts, by, failed, missed, _ = fits(papers._compose_verdict((ledger, {})))
     assert counts == "3 claims of 2 papers: 2 reproduced, 1 not reproduced."
     assert "one 1 of 2; two 1 of 1" in by
     assert failed.startswith("Not reproduced: one Fig. 1.")

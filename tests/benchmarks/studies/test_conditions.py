@@ -32,7 +32,7 @@ SHORT = 3.0  # s
 def drive(name: str, seed: int = 0, **changes: Any) -> tuple[Log, Log, Any]:
     """A drive, the same with the condition's error, and the env."""
     condition = dataclasses.replace(NAMED[name], **changes)
-    log, base, _ = conditions._drive_car(condition, seed)
+    log, base = conditions._drive_car(condition, seed)
     return log, conditions._apply_edit(condition.edit, log, seed), base
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
+from sideslip.benchmarks.papers.manoeuvres import PAPER_TUNINGS
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger import PAPER_TUNINGS
+from sideslip.benchmarks.papers.manoeuvres import PAPER_TUNINGS
 from sideslip.estimators import make_estimator
 from tests.estimators.simulation import CAMERA, FIG6, FIG7, GPS, error, simulate
 
