@@ -177,7 +177,7 @@ def _format_key(name: str) -> str:
 
 
 def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT:
-    """Make a dataclass's instance from JSON, lists for tuples; ValueError for what does not fit.
+    """Make a dataclass's instance, and those in it, from JSON, lists for tuples; else ValueError.
 
     Args:
         kind: Dataclass of the instance.
@@ -191,11 +191,16 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
     for what, names in (("unknown", entry.keys() - known), ("missing", required - entry.keys())):
         if names:
             raise ValueError(f"{where}: {what} {join_names(sorted(names))}")
-    lists = {name: value for name, value in entry.items() if isinstance(value, list)}
-    tuples = {n: tuple(v) for n, v in lists.items() if get_origin(known[n].type) is tuple}
-    check_types(kind, entry | tuples, where)
+    values: dict[str, Any] = {}
+    for name, value in entry.items():
+        expected: Any = known[name].type
+        is_tuple = isinstance(value, list) and get_origin(expected) is tuple
+        values[name] = tuple(value) if is_tuple else value
+        if hasattr(expected, "__dataclass_fields__"):
+            values[name] = from_json(expected, value, f"{where}: {name}")
+    check_types(kind, values, where)
     try:
-        return kind(**entry | tuples)
+        return kind(**values)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -160,6 +160,6 @@ def test_a_training_goes_on_from_its_checkpoint(
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
     monkeypatch.setattr(callbacks, "__version__", "0.2.0")
     saved = callbacks.read_training(folder)
-    found = Trainer(saved.task, saved.checkpoint.steps, folder, resume=True).train()
+    found = Trainer(saved.task, saved.steps, folder, resume=True).train()
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

@@ -101,15 +101,28 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a training beside its tensors, in JSON types."""
+    """The state of a training beside its tensors, of JSON types."""
 
     groups: dict[str, Any]  # `param_groups` of each optimiser
     sideslip: str  # version of the package
-    task: dict[str, Any]  # fields of `TrainingTask`
+    task: TrainingTask
     steps: int  # so far
-    aim: dict[str, Any]  # fields of `RunRecord`
+    aim: RunRecord
     scaling: list[Any]  # of the observations: `Standardisation`
     evaluations: list[Any]  # so far
+
+    def load_initial_policy(self, folder: Path) -> Policy | None:
+        """Load the policy that it started from, under its own name; None for another training.
+
+        Args:
+            folder: Folder of the training.
+        """
+        name, file = self.aim.begun_with, folder / INITIAL_FILE
+        if not name:
+            return None
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
+        return replace(load_policy(file), name=name)
 
 
 class EvalCallback(BaseCallback):
@@ -250,10 +263,10 @@ class EvalCallback(BaseCallback):
             else:
                 tensors |= {f"{part}/{name}": value for name, value in state.items()}
         tensors |= {f"{_VARIABLES}/{k}": value for k, value in self._get_variables().items()}
-        records = asdict(self.task), self.model.num_timesteps, asdict(self.run_record)
+        records = self.task, self.model.num_timesteps, self.run_record
         now = Checkpoint(groups, __version__, *records, list(self.scaling), self.evaluations)
         plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
-        text = json.dumps({"format": _FORMAT} | vars(now), allow_nan=False)
+        text = json.dumps({"format": _FORMAT} | asdict(now), allow_nan=False)
         write_atomic(self.folder / CHECKPOINT, save(plain, {"checkpoint": text}))
 
     def _write_zoo_evaluation(self, costs: Array, lengths: Array) -> None:
@@ -297,26 +310,8 @@ class EvalCallback(BaseCallback):
         self.model.set_parameters(parts, device=self.model.device)
 
 
-class SavedTraining(NamedTuple):
-    """A training as its folder has it."""
-
-    folder: Path
-    task: TrainingTask
-    record: RunRecord
-    checkpoint: Checkpoint
-
-    def load_initial_policy(self) -> Policy | None:
-        """Load the policy that it started from, under its own name; None for another training."""
-        name, file = self.record.begun_with, self.folder / INITIAL_FILE
-        if not name:
-            return None
-        if not file.is_file():
-            raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
-        return replace(load_policy(file), name=name)
-
-
-def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
-    """Read a folder's training from its checkpoint; ValueError for another version.
+def read_training(folder: str | Path, **arguments: Any) -> Checkpoint:
+    """Read the checkpoint of a folder's training; ValueError for another version.
 
     Args:
         folder: Folder of the training; FileNotFoundError without a checkpoint.
@@ -334,11 +329,11 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         raise ValueError(f"{path} is no checkpoint: its state is no JSON ({error})") from None
     if not isinstance(state, dict) or state.pop("format", 0) != _FORMAT:
         raise ValueError(f"{path} is no checkpoint of this format ({_FORMAT})")
-    checkpoint = from_json(Checkpoint, state, f"{path}: the checkpoint")
-    if checkpoint.sideslip != __version__:
-        text = f"{path} was made by sideslip {checkpoint.sideslip}, this is {__version__}"
+    if (version := state.get("sideslip", __version__)) != __version__:
+        text = f"{path} was made by sideslip {version}, this is {__version__}"
         raise ValueError(f"{text}, whose cars and costs may be others: train anew, elsewhere")
-    task = from_json(TrainingTask, checkpoint.task, f"{path}: the task")
+    checkpoint = from_json(Checkpoint, state, f"{path}: the checkpoint")
+    task = checkpoint.task
     try:
         check_names_no_code(task.env_id, task.estimator, task.estimator_options)
     except ValueError as error:
@@ -347,8 +342,7 @@ def read_training(folder: str | Path, **arguments: Any) -> SavedTraining:
         if value != getattr(task, name):
             text = f"{path} is of {name} {getattr(task, name)!r}, not {value!r}"
             raise ValueError(f"{text}: train that in another folder")
-    record = from_json(RunRecord, checkpoint.aim, f"{path}: the aim")
-    return SavedTraining(Path(folder), task, record, checkpoint)
+    return checkpoint
 
 
 def _compute_equal_weights(costs: Array) -> Array:

@@ -158,8 +158,8 @@ class Trainer:
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
         self._checkpoint: Checkpoint | None = None
         if self.resume:
-            saved = read_training(self._folder, **asdict(self.task))
-            self._checkpoint, self.initial = saved.checkpoint, saved.load_initial_policy()
+            self._checkpoint = read_training(self._folder, **asdict(self.task))
+            self.initial = self._checkpoint.load_initial_policy(self._folder)
         elif (self._folder / CHECKPOINT).exists():
             text = f"{self._folder} holds a training already: go on with it (resume), or"
             raise ValueError(f"{text} take another folder")

@@ -280,11 +280,13 @@ class _Train:
         folder = _choose_folder(task, start, out, logs)
         file = folder / callbacks.POLICY
         if self.conf_file is not None:
-            initial = callbacks.read_training(folder).load_initial_policy() if resume else agent
+            initial = agent
+            if resume:
+                initial = callbacks.read_training(folder).load_initial_policy(folder)
             options["settings"] = resolve_settings(self.conf_file, task.algo, task.env_id, initial)
         if resume:
             saved = callbacks.read_training(folder, **options)
-            task, record = saved.task, saved.record
+            task, record = saved.task, saved.aim
         else:
             task = new(**options)
             usual = int(task.settings["n_timesteps"]), callbacks.RunOptions.eval_freq

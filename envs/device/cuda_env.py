@@ -37,6 +37,7 @@ from .cuda_kernel import (
     WORDS,
     DeviceArrays,
     KernelConstants,
+    Real,
     make_constants,
     make_kernel,
     make_specification,
@@ -53,9 +54,7 @@ _SIMULATED_BLOCK = 4
 _Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
 
 
-def get_ptx(
-    constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
-) -> str:
+def get_ptx(constants: KernelConstants, real: Real, capability: _Capability) -> str:
     """Get a kernel's PTX, from the disk or compiled.
 
     Args:
@@ -83,9 +82,7 @@ def _hash_text(text: bytes) -> bytes:
     return f"// {hashlib.sha256(text).hexdigest()}".encode()
 
 
-def _compile_ptx(
-    constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
-) -> str:
+def _compile_ptx(constants: KernelConstants, real: Real, capability: _Capability) -> str:
     """Compile the kernel's PTX."""
     specification = make_specification(constants, real, 1, 1)
     pointers = [types.CPointer(from_dtype(np.dtype(dtype))) for dtype, _ in specification]
@@ -149,9 +146,7 @@ class _DriverKernel:
         return values[0] if values else None
 
 
-def _load_kernel(
-    constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
-) -> Any:
+def _load_kernel(constants: KernelConstants, real: Real, device: torch.device) -> Any:
     """Load a kernel: a function of the number of rows, whether they are reset, and `DeviceArrays`.
 
     In numba's simulator it is plain Python, a thread after the other.

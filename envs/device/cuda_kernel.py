@@ -39,6 +39,7 @@ with require_extra("cuda", "the CUDA engine needs numba-cuda"):
     import numba_cuda as numba_cuda  # makes sure of it: numba's own `cuda` is an older one
 
 _Function = Callable[..., Any]
+Real = type[np.floating[Any]]  # float64 or float32
 SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 """Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
 
@@ -137,9 +138,7 @@ class DeviceArrays(NamedTuple):
     counts: Matrix  # of ticks and of packets
 
 
-def make_specification(
-    constants: KernelConstants, real: type[np.floating[Any]], N: int, starts: int
-) -> DeviceArrays:
+def make_specification(constants: KernelConstants, real: Real, N: int, starts: int) -> DeviceArrays:
     """Make (type, shape) of each array, in place of the arrays.
 
     Args:
@@ -223,7 +222,7 @@ def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, repor
         m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
 
 
-def _to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
+def _to_cuda(function: Any, real: Real) -> Any:
     """Rebuild a function compiled by `jit`, and its callees; plain Python in the simulator."""
 
     def finish(rebuilt: Any) -> Any:
@@ -243,7 +242,7 @@ _SINGLE: dict[str, _Function] = {
 """Primitives of the simulator's float32: a word's 32 bits are those of a float."""
 
 
-def _set_precision(function: Any, real: Any) -> None:
+def _set_precision(function: Any, real: Real) -> None:
     """Give the function's literals and global numbers a precision, so that no float64 enters."""
     names, code = function.__globals__, function.__code__
     function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
@@ -252,7 +251,7 @@ def _set_precision(function: Any, real: Any) -> None:
             names[name] = real if name == "float" else _convert_literals(names[name], real)
 
 
-def _convert_literals(value: Any, real: Any) -> Any:
+def _convert_literals(value: Any, real: Real) -> Any:
     """Convert the floats of a value and of nested tuples."""
     if isinstance(value, float):
         return real(value)
@@ -262,7 +261,7 @@ def _convert_literals(value: Any, real: Any) -> Any:
     return value
 
 
-def _make_table(real: Any) -> dict[str, _Function]:
+def _make_table(real: Real) -> dict[str, _Function]:
     """Make CUDA's own primitives by the names that the equations use; Python's serve for others."""
     from numba.cuda import libdevice
 
@@ -328,7 +327,7 @@ def _store_element(array, value, i, j=None):
     return _build_function(text)
 
 
-def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
+def make_kernel(constants: KernelConstants, real: Real) -> Any:
     """Make the kernel, a function of N, whether rows are reset, and pointers to `DeviceArrays`.
 
     Args:

@@ -76,6 +76,9 @@ class StepOutcome(NamedTuple):
     delivered: Tensor  # packets that count, int64, (N,)
 
 
+_Stepped = tuple[TorchState, StepOutcome]
+
+
 class _InfoValues(NamedTuple):
     """Numbers of `info` from the last tick of a car; (N,) each."""
 
@@ -139,9 +142,7 @@ class TorchStep:
             parts = list(map(compile_method, parts))
         self.finish_step, self._tick, self._window = parts
 
-    def __call__(
-        self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor
-    ) -> tuple[TorchState, StepOutcome]:
+    def __call__(self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor) -> _Stepped:
         """Step all cars; those that are over stand still, those with a non-finite action fail.
 
         p is (PARAMS_WIDTH, N), keys (2, N) int64, actions (N, width) of the floats of p.
@@ -244,9 +245,7 @@ class TorchStep:
             select_cars(alive, next_state.motion, tick_state.track),
         )
 
-    def _finish_step(
-        self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked
-    ) -> tuple[TorchState, StepOutcome]:
+    def _finish_step(self, p: Tensor, keys: Tensor, state: TorchState, ticked: _Ticked) -> _Stepped:
         """Do slow sensors, observation and report of a step whose ticks are integrated."""
         tick_state, rows, track, running, refused = ticked
         cars = tick_state.cars
@@ -349,9 +348,7 @@ class TorchReset:
             compute_target_angle, compute_first_row, compute_reference, compute_sideslip_angle,
         )  # fmt: skip
 
-    def __call__(
-        self, p: Tensor, keys: Tensor, state: TorchState
-    ) -> tuple[TorchState, StepOutcome]:
+    def __call__(self, p: Tensor, keys: Tensor, state: TorchState) -> _Stepped:
         """Compute (state, outcome) at tick 0 from the state that a reset left."""
         kind, functions = self._step.kind, self._functions
         params, zero = functions.make_step_params(p), torch.zeros_like(state.tick)
@@ -378,7 +375,7 @@ class TorchReset:
             tick=state.tick - 1.0, slow=self._rewind_sensors(p, keys, state.slow), queue=empty_queue
         )
         rows = torch.stack(row).expand(self._step.n, -1, -1)  # tick 0 stands for every sample
-        result: tuple[TorchState, StepOutcome] = self._step.finish_step(
+        result: _Stepped = self._step.finish_step(
             p, keys, previous, _Ticked(tick_state, rows, state.motion[None], all_cars, ~all_cars)
         )
         return result

@@ -6,15 +6,16 @@ The table in the docs is made of both.
 """
 
 import dataclasses
+from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..io import read_document
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
-from ..numerics.packed import make_offsets, read
+from ..numerics.packed import read
 from ..numerics.primitives import Scalar, Vector, select
 from ..validation import check_choice, describe_unknown, is_finite, short_repr
 from ..vehicle.dynamics import CarParams
@@ -38,78 +39,24 @@ def get_range(value: Range | None) -> tuple[float, float]:
     return float(low), float(high)
 
 
-class Draws(NamedTuple):
-    """The quantities that a scenario gives as a number or a range."""
-
-    speed: Scalar  # m/s
-    friction: Scalar
-    front_stiffness: Scalar  # factor on the vehicle's
-    rear_stiffness: Scalar
-    onset: Scalar  # s
-    amplitude: Scalar  # rad
-    amplitude_2: Scalar  # rad, of the second pair of a random steering
-    frequency: Scalar  # Hz
-    frequency_2: Scalar
-    frequency_3: Scalar
-    frequency_4: Scalar
-    hold: Scalar  # s, of a step, a dwell, a ramp, a sweep; from one lane change to the next
-    wind_force: Scalar  # N
-    wind_arm: Scalar  # m, ahead of the centre of gravity
-    wind_start: Scalar  # s
-    wind_length: Scalar  # s
-    side: Scalar  # uniform in (0, 1): below a half the steering is mirrored
-    wind_side: Scalar
-    curvature: Scalar  # 1/m, of the road
-    path_speed: Scalar  # m/s at which a track has its standard's lengths; 0 always
-    friction_right: Scalar  # 0 as on the left
-    tyre_change_time: Scalar  # s; 0 never
-    front_change: Scalar  # factors on the stiffness from then on
-    rear_change: Scalar
-    gyro_bias: Scalar  # rad/s
-    accel_y_bias: Scalar  # m/s2
-    gps_latency: Scalar  # s, on top of the GPS's delays
-    bank: Scalar  # rad
-    initial_beta: Scalar  # rad, where the episode begins
-    initial_gamma: Scalar  # rad/s
-    # from here on the ranges of a `World`, in its order
-    camera_yaw: Scalar  # rad
-    camera_pitch: Scalar  # rad
-    camera_height: Scalar
-    steer_offset: Scalar  # rad
-    steer_scale: Scalar
-    wheel_scale: Scalar
-    wheel_left: Scalar
-    torque_scale: Scalar
-    torque_left: Scalar
-    torque_rate: Scalar  # 1/s
-    gyro_scale: Scalar
-    gyro_drift: Scalar  # rad/s2
-    accel_scale: Scalar
-    accel_roll: Scalar  # rad
-    accel_ahead: Scalar  # m
-    vibration: Scalar  # m/s2
-    course_error: Scalar  # rad m/s
-    course_period: Scalar  # s
-    gps_stamp: Scalar  # s
-    map_error: Scalar  # 1/m
-    map_length: Scalar  # m
-    map_lag: Scalar  # s
-    load: Scalar
-    inertia: Scalar
-    gravity_shift: Scalar
-    bank_wave: Scalar  # rad
-    bank_length: Scalar  # m
-    gust: Scalar  # m/s2
-    friction_wave: Scalar
-    friction_length: Scalar  # m
-    friction_across: Scalar
-    relaxation: Scalar
-    phase: Scalar  # uniform in (0, 1): where the waves of a world begin
-    friction_change: Scalar  # factor on the friction from the tyres' change on
-    critical_speed: Scalar  # least critical speed of a drawn car, over its speed
-
-
-DRAWS, DRAWS_WIDTH = make_offsets(Draws)
+# Quantities that a scenario gives as a number or a range, then those of a `World`, by the names and
+# in the units of their fields; 0 stands for None. Uniform in (0, 1) are side and wind_side, below a
+# half mirrored, and phase, where the waves of a world begin. A new one goes to the end, as its
+# place chooses its random number.
+Draws = namedtuple(
+    "Draws",
+    "speed friction front_stiffness rear_stiffness onset amplitude amplitude_2 frequency "
+    "frequency_2 frequency_3 frequency_4 hold wind_force wind_arm wind_start wind_length side "
+    "wind_side curvature path_speed friction_right tyre_change_time front_change rear_change "
+    "gyro_bias accel_y_bias gps_latency bank initial_beta initial_gamma "
+    "camera_yaw camera_pitch camera_height steer_offset steer_scale wheel_scale wheel_left "
+    "torque_scale torque_left torque_rate gyro_scale gyro_drift accel_scale accel_roll accel_ahead "
+    "vibration course_error course_period gps_stamp map_error map_length map_lag load inertia "
+    "gravity_shift bank_wave bank_length gust friction_wave friction_length friction_across "
+    "relaxation phase friction_change critical_speed",
+)
+DRAWS_WIDTH = len(Draws._fields)
+DRAWS = Draws(*range(DRAWS_WIDTH))
 
 
 @jit

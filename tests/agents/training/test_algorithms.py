@@ -141,7 +141,7 @@ def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.M
     means = RunOptions(eval_freq=ROLLOUT, report=spoil)
     with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
         trainer.Trainer(tiny(algo), 3 * ROLLOUT, tmp_path, run_options=means).train()
-    assert read_training(tmp_path).checkpoint.steps == ROLLOUT
+    assert read_training(tmp_path).steps == ROLLOUT
 
 
 @pytest.mark.parametrize("algo", ["tqc", "recurrent-ppo"])

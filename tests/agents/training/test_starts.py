@@ -26,6 +26,7 @@ from sideslip.agents.training.callbacks import (
     EvalCallback,
     Evaluation,
     RunOptions,
+    RunRecord,
     _make_evaluation_seeds,
     read_training,
 )
@@ -147,7 +148,8 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     if steps:
         monkeypatch.setattr(EvalCallback, "load_parameters", lambda *_: None)
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-        training._checkpoint = Checkpoint({}, "", {}, steps, {}, list(scaling), [])
+        aim = RunRecord(400, 1)
+        training._checkpoint = Checkpoint({}, "", task, steps, aim, list(scaling), [])
     model: Any = training.build().model
     driver, cars = network, model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
@@ -214,7 +216,7 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     again = Trainer(task, 96, tmp_path, resume=True).train()
     card = load_policy(tmp_path / "policy.safetensors").card
     assert card.algorithm_options["begun_with"] == "distill-coms-yaw"
-    assert read_training(tmp_path).load_initial_policy() is not None
+    assert read_training(tmp_path).load_initial_policy(tmp_path) is not None
     assert again.evaluations[: len(found.evaluations)] == found.evaluations
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()

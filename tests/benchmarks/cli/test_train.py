@@ -62,10 +62,10 @@ def test_it_goes_on_with_a_folder(
     assert len((tmp_path / folder / CURVE).read_text().splitlines()) == 3
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
-    aim = read_training(folder).record
+    aim = read_training(folder).aim
     assert (aim.steps, aim.eval_freq) == (768, 512) and aim.command.count("sideslip train") == 3
     assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
-    assert read_training(folder).record == aim
+    assert read_training(folder).aim == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
     settings = (tmp_path / "mine.yml", "sideslip/YawGps-v0:\n  n_envs: 8\n  policy: MlpPolicy\n")
