@@ -117,8 +117,8 @@ def test_rows_and_a_session_are_read() -> None:
         "control", "tier 1", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12, salt="ab12"
     )
     assert read_json(OLD / "rows.json") == [row]
-    assert controller.Session(OLD / "session.slip").setup["estimator"] == "exact-kf"
-    ((batches, _),) = controller.Session(OLD / "session.slip").blocks
+    assert controller.read_setup(OLD / "session.slip")["estimator"] == "exact-kf"
+    ((batches, _),) = controller.read_blocks(OLD / "session.slip")
     found = [messages.decode(arrival.data) for batch in batches for arrival in batch]
     kinds = [getattr(each, "kind", each) for each in found]
     assert kinds == [messages.DatagramKind.INERTIAL, messages.DatagramKind.END]

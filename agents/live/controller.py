@@ -10,7 +10,6 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
@@ -81,11 +80,13 @@ class OnboardController:
         self._outputs = NO_OUTPUTS._replace(X=X, S=S)
         # estimated states and their standard deviations, shape (n,), written anew by every tick
         self.x, self.std = X[0], S[0]
+        self.digest = 0  # CRC-32 of all estimates
         self._begin(0)
         row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
             self.take(Tick(number, row, 0.0, packet, number == 0))
         self._begin(0)
+        self.digest = 0
 
     @property
     def refused(self) -> dict[str, int]:
@@ -124,6 +125,7 @@ class OnboardController:
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
             self.x[:], self.std[:] = self.estimator.x, compute_std(self.estimator.P)
+        self.digest = zlib.crc32(self.std.tobytes(), zlib.crc32(self.x.tobytes(), self.digest))
         self._rows[self._count] = row
         self._count += 1
         self._packets.append(tick.packets)
@@ -179,20 +181,14 @@ class Recorder:
         self._file.write(MAGIC + _LENGTH.pack(len(text)) + text)
         self._items, self._batches, self._digest = bytearray(), 0, 0
 
-    def note(self, onboard: OnboardController) -> None:
-        """Add an estimate to the checksum.
-
-        Args:
-            onboard: On-board controller after a tick.
-        """
-        self._digest = _update_digest(onboard, self._digest)
-
-    def take(self, accepted: list[bytes]) -> None:
+    def take(self, accepted: list[bytes], digest: int) -> None:
         """Record the accepted datagrams of a batch.
 
         Args:
             accepted: Datagrams of the batch.
+            digest: `OnboardController.digest` after it.
         """
+        self._digest = digest
         for data in accepted:
             self._items += _ITEM.pack(self._batches, len(data)) + data
         self._batches += 1
@@ -211,11 +207,6 @@ class Recorder:
         self._file.close()
 
 
-def _update_digest(onboard: OnboardController, digest: int) -> int:
-    """Update the CRC-32 of all estimates by the newest one."""
-    return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
-
-
 def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     """Parse the datagrams of each batch; None for data that no recorder wrote."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
@@ -229,59 +220,64 @@ def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     return batches if offset == len(data) else None
 
 
-@dataclass(frozen=True)
-class Session:
-    """A recorded session on disk; ValueError for a file that is none."""
+def _read_header(file: BinaryIO, path: Path | str) -> dict[str, Any]:
+    """Read a session's setup; ValueError for a file that is none."""
+    if file.read(len(MAGIC)) == MAGIC:
+        with suppress(ValueError, RecursionError, struct.error):
+            setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
+            if isinstance(setup, dict):
+                return setup
+    text = "no session of `sideslip live --record`, or only its beginning"
+    raise ValueError(f"{path} is {text}")
 
-    path: Path | str
 
-    def _read_header(self, file: BinaryIO) -> dict[str, Any]:
-        if file.read(len(MAGIC)) == MAGIC:
-            with suppress(ValueError, RecursionError, struct.error):
-                setup = json.loads(file.read(*_LENGTH.unpack(file.read(_LENGTH.size))))
-                if isinstance(setup, dict):
-                    return setup
-        text = "no session of `sideslip live --record`, or only its beginning"
-        raise ValueError(f"{self.path} is {text}")
+def read_setup(path: Path | str) -> dict[str, Any]:
+    """Read the setup of a session, in JSON types; ValueError for an incomplete one.
 
-    @property
-    def setup(self) -> dict[str, Any]:
-        """The setup in JSON types; ValueError for an incomplete one."""
-        with open(self.path, "rb") as file:
-            setup = self._read_header(file)
-        wrong = [name for name, x in _SETUP.items() if not isinstance(setup.get(name, ...), x)]
-        if wrong:
-            text = f"{self.path}: its setup lacks {', '.join(wrong)}"
-            raise ValueError(f"{text}, or has it of another type")
-        return setup
+    Args:
+        path: File of a `Recorder`; ValueError for another file.
+    """
+    with open(path, "rb") as file:
+        setup = _read_header(file, path)
+    if wrong := [name for name, x in _SETUP.items() if not isinstance(setup.get(name, ...), x)]:
+        text = f"{path}: its setup lacks {', '.join(wrong)}"
+        raise ValueError(f"{text}, or has it of another type")
+    return setup
 
-    @property
-    def blocks(self) -> Iterator[tuple[list[list[Arrival]], int]]:
-        """Batches of datagrams and the checksum of all estimates after them, as far as sound."""
-        with open(self.path, "rb") as file:
-            self._read_header(file)
-            while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
-                magic, count, size, check, digest = _BLOCK.unpack(head)
-                is_sound = magic == _BLOCK_MAGIC and count <= MAX_BATCHES
-                data = file.read(size) if is_sound else b""
-                if not is_sound or len(data) != size or zlib.crc32(data) != check:
-                    return
-                if (batches := _parse_batches(data, count)) is None:
-                    return
-                yield batches, digest
 
-    def replay(self, onboard: OnboardController, patience: int | None) -> tuple[int, bool]:
-        """Replay the session; the number of ticks, and whether its checksums are the estimates'.
+def read_blocks(path: Path | str) -> Iterator[tuple[list[list[Arrival]], int]]:
+    """Read batches of datagrams and the checksum of all estimates after them, as far as sound.
 
-        Args:
-            onboard: On-board controller made from the session's setup.
-            patience: Batches without a fast row before the last row is held; None: no limit.
-        """
-        synchroniser, digest, ticks, same = StreamSynchroniser(patience), 0, 0, True
-        for batches, block_digest in self.blocks:
-            for tick in chain.from_iterable(map(synchroniser.take, batches)):
-                onboard.take(tick)
-                digest = _update_digest(onboard, digest)
-                ticks += 1
-            same = same and digest == block_digest
-        return ticks, same
+    Args:
+        path: File of a `Recorder`; ValueError for another file.
+    """
+    with open(path, "rb") as file:
+        _read_header(file, path)
+        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+            magic, count, size, check, digest = _BLOCK.unpack(head)
+            is_sound = magic == _BLOCK_MAGIC and count <= MAX_BATCHES
+            data = file.read(size) if is_sound else b""
+            if not is_sound or len(data) != size or zlib.crc32(data) != check:
+                return
+            if (batches := _parse_batches(data, count)) is None:
+                return
+            yield batches, digest
+
+
+def replay_session(
+    path: Path | str, onboard: OnboardController, patience: int | None
+) -> tuple[int, bool]:
+    """Replay a session; the number of ticks, and whether its checksums are the estimates'.
+
+    Args:
+        path: File of a `Recorder`; ValueError for another file.
+        onboard: On-board controller made from the session's setup.
+        patience: Batches without a fast row before the last row is held; None: no limit.
+    """
+    synchroniser, ticks, same, onboard.digest = StreamSynchroniser(patience), 0, True, 0
+    for batches, block_digest in read_blocks(path):
+        for tick in chain.from_iterable(map(synchroniser.take, batches)):
+            onboard.take(tick)
+            ticks += 1
+        same = same and onboard.digest == block_digest
+    return ticks, same

@@ -332,10 +332,8 @@ class Loop:
             ticks += 1
             statistics.ticks += 1
             self._send(tick)
-            if self.recorder is not None:
-                self.recorder.note(onboard)
         if self.recorder is not None:
-            self.recorder.take(self.assembler.accepted)
+            self.recorder.take(self.assembler.accepted, onboard.digest)
         return ticks
 
     def _send(self, tick: Tick) -> None:

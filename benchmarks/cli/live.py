@@ -162,11 +162,10 @@ class _Live:
         """Process a session again, and compare the estimates."""
         from ...agents import AGENTS
         from ...agents.learned.policy import check_names_no_code
-        from ...agents.live.controller import OnboardController, Session
+        from ...agents.live.controller import OnboardController, read_setup, replay_session
         from ...estimators.filters import FILTERS
 
-        recorded = Session(path)
-        setup = recorded.setup
+        setup = read_setup(path)
         for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
             if requested[kind] not in (None, "none", setup.get(kind)):
                 raise ValueError(f"{path} is of {kind} {setup[kind]}, not {requested[kind]}")
@@ -177,7 +176,7 @@ class _Live:
         check_names_no_code(unasked, "", setup["estimator_options"])
         driver = common.make_driver(requested | setup, self.trust)
         onboard = OnboardController(*driver, setup["seed"])
-        ticks, same = recorded.replay(onboard, setup["patience"])
+        ticks, same = replay_session(path, onboard, setup["patience"])
         text = "those of the session bit for bit" if same else "NOT those of the session"
         console.print(f"{ticks} ticks; the estimates are {text}")
         self._write(setup | {"ticks": ticks, "same": same})

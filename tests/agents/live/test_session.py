@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from sideslip.agents.live import controller
-from sideslip.agents.live.controller import _BLOCK, _BLOCK_MAGIC, _ITEM, Recorder, Session
+from sideslip.agents.live.controller import (
+    _BLOCK,
+    _BLOCK_MAGIC,
+    _ITEM,
+    Recorder,
+    read_blocks,
+    read_setup,
+    replay_session,
+)
 from sideslip.agents.live.messages import PATIENCE
 from tests.agents.live.both_ends import SEED, STEERING, drive, onboard, watch_ticks
 
@@ -39,8 +47,8 @@ def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> Non
     path, estimates, patience = driven
     car, replayed = onboard(STEERING, "dakf"), list[Any]()
     watch_ticks(car, lambda _: replayed.append(np.concatenate([car.x, car.std])))
-    ticks, same = Session(path).replay(car, patience)
-    assert same and Session(path).setup == SETUP
+    ticks, same = replay_session(path, car, patience)
+    assert same and read_setup(path) == SETUP
     assert np.array_equal(replayed, estimates) and ticks == len(estimates) >= 500
 
 
@@ -49,7 +57,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
 ) -> None:
     path, estimates, patience = driven
     data, cut = path.read_bytes(), tmp_path / "cut.session"
-    blocks, car, lengths = list(Session(path).blocks), onboard(STEERING, "dakf"), set()
+    blocks, car, lengths = list(read_blocks(path)), onboard(STEERING, "dakf"), set()
     replayed = list[Any]()
     watch_ticks(car, lambda _: replayed.append(np.concatenate([car.x, car.std])))
     assert len(blocks) >= 5
@@ -57,15 +65,15 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
     for size in [*range(beginning, len(data), len(data) // 23), len(data) - 1]:
         cut.write_bytes(data[:size])
         replayed.clear()
-        ticks, same = Session(cut).replay(car, patience)
+        ticks, same = replay_session(cut, car, patience)
         assert same and len(replayed) == ticks < len(estimates)
         assert not ticks or np.array_equal(replayed, estimates[:ticks])
-        lengths.add(len(list(Session(cut).blocks)))
+        lengths.add(len(list(read_blocks(cut))))
     assert lengths <= set(range(len(blocks))) and len(lengths) > 3
     for size in range(beginning):
         cut.write_bytes(data[:size])
         with pytest.raises(ValueError, match="no session"):
-            assert Session(cut).setup
+            assert read_setup(cut)
 
 
 def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
@@ -76,9 +84,9 @@ def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
     data[len(data) // 2] ^= 1
     damaged = tmp_path / "damaged.session"
     damaged.write_bytes(data)
-    assert 0 < Session(damaged).replay(onboard(STEERING, "dakf"), patience)[0] < len(estimates)
+    assert 0 < replay_session(damaged, onboard(STEERING, "dakf"), patience)[0] < len(estimates)
     other = onboard(STEERING, "exact-kf")
-    assert not Session(path).replay(other, patience)[1]
+    assert not replay_session(path, other, patience)[1]
 
 
 @pytest.mark.parametrize("items", [_ITEM.pack(7, 1) + b"a", _ITEM.pack(0, 9) + b"a", b"abc"])
@@ -88,7 +96,7 @@ def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: by
     Recorder(path, {}).close()
     with path.open("ab") as file:
         file.write(_BLOCK.pack(_BLOCK_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
-    assert list(Session(path).blocks) == []
+    assert list(read_blocks(path)) == []
 
 
 @pytest.mark.parametrize(
@@ -99,7 +107,7 @@ def test_what_a_setup_lacks_is_named(tmp_path: Path, change: Any, what: str) -> 
     setup = SETUP | change if change else {k: v for k, v in SETUP.items() if k != "seed"}
     Recorder(path, setup).close()
     with pytest.raises(ValueError, match=f"its setup lacks {what}, or has it of another type"):
-        assert Session(path).setup
+        assert read_setup(path)
 
 
 def test_a_session_is_never_overwritten(tmp_path: Path) -> None:
@@ -115,8 +123,8 @@ def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
     path = tmp_path / "a.session"
     recorder = Recorder(path, SETUP)
     for i in range(3 * controller.MAX_BATCHES + 7):
-        recorder.take([bytes([i % 256])])
-    batches = [batch for block in Session(path).blocks for batch in block[0]]
+        recorder.take([bytes([i % 256])], 0)
+    batches = [batch for block in read_blocks(path) for batch in block[0]]
     assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]
     recorder.close()
-    assert sum(len(block[0]) for block in Session(path).blocks) == 307
+    assert sum(len(block[0]) for block in read_blocks(path)) == 307
