@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import copy_into, jit
+from ...envs.numerics.packed import read, write
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
@@ -378,29 +379,30 @@ def _lane_keeping_law(x: Matrix, state: Matrix, action: Matrix, design: tuple[An
     table, axes, share_per_torque, preview, filter_time, dt, authority = design
     m, n = table.shape[3:]
     K, z = np.empty((m, n)), np.empty(n)
-    for row in range(len(x)):
-        v = maximum(0.5 * (x[row, LANE_IN.wheel_left] + x[row, LANE_IN.wheel_right]), axes[0][0])
-        gamma, psi = x[row, LANE_IN.gamma_hat], x[row, LANE_IN.psi_hat]
-        if state[row, LANE_LAST.started] == 0.0:
-            state[row, LANE_LAST.rate], state[row, LANE_LAST.heading] = gamma / v, psi
-            state[row, LANE_LAST.started] = 1.0
-        turned = psi - state[row, LANE_LAST.heading]
-        kappa = state[row, LANE_LAST.rate] - turned / (v * filter_time)  # psi' = gamma - V kappa
-        state[row, LANE_LAST.rate] += (gamma / v - state[row, LANE_LAST.rate]) * dt / filter_time
-        state[row, LANE_LAST.heading] += turned * dt / filter_time
-        y_l = x[row, LANE_IN.y_l_hat]
-        y = y_l - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
-        z[AT.beta], z[AT.gamma], z[AT.psi], z[AT.y] = x[row, LANE_IN.beta_hat], gamma, psi, y
-        z[AT.N_z] = share_per_torque * (x[row, LANE_IN.torque_right] - x[row, LANE_IN.torque_left])
-        z[AT.delta_f], z[AT.driver] = x[row, LANE_IN.steer], x[row, LANE_IN.steer_command]
-        z[AT.integral], z[AT.kappa] = state[row, LANE_LAST.integral], kappa
+    for k in range(len(x)):
+        row, last = read(x[k], LANE_IN), read(state[k], LANE_LAST)
+        v = maximum(0.5 * (row.wheel_left + row.wheel_right), axes[0][0])
+        gamma, psi, rate, heading = row.gamma_hat, row.psi_hat, last.rate, last.heading
+        if last.started == 0.0:
+            rate, heading = gamma / v, psi
+        turned = psi - heading
+        kappa = rate - turned / (v * filter_time)  # psi' = gamma - V kappa
+        rate += (gamma / v - rate) * dt / filter_time
+        heading += turned * dt / filter_time
+        y = row.y_l_hat - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
+        z[AT.beta], z[AT.gamma], z[AT.psi], z[AT.y] = row.beta_hat, gamma, psi, y
+        z[AT.N_z] = share_per_torque * (row.torque_right - row.torque_left)
+        z[AT.delta_f], z[AT.driver] = row.steer, row.steer_command
+        z[AT.integral], z[AT.kappa] = last.integral, kappa
         interpolate_gains(table, axes, v, 0.0, 0.0, K)
         for i in range(m):  # the yaw moment, if it is used, and the steering
             for j in range(n):
-                action[row, 2 - m + i] -= K[i, j] * z[j]
-        action[row, 1] /= authority
-        if abs(action[row, 0]) <= 1.0 and abs(action[row, 1]) <= 1.0:  # else it would wind up
-            state[row, LANE_LAST.integral] += y * dt
+                action[k, 2 - m + i] -= K[i, j] * z[j]
+        action[k, 1] /= authority
+        integral = last.integral
+        if abs(action[k, 0]) <= 1.0 and abs(action[k, 1]) <= 1.0:  # else it would wind up
+            integral += y * dt
+        write(state[k], LaneMemory(integral, rate, heading, 1.0), LANE_LAST)
 
 
 class LaneKeeping(Controller):

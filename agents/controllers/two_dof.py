@@ -12,6 +12,7 @@ import numpy as np
 
 from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
+from ...envs.numerics.packed import read, write
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.validation import check_choice
@@ -123,24 +124,23 @@ def _two_dof_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, de
     """Compute the actions from `Inputs` x and update the `Memory` state."""
     follows, car, k_p, k_i, full_scale, wait, dt = design
     for n in range(len(x)):
-        if state[n, LAST.wait] > 0.0:
+        row, last = read(x[n], IN), read(state[n], LAST)
+        if last.wait > 0.0:
             state[n, LAST.wait] -= 1.0
-            action[n, 0] = state[n, LAST.share]
+            action[n, 0] = last.share
             continue
-        v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
-        error = x[n, IN.beta_ref] - x[n, IN.beta_hat]
-        forward = _compute_static_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.steer_command]
+        v = 0.5 * (row.wheel_left + row.wheel_right)
+        error = row.beta_ref - row.beta_hat
+        forward = _compute_static_gain(car, maximum(v, MIN_SPEED)) * row.steer_command
         if follows:
-            forward += _compute_sideslip_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.beta_ref]
-        integral = state[n, LAST.integral]
-        unlimited = forward + _interpolate_column(k_p, v) * error + integral
+            forward += _compute_sideslip_gain(car, maximum(v, MIN_SPEED)) * row.beta_ref
+        unlimited = forward + _interpolate_column(k_p, v) * error + last.integral
         limit = max_share[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
         step = _interpolate_column(k_i, v) * error * dt  # forward Euler
-        state[n, LAST.integral] = integrate_antiwindup(integral, step, unlimited, N_z)
-        state[n, LAST.wait] = wait - 1.0
-        state[n, LAST.share] = N_z / full_scale
-        action[n, 0] = state[n, LAST.share]
+        integral = integrate_antiwindup(last.integral, step, unlimited, N_z)
+        action[n, 0] = N_z / full_scale
+        write(state[n], Memory(integral, wait - 1.0, action[n, 0]), LAST)
 
 
 class Feedforward(Controller):

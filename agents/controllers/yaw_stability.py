@@ -13,6 +13,7 @@ import numpy as np
 
 from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
+from ...envs.numerics.packed import read, write
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
@@ -47,7 +48,7 @@ def _solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> tuple[S
     return delta_f, (second - plant.b21 * delta_f) / plant.b22
 
 
-# Columns of the law's inputs; the last one only where the sideslip angle is bounded.
+# Columns of the law's inputs; the gyro stands in for a sideslip angle that is not bounded.
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
 ESC_IN = EscInputs(*range(5))
 
@@ -76,15 +77,16 @@ def _esc_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design
     """Compute the actions from `EscInputs` x; the state is the integral (N m)."""
     target, speeds, gains, band, max_sideslip, stiffness, bounded, full_scale, dt = design
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, ESC_IN.wheel_left] + x[n, ESC_IN.wheel_right]), speeds[0])
+        row = read(x[n], ESC_IN)
+        v = maximum(0.5 * (row.wheel_left + row.wheel_right), speeds[0])
         i, share = find_cell(speeds, v)
         k_p = (1.0 - share) * gains[i, 0] + share * gains[i + 1, 0]
         k_i = (1.0 - share) * gains[i, 1] + share * gains[i + 1, 1]
-        _, gamma_ref = compute_reference(x[n, ESC_IN.steer_command], v, target, LIMITED)
-        error = _apply_dead_zone(gamma_ref - x[n, ESC_IN.gyro], band)
+        _, gamma_ref = compute_reference(row.steer_command, v, target, LIMITED)
+        error = _apply_dead_zone(gamma_ref - row.gyro, band)
         unlimited = k_p * error + state[n, 0]
         if bounded:  # more yaw rate to the side the car slides to: beta' = ... - gamma
-            unlimited += stiffness * _apply_dead_zone(x[n, ESC_IN.beta_hat], max_sideslip)
+            unlimited += stiffness * _apply_dead_zone(row.beta_hat, max_sideslip)
         limit = max_share[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
         state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
@@ -117,7 +119,7 @@ class Esc(Controller):
         grip: float | None = None,
     ) -> None:  # fmt: skip
         bounded = "beta_hat" in get_env_facts(env).names
-        self.needs = EscInputs._fields if bounded else EscInputs._fields[:-1]
+        self.needs = (*EscInputs._fields[:-1], "beta_hat" if bounded else "gyro")
         super().__init__(env, grip)
         bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
         band = check_positive("band", band, allow_zero=True)
@@ -147,14 +149,14 @@ def _compute_surface_slope(plant: BicyclePlant, pole: Scalar) -> Scalar:
 
 @jit
 def _compute_reference(
-    x: Vector, v: Scalar, plant: BicyclePlant, target: ReferenceParams, kind: int
+    row: SlidingModeInputs, v: Scalar, plant: BicyclePlant, target: ReferenceParams, kind: int
 ) -> tuple[Scalar, Scalar]:
     """Compute (beta_ref, gamma_ref) of a row; a free yaw rate is that which keeps beta_ref."""
     if kind == LAGGED:  # then the observation has it
-        return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
-    beta, gamma = compute_reference(x[SLIDING_IN.steer_command], v, target, kind)
+        return row.beta_ref, row.gamma_ref
+    beta, gamma = compute_reference(row.steer_command, v, target, kind)
     if kind == ZERO_SLIP:
-        gamma = _compute_steady_yaw_rate(plant, beta, x[SLIDING_IN.steer])
+        gamma = _compute_steady_yaw_rate(plant, beta, row.steer)
     return beta, gamma
 
 
@@ -165,24 +167,22 @@ def _sliding_mode_law(
     """Compute the actions from `SlidingModeInputs` x and update the `SlidingModeMemory` state."""
     car, target, kind, pole, rate, layer, full_scale, dt = design
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), _MIN_SPEED)
+        row, last = read(x[n], SLIDING_IN), read(state[n], SLIDING_LAST)
+        v = maximum(0.5 * (row.wheel_left + row.wheel_right), _MIN_SPEED)
         plant = compute_bicycle_coefficients(car, v)
-        beta, gamma = x[n, SLIDING_IN.beta_hat], x[n, SLIDING_IN.gamma_hat]
-        delta = x[n, SLIDING_IN.steer]
         xi = _compute_surface_slope(plant, pole)
-        beta_ref, gamma_ref = _compute_reference(x[n], v, plant, target, kind)
+        beta_ref, gamma_ref = _compute_reference(row, v, plant, target, kind)
         beta_ref_rate, gamma_ref_rate = 0.0, 0.0  # the references' derivatives
-        if state[n, SLIDING_LAST.known] > 0.0:
-            beta_ref_rate = (beta_ref - state[n, SLIDING_LAST.beta_ref]) / dt
-            gamma_ref_rate = (gamma_ref - state[n, SLIDING_LAST.gamma_ref]) / dt
-        s = gamma - gamma_ref + xi * (beta - beta_ref)
-        beta_rate, gamma_rate = _compute_drift(plant, beta, gamma)
-        s_rate = gamma_rate + plant.b21 * delta - gamma_ref_rate  # s' without the yaw moment
-        s_rate += xi * (beta_rate + plant.b11 * delta - beta_ref_rate)
+        if last.known > 0.0:
+            beta_ref_rate = (beta_ref - last.beta_ref) / dt
+            gamma_ref_rate = (gamma_ref - last.gamma_ref) / dt
+        s = row.gamma_hat - gamma_ref + xi * (row.beta_hat - beta_ref)
+        beta_rate, gamma_rate = _compute_drift(plant, row.beta_hat, row.gamma_hat)
+        s_rate = gamma_rate + plant.b21 * row.steer - gamma_ref_rate  # s' without the yaw moment
+        s_rate += xi * (beta_rate + plant.b11 * row.steer - beta_ref_rate)
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
-        state[n, SLIDING_LAST.beta_ref], state[n, SLIDING_LAST.gamma_ref] = beta_ref, gamma_ref
-        state[n, SLIDING_LAST.known] = 1.0
+        write(state[n], SlidingModeMemory(beta_ref, gamma_ref, 1.0), SLIDING_LAST)
         action[n, 0] = min(max(N_z / full_scale, -max_share[n]), max_share[n])
 
 
@@ -236,11 +236,11 @@ def _model_following_law(
     # K: K_beta and K_gamma (rad/s), rejection: 1 or 0 for (26), max_share: of full scale
     car, target, kind, K, rejection, full_scale, authority, dt = design
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, MODEL_IN.wheel_left] + x[n, MODEL_IN.wheel_right]), _MIN_SPEED)
-        driver = x[n, MODEL_IN.steer_command]
-        beta_ref, gamma_ref = x[n, MODEL_IN.beta_ref], x[n, MODEL_IN.gamma_ref]
+        row, last = read(x[n], MODEL_IN), read(state[n], MODEL_LAST)
+        v = maximum(0.5 * (row.wheel_left + row.wheel_right), _MIN_SPEED)
+        driver, beta_ref, gamma_ref = row.steer_command, row.beta_ref, row.gamma_ref
         plant = compute_bicycle_coefficients(car, v)
-        last_driver = state[n, MODEL_LAST.driver] if state[n, MODEL_LAST.known] > 0.0 else driver
+        last_driver = last.driver if last.known > 0.0 else driver
         old = compute_reference(last_driver, v, target, kind)
         new = compute_reference(driver, v, target, kind)
         reference_rates = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
@@ -252,25 +252,23 @@ def _model_following_law(
             last_gamma_ref = _compute_steady_yaw_rate(plant, beta_ref, last_driver)
             reference_rates = (reference_rates[0], (gamma_ref - last_gamma_ref) / dt)
         drift_rates = _compute_drift(plant, beta_ref, gamma_ref)
-        p_beta = K[0] * (beta_ref - x[n, MODEL_IN.beta_hat])
-        p_gamma = K[1] * (gamma_ref - x[n, MODEL_IN.gamma_hat])
+        p_beta = K[0] * (beta_ref - row.beta_hat)
+        p_gamma = K[1] * (gamma_ref - row.gamma_hat)
         # (28) by the references' derivatives, P of (31), and (26) at once: B^-1 is linear
         delta_f, N_z = _solve_inputs(
             plant,
-            reference_rates[0] - drift_rates[0] + p_beta - rejection * x[n, MODEL_IN.d1_hat],
-            reference_rates[1] - drift_rates[1] + p_gamma - rejection * x[n, MODEL_IN.d2_hat],
+            reference_rates[0] - drift_rates[0] + p_beta - rejection * row.d1_hat,
+            reference_rates[1] - drift_rates[1] + p_gamma - rejection * row.d2_hat,
         )
-        delta_f_sum, N_z_sum = state[n, MODEL_LAST.delta_f_sum], state[n, MODEL_LAST.N_z_sum]
-        delta_f, N_z = delta_f + delta_f_sum, N_z + N_z_sum  # (33)
+        delta_f, N_z = delta_f + last.delta_f_sum, N_z + last.N_z_sum  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)
         limit = max_share[n] * full_scale
         moment = min(max(N_z, -limit), limit)
         drift_rates = _compute_drift(plant, p_beta, p_gamma)  # I of (31), forward Euler
         steps = _solve_inputs(plant, -drift_rates[0] * dt, -drift_rates[1] * dt)
-        delta_f_sum = integrate_antiwindup(delta_f_sum, steps[0], delta_f, steer)
-        N_z_sum = integrate_antiwindup(N_z_sum, steps[1], N_z, moment)
-        state[n, MODEL_LAST.delta_f_sum], state[n, MODEL_LAST.N_z_sum] = delta_f_sum, N_z_sum
-        state[n, MODEL_LAST.driver], state[n, MODEL_LAST.known] = driver, 1.0
+        delta_f_sum = integrate_antiwindup(last.delta_f_sum, steps[0], delta_f, steer)
+        N_z_sum = integrate_antiwindup(last.N_z_sum, steps[1], N_z, moment)
+        write(state[n], ModelMemory(delta_f_sum, N_z_sum, driver, 1.0), MODEL_LAST)
         action[n, 0] = moment / full_scale
         action[n, 1] = (steer - driver) / authority
 
