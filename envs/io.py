@@ -18,7 +18,7 @@ import stat
 import tomllib
 import uuid
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
@@ -39,10 +39,7 @@ def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
     Links are followed, an older file's mode and owner stay; a pipe, a device or an open file such
     as /dev/stdout is written directly.
     """
-    try:
-        old = os.stat(path)
-    except FileNotFoundError:
-        old = None
+    old = os.stat(path) if os.path.exists(path) else None
     if old and (not stat.S_ISREG(old.st_mode) or os.path.abspath(path).startswith(_OPEN)):
         with open(path, "ab") as file:
             yield file
@@ -191,13 +188,11 @@ def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT
     for what, names in (("unknown", entry.keys() - known), ("missing", required - entry.keys())):
         if names:
             raise ValueError(f"{where}: {what} {join_names(sorted(names))}")
-    values: dict[str, Any] = {}
-    for name, value in entry.items():
-        expected: Any = known[name].type
-        is_tuple = isinstance(value, list) and get_origin(expected) is tuple
-        values[name] = tuple(value) if is_tuple else value
-        if hasattr(expected, "__dataclass_fields__"):
-            values[name] = from_json(expected, value, f"{where}: {name}")
+    lists = {name: value for name, value in entry.items() if isinstance(value, list)}
+    tuples = {n: tuple(v) for n, v in lists.items() if get_origin(known[n].type) is tuple}
+    kinds: dict[str, Any] = {n: known[n].type for n in entry if is_dataclass(known[n].type)}
+    records = {n: from_json(k, entry[n], f"{where}: {n}") for n, k in kinds.items()}
+    values = entry | tuples | records
     check_types(kind, values, where)
     try:
         return kind(**values)

@@ -108,12 +108,7 @@ class Controller(ABC):
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
-        """Note in the state that the env gets an action other than the controller's own.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
+        """Note in the state that the env gets an action other than the controller's own."""
 
     def predict(
         self, observation: npt.NDArray[np.float32], state: Array | None = None,

@@ -187,22 +187,13 @@ class Lqr(Controller):
         return KS
 
     def curvature(self, speed: float) -> Array:
-        """Compute S, shape (width, width): an action that is off by e costs e' S e more.
-
-        Args:
-            speed: Speed (m/s).
-        """
+        """Compute S, shape (width, width): an action that is off by e costs e' S e more."""
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
         KS = self._interpolate(speed, car.front_stiffness, car.rear_stiffness)
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
-        """Note the added steering, from which the rate limit counts, and the moment.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
+        """Note the added steering, from which the rate limit counts, and the moment."""
         if self.width == 2:
             state[:, 0] = action[:, 1] * self._steer_unit
         if self.remembered:

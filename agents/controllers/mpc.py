@@ -392,11 +392,7 @@ class Nmpc(Lqr):
         state[rows, LAST.status] = NOT_FINITE
 
     def status(self, state: Array) -> list[str]:
-        """List the status of each row's last decision, of `STATUSES`.
-
-        Args:
-            state: Memory, shape (N, memory).
-        """
+        """List the status of each row's last decision, of `STATUSES`."""
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
     def _compute_actions(self, inputs: Array, state: Array, action: Array) -> None:

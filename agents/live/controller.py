@@ -3,6 +3,9 @@
 A session's file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended
 as they are full; a file that is cut is read up to there. A block has a checksum of itself and one
 of all estimates so far, by which a replay checks itself bit for bit. Nothing in a file is run.
+
+Args:
+    path: File of a session, which a `Recorder` writes; ValueError for one that is none.
 """
 
 import json
@@ -232,11 +235,7 @@ def _read_header(file: BinaryIO, path: Path | str) -> dict[str, Any]:
 
 
 def read_setup(path: Path | str) -> dict[str, Any]:
-    """Read the setup of a session, in JSON types; ValueError for an incomplete one.
-
-    Args:
-        path: File of a `Recorder`; ValueError for another file.
-    """
+    """Read the setup of a session, in JSON types; ValueError for an incomplete one."""
     with open(path, "rb") as file:
         setup = _read_header(file, path)
     if wrong := [name for name, x in _SETUP.items() if not isinstance(setup.get(name, ...), x)]:
@@ -246,11 +245,7 @@ def read_setup(path: Path | str) -> dict[str, Any]:
 
 
 def read_blocks(path: Path | str) -> Iterator[tuple[list[list[Arrival]], int]]:
-    """Read batches of datagrams and the checksum of all estimates after them, as far as sound.
-
-    Args:
-        path: File of a `Recorder`; ValueError for another file.
-    """
+    """Read batches of datagrams and the checksum of all estimates after them, as far as sound."""
     with open(path, "rb") as file:
         _read_header(file, path)
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
@@ -270,7 +265,7 @@ def replay_session(
     """Replay a session; the number of ticks, and whether its checksums are the estimates'.
 
     Args:
-        path: File of a `Recorder`; ValueError for another file.
+        path: File of the session.
         onboard: On-board controller made from the session's setup.
         patience: Batches without a fast row before the last row is held; None: no limit.
     """

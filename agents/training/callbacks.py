@@ -111,7 +111,7 @@ class Checkpoint:
     scaling: list[Any]  # of the observations: `Standardisation`
     evaluations: list[Any]  # so far
 
-    def load_initial_policy(self, folder: Path) -> Policy | None:
+    def load_initial(self, folder: Path) -> Policy | None:
         """Load the policy that it started from, under its own name; None for another training.
 
         Args:

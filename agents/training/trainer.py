@@ -159,7 +159,7 @@ class Trainer:
         self._checkpoint: Checkpoint | None = None
         if self.resume:
             self._checkpoint = read_training(self._folder, **asdict(self.task))
-            self.initial = self._checkpoint.load_initial_policy(self._folder)
+            self.initial = self._checkpoint.load_initial(self._folder)
         elif (self._folder / CHECKPOINT).exists():
             text = f"{self._folder} holds a training already: go on with it (resume), or"
             raise ValueError(f"{text} take another folder")

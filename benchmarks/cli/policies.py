@@ -280,9 +280,7 @@ class _Train:
         folder = _choose_folder(task, start, out, logs)
         file = folder / callbacks.POLICY
         if self.conf_file is not None:
-            initial = agent
-            if resume:
-                initial = callbacks.read_training(folder).load_initial_policy(folder)
+            initial = callbacks.read_training(folder).load_initial(folder) if resume else agent
             options["settings"] = resolve_settings(self.conf_file, task.algo, task.env_id, initial)
         if resume:
             saved = callbacks.read_training(folder, **options)

@@ -9,7 +9,7 @@ import dataclasses
 import os
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,10 +28,9 @@ from ..validation import check_mapping, check_number, describe_unknown
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import Vehicle
 from .base import StepEnds, Tensor, TensorVectorEnv
-from .torch_sensors import PacketCapacity, read_packed, write_packed
+from .torch_sensors import Capacities, PacketCapacity, read_packed, write_packed
 from .torch_step import StepOutcome, TorchReset, TorchState, TorchStep
 
-_Capacities = dict[int, PacketCapacity]  # by the sensor's place
 _FIELDS = [field.name for field in dataclasses.fields(Vehicle) if field.name != "name"]
 _RECORD = StepOutcome._fields.index("rows")  # from here on the rows are the last axis
 _PACKED = [
@@ -122,9 +121,7 @@ class _AttachedParameters:
         # rows by the place that they replace, the configs of all rows, and the parameters
         self._held: list[tuple[dict[int, Tensor], list[EpisodeConfig], dict[str, Any]]] = []
 
-    def put(
-        self, rows: Tensor, configs: Sequence[EpisodeConfig], parameters: dict[str, Any]
-    ) -> None:
+    def put(self, rows: Tensor, configs: list[EpisodeConfig], parameters: dict[str, Any]) -> None:
         """Put parameters, () or (N,), of some rows (M,) in place of those that they had."""
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
@@ -163,7 +160,7 @@ class _DeviceRows:
     """Parameters, keys, state and last outcome of episodes as tensors; `start` is for gradients."""
 
     def __init__(
-        self, episodes: BatchArrays, capacities: _Capacities, device: torch.device,
+        self, episodes: BatchArrays, capacities: Capacities, device: torch.device,
         dtype: torch.dtype, start: TorchReset | None,
     ) -> None:  # fmt: skip
         self.capacities, self._device, self._dtype = capacities, device, dtype
@@ -177,7 +174,7 @@ class _DeviceRows:
         self.params, self.outcome = self._packed_params, self._read_outcome(episodes, all_rows)
 
     def upload(
-        self, episodes: BatchArrays, rows: IntArray, configs: Sequence[EpisodeConfig],
+        self, episodes: BatchArrays, rows: IntArray, configs: list[EpisodeConfig],
         inputs: _ResetTensors,
     ) -> None:  # fmt: skip
         """Copy rows (M,) that were reset to the device; configs of all N, tensors of the reset."""
@@ -317,8 +314,8 @@ class DeviceVectorEnv(TensorVectorEnv):
         self._build(self._extend_capacities(empty, self.configs))
 
     def _extend_capacities(
-        self, capacities: _Capacities, configs: Iterable[EpisodeConfig]
-    ) -> _Capacities:
+        self, capacities: Capacities, configs: Iterable[EpisodeConfig]
+    ) -> Capacities:
         """Extend the slow sensors' capacities to what these configs need, which are checked."""
         unique = list({id(config): config for config in configs}.values())
         for scenario in (config.scenario for config in unique):
@@ -335,7 +332,7 @@ class DeviceVectorEnv(TensorVectorEnv):
                 extended[i] = PacketCapacity(*map(max, capacity, needed))
         return extended
 
-    def _build(self, capacities: _Capacities) -> None:
+    def _build(self, capacities: Capacities) -> None:
         """Build the step with these capacities, and copy all rows to the device."""
         kinds = self.dtype, self.dtype if self._grad else torch.float32, self.device, self._compile
         self._step = TorchStep(self.config, capacities, *kinds)

@@ -53,6 +53,9 @@ class PacketCapacity(NamedTuple):
     copies: int  # of a packet
 
 
+Capacities = dict[int, PacketCapacity]  # by the sensor's place
+
+
 class SlowSensors:
     """Slow sensors of a batch.
 
@@ -62,9 +65,7 @@ class SlowSensors:
         dtype: Type of floats.
     """
 
-    def __init__(
-        self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
-    ) -> None:
+    def __init__(self, capacities: Capacities, small_angle: int, dtype: torch.dtype) -> None:
         self.capacities, self._small_angle = capacities, small_angle
         functions = sample_sensor, make_measurement_context, compute_arrivals, read, select
         self._functions = to_torch(dtype, *functions)

@@ -33,7 +33,7 @@ from ..task import (
     select_failure,
 )
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
-from .torch_sensors import Delivered, PacketCapacity, SlowSensors, SlowState, TickWindow
+from .torch_sensors import Capacities, Delivered, SlowSensors, SlowState, TickWindow
 
 Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]
@@ -123,7 +123,7 @@ class TorchStep:
     """
 
     def __init__(
-        self, config: EnvConfig, capacities: dict[int, PacketCapacity], dtype: torch.dtype,
+        self, config: EnvConfig, capacities: Capacities, dtype: torch.dtype,
         obs_dtype: torch.dtype, device: torch.device, compile: bool,
     ) -> None:  # fmt: skip
         start = config.base.start

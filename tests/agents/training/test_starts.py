@@ -216,7 +216,7 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     again = Trainer(task, 96, tmp_path, resume=True).train()
     card = load_policy(tmp_path / "policy.safetensors").card
     assert card.algorithm_options["begun_with"] == "distill-coms-yaw"
-    assert read_training(tmp_path).load_initial_policy(tmp_path) is not None
+    assert read_training(tmp_path).load_initial(tmp_path) is not None
     assert again.evaluations[: len(found.evaluations)] == found.evaluations
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()
