@@ -169,27 +169,16 @@ class Lqr(Controller):
         """List entries of an observation that a subclass reads behind `Inputs`."""
         return ()
 
-    def gains(self, speed: float, front: float | None = None, rear: float | None = None) -> Array:
-        """Compute the gains K on the states of the design, shape (m, n).
-
-        Args:
-            speed: Speed (m/s).
-            front: Front cornering stiffness of a tyre (N/rad) for scheduled gains; None: the car's.
-            rear: Rear cornering stiffness of a tyre (N/rad), likewise.
-        """
-        stiffness = front or self.vehicle.front_stiffness, rear or self.vehicle.rear_stiffness
-        return self._interpolate(speed, *stiffness)[:, : len(self.design_spec.states)]
-
-    def _interpolate(self, speed: float, front: float, rear: float) -> Array:
-        """Interpolate the table of [K S], shape (m, n + m)."""
+    def _interpolate(self, v: float, front: float = 0.0, rear: float = 0.0) -> Array:
+        """Interpolate the table of [K S], (m, n + m), at stiffnesses (N/rad); 0: the vehicle's."""
+        C_f, C_r = front or self.vehicle.front_stiffness, rear or self.vehicle.rear_stiffness
         KS = np.empty(self.table.shape[3:])
-        interpolate_gains(self.table, self.axes, float(speed), float(front), float(rear), KS)
+        interpolate_gains(self.table, self.axes, float(v), float(C_f), float(C_r), KS)
         return KS
 
     def curvature(self, speed: float) -> Array:
         """Compute S, shape (width, width): an action that is off by e costs e' S e more."""
-        car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
-        KS = self._interpolate(speed, car.front_stiffness, car.rear_stiffness)
+        per, KS = np.array([1.0, self.authority])[: self.width], self._interpolate(speed)
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:

@@ -59,26 +59,24 @@ class ByteSource:
             time.sleep(self.wait)
 
 
-def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
+def make_source(text: str) -> ByteSource:
     """Make the source that a text names; nothing is opened before it is iterated.
 
     Raises ValueError for a text of another form and a folder, FileNotFoundError without the file.
 
     Args:
         text: A file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
-        tries: Number of times that a lost line is opened again before a byte comes.
-        wait: Time before each (s).
     """
     kind, _, rest = text.partition(":")
     head, _, number = rest.rpartition(":")
     if kind == "serial" and rest:
         port, baud = (head, int(number)) if head and number.isdecimal() else (rest, BAUD)
-        return ByteSource(text, lambda: _read_serial(port, baud), tries, wait)
+        return ByteSource(text, lambda: _read_serial(port, baud))
     if kind == "tcp":
         if not (head and number.isdecimal() and 0 < int(number) < 65_536):
             raise ValueError(f"expected tcp:HOST:PORT, got {short_repr(text)}")
         host = head.strip("[]")
-        return ByteSource(text, lambda: _read_tcp(host, int(number)), tries, wait)
+        return ByteSource(text, lambda: _read_tcp(host, int(number)))
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")

@@ -18,6 +18,7 @@ from sideslip.estimators.vector import estimate
 from sideslip.estimators.vector.estimate import TruthObservation as VectorTruth
 from sideslip.estimators.wrappers.estimate import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
+from tests.agents.helpers import compute_gains
 from tests.envs.helpers import bits
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
@@ -94,7 +95,7 @@ def test_gains_are_designed_for_each_rows_car(kind: str) -> None:
     assert agent._get_for_car(numbers.copy()) is other
     assert other.vehicle == (fit_fiala(car) if kind == "nmpc" else car)
     wanted = make_design_model(other.vehicle, speed, agent.design_spec).solve()[0]
-    np.testing.assert_allclose(other.gains(speed), wanted, 1e-9)
+    np.testing.assert_allclose(compute_gains(other, speed), wanted, 1e-9)
     if isinstance(other, Nmpc):
         assert other.design.model.car.m == 1800.0
         assert other.design.model.car.C_f == fit_fiala(car).front_stiffness

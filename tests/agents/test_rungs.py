@@ -19,6 +19,7 @@ from sideslip.envs.scenarios.manoeuvres import SCENARIOS, TIERS
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.scenarios.world import WORLDS, World
 from sideslip.estimators.vector.estimate import EstimateObservation
+from tests.agents.helpers import compute_gains
 from tests.agents.test_car_truth import SLALOM
 from tests.envs.helpers import bits
 
@@ -77,7 +78,7 @@ def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
     for _ in range(20):
         speed, front, rear = rng.uniform((5.0, 0.6, 0.6), (10.0, 1.4, 1.4))
         car = COMS.scale_stiffness(front, rear)
-        K = agent.gains(speed, car.front_stiffness, car.rear_stiffness)
+        K = compute_gains(agent, speed, car.front_stiffness, car.rear_stiffness)
         wanted = make_design_model(car, speed, agent.design_spec).solve()[0]
         assert np.abs(K[:, :4] - wanted[:, :4]).max() < 0.02 * np.abs(wanted[:, :4]).max()
 

@@ -15,6 +15,7 @@ from sideslip.benchmarks.control.tasks import STEERING, ControlTask
 from sideslip.envs import make_scenario
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as Vector
+from tests.agents.helpers import compute_gains
 
 STEERED = ControlTask("", STEERING, "passenger-car", "lagged", "car-slalom")
 
@@ -53,7 +54,7 @@ def test_the_gains_are_those_of_the_stiffness_estimated(front: float, rear: floa
     make_design_state(x, agent.share, z)
     car = agent.vehicle
     speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
-    K = agent.gains(speed, front * car.front_stiffness, rear * car.rear_stiffness)
+    K = compute_gains(agent, speed, front * car.front_stiffness, rear * car.rear_stiffness)
     u, w = -K @ z
     assert action == pytest.approx([u, w / agent.authority], rel=1e-4, abs=1e-7)
 

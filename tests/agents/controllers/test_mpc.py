@@ -15,7 +15,7 @@ from sideslip.agents.controllers.mpc import NOT_FINITE, STATUSES, Mpc
 from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
-from tests.agents.helpers import observe
+from tests.agents.helpers import compute_gains, observe
 from tests.envs.helpers import bits
 
 V = SPEEDS[18]
@@ -44,7 +44,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     lqr = Lqr(env)
     obs = observe(env, V, **told)
     program, _ = agent._get_solver(V)
-    K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
+    K = compute_gains(lqr, V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
     x = np.zeros(len(agent.design_spec.states))
     for name, value in told.items():
         at = {"beta_hat": 0, "gamma_hat": 1, "steer": 3, "steer_command": 4}[name]

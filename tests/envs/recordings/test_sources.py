@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -70,7 +71,7 @@ def test_a_log_is_dated_by_its_last_date_and_how_many_epochs_were_is_counted(
 def test_a_serial_port_that_vanishes_ends_clearly() -> None:
     ours, theirs = os.openpty()
     name = os.ttyname(theirs)
-    source = make_source(f"serial:{name}:9600", tries=2, wait=0.01)
+    source = replace(make_source(f"serial:{name}:9600"), tries=2, wait=0.01)
     chunks = iter(source)
     assert next(chunks) == b""  # open: what came before is flushed
     os.write(ours, LOG[:1000])
@@ -99,7 +100,7 @@ def test_a_peer_that_closes_is_called_again_and_nothing_whole_is_lost() -> None:
     half = len(LOG) // 2  # amid a sentence
     parts = iter([LOG[:half], LOG[half:]])
     with peer(lambda connection: connection.sendall(next(parts)), 2) as text:
-        source = make_source(text, tries=2, wait=0.01)
+        source = replace(make_source(text), tries=2, wait=0.01)
         epochs = collected(source, len(SECONDS))
     assert len(epochs) == len(SECONDS) and source.losses == 1
 
@@ -120,7 +121,7 @@ def test_a_line_is_opened_again_so_many_times_and_no_more() -> None:
 def test_garbage_of_a_peer_is_counted_and_what_follows_decoded() -> None:
     garbage = os.urandom(1 << 20)
     with peer(lambda connection: connection.sendall(garbage + b"\r\n" + LOG), 1) as text:
-        epochs = collected(make_source(text, wait=0.01), len(SECONDS))
+        epochs = collected(replace(make_source(text), wait=0.01), len(SECONDS))
     assert [epoch.t % 60.0 for epoch in epochs[-20:]] == [float(i) for i in range(20)]
 
 
