@@ -218,11 +218,7 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
 
 
 def get_layout(env: CarVectorEnv) -> tuple[ObservationEntry, ...]:
-    """Read the layout of the outermost layer that has one, else that of the sub-environments.
-
-    Args:
-        env: Vector env with its wrappers.
-    """
+    """Read the layout of the outermost layer that has one, else that of the sub-environments."""
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
         layer = layer.env

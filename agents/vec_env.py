@@ -1,4 +1,8 @@
-"""Stable-baselines3's `VecEnv` over the native vector env: one call for all rows."""
+"""Stable-baselines3's `VecEnv` over the native vector env: one call for all rows.
+
+Args:
+    layout: Entries of an observation, in their units.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, cast
@@ -143,21 +147,13 @@ class _NativeVecEnv(VecEnv):
 
 
 def get_scales(layout: Sequence[ObservationEntry]) -> npt.NDArray[np.float32]:
-    """Get the fixed scale of each entry of an observation, in its unit, shape (k,).
-
-    Args:
-        layout: Entries of the observation.
-    """
+    """Get the fixed scale of each entry of an observation, in its unit, shape (k,)."""
     scales = [_WIDE_SCALES.get(name, _SCALES.get(unit, 1.0)) for name, unit, *_ in layout]
     return np.array(scales, np.float32)
 
 
 def scale_layout(layout: Sequence[ObservationEntry]) -> tuple[ObservationEntry, ...]:
-    """Divide the bounds of an observation's entries by their scales.
-
-    Args:
-        layout: Entries in their units.
-    """
+    """Divide the bounds of an observation's entries by their scales."""
     rows = zip(layout, get_scales(layout).tolist(), strict=True)
     return tuple(ObservationEntry(name, "-", a / s, b / s) for (name, _, a, b), s in rows)
 

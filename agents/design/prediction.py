@@ -324,13 +324,8 @@ def simulate_plans(task: PredictionTask, batch: PlanBatch) -> None:
             store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)
             gamma_error = motion.gamma - state.gamma_ref
             store_element(residuals, node * model.per_gamma * gamma_error, row + 1)
-            store_element(residuals, span * efforts[0], row + 2)
-            store_element(residuals, span * efforts[1], row + 3)
-            store_element(residuals, span * efforts[2], row + 4)
-            store_element(residuals, span * efforts[3], row + 5)
-            if n_step > N_RESIDUALS:
-                store_element(residuals, span * efforts[4], row + 6)
-                store_element(residuals, span * efforts[5], row + 7)
+            for i in range(2, n_step):  # the last two where the moment's rate costs
+                store_element(residuals, span * efforts[i - 2], row + i)
             row += n_step
     for j in range(len(terminal)):
         store_element(residuals, _multiply_row(terminal, j, task, state, beta), row + j)

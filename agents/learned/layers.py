@@ -2,6 +2,14 @@
 
 A kind of memory layer is a class, by which files and cards have it, and a branch of `step_layer`.
 Sums are in double precision and in one order, whatever the batch.
+
+Args:
+    z: Input.
+    memory: Memory of a layer, which is updated.
+    numbers: Numbers of a network.
+    offset: Place of a layer's `numbers`; a dense one's are weights (inputs, outputs) and biases.
+    out: Output.
+    code: Place of a layer's kind in `MEMORY_LAYERS`.
 """
 
 from collections.abc import Sequence
@@ -190,14 +198,7 @@ def apply_activation(x: Scalar, kind: int) -> Scalar:
 
 @jit
 def apply_dense(z: Vector, numbers: Vector, offset: int, out: Vector) -> int:
-    """Write out = W z + b with the numbers at a place; return the place behind them.
-
-    Args:
-        z: Input.
-        numbers: Numbers of a network.
-        offset: Place of the weights (inputs, outputs), row by row; the biases follow.
-        out: Output.
-    """
+    """Write out = W z + b with the numbers at a place; return the place behind them."""
     n = len(out)
     bias = offset + len(z) * n
     for o in range(n):
@@ -213,16 +214,7 @@ def apply_dense(z: Vector, numbers: Vector, offset: int, out: Vector) -> int:
 def step_layer(
     code: int, z: Vector, memory: Vector, numbers: Vector, offset: int, out: Vector
 ) -> int:
-    """Step a memory layer; return the place behind its numbers.
-
-    Args:
-        code: Place of its kind in `MEMORY_LAYERS`.
-        z: Input.
-        memory: Memory, which is updated.
-        numbers: Numbers of a network.
-        offset: Place of the layer's `numbers`.
-        out: Output.
-    """
+    """Step a memory layer; return the place behind its numbers."""
     if code == TRACES:
         return _step_averages(z, memory, numbers, offset, out)
     n = len(out)

@@ -3,6 +3,13 @@
 The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
 weighted by 1 over the uncontrolled car's cost, but at least 5 % of its mean over the scenarios.
 Where a training starts from a policy, each drive is weighted by 1 over that policy's cost in it.
+
+Args:
+    task: Task of the training; of a mixture the zoo's `enjoy` drives the first scenario.
+    folder: Folder of the training.
+    steps: Steps of the whole training.
+    eval_freq: Steps between two evaluations.
+    logs: Folder of all trainings.
 """
 
 import glob
@@ -112,11 +119,7 @@ class Checkpoint:
     evaluations: list[Any]  # so far
 
     def load_initial(self, folder: Path) -> Policy | None:
-        """Load the policy that it started from, under its own name; None for another training.
-
-        Args:
-            folder: Folder of the training.
-        """
+        """Load the policy that it started from, under its own name; None for another training."""
         name, file = self.aim.begun_with, folder / INITIAL_FILE
         if not name:
             return None
@@ -372,24 +375,13 @@ def find_zoo_folder(logs: Path, task: TrainingTask) -> Path:
 
     It will hold `best_model.zip`, `ENV.zip` (the last model), `evaluations.npz` and `ENV/`, which
     `describe_for_zoo` makes.
-
-    Args:
-        logs: Folder of all trainings.
-        task: Task of the next one.
     """
     folder, name = logs / task.algorithm.zoo, _make_zoo_name(task.env_id)
     return folder / f"{name}_{get_latest_run_id(glob.escape(str(folder)), name) + 1}"
 
 
 def describe_for_zoo(task: TrainingTask, folder: Path, steps: int, eval_freq: int) -> None:
-    """Make a training's folder with the files that the zoo's `enjoy` reads before a model.
-
-    Args:
-        task: Task of the training; of a mixture `enjoy` drives the first scenario.
-        folder: Folder of `find_zoo_folder`.
-        steps: Steps of the training.
-        eval_freq: Steps between two evaluations.
-    """
+    """Make a training's folder with the files that the zoo's `enjoy` reads before a model."""
     first = {"scenario": task.scenarios[0]} if task.scenarios else {}
     arguments = {
         "algo": task.algorithm.zoo, "env": task.env_id, "env_kwargs": task.env_options | first,

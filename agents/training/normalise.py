@@ -2,6 +2,9 @@
 
 Scales and mixing are measured once, before the training, and are part of the network. Mixing scales
 up small differences of entries that vary much, such as course less heading, for gradient methods.
+
+Args:
+    observations: Observations, shape (..., k).
 """
 
 import math
@@ -39,11 +42,7 @@ class Standardisation(NamedTuple):
     mixing: list[list[float]] | Array | None = None  # shape (k, k), None for none
 
     def transform(self, observations: Observations) -> Observations:
-        """Standardise and mix observations, shape (..., k), as `Standardised` does.
-
-        Args:
-            observations: Observations, shape (..., k).
-        """
+        """Standardise and mix observations, as `Standardised` does."""
         mean, scale = np.array(self.mean, np.float32), np.array(self.scale, np.float32)
         limit = math.inf if self.clip is None else self.clip
         z: Observations = np.clip((observations - mean) * scale, -limit, limit)
@@ -84,11 +83,7 @@ class Standardised(FlattenExtractor):
         return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Standardise and mix observations, shape (N, k).
-
-        Args:
-            observations: Observations, shape (N, k).
-        """
+        """Standardise and mix observations."""
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
 

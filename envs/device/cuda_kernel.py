@@ -8,6 +8,12 @@ reads and writes, so that neighbouring threads touch neighbouring numbers. A gen
 PCG64 (M. E. O'Neill, "PCG: A Family of Simple Fast Space-Efficient Statistically Good Algorithms
 for Random Number Generation", 2014): state, then increment, each of four words of 32 bits, the
 lowest first.
+
+Args:
+    constants: Constants of the kernel.
+    real: Type of floats.
+    N: Number of rows.
+    starts: Number of starts.
 """
 
 import functools
@@ -139,14 +145,7 @@ class DeviceArrays(NamedTuple):
 
 
 def make_specification(constants: KernelConstants, real: Real, N: int, starts: int) -> DeviceArrays:
-    """Make (type, shape) of each array, in place of the arrays.
-
-    Args:
-        constants: Constants of the kernel.
-        real: Type of floats.
-        N: Number of rows.
-        starts: Number of starts.
-    """
+    """Make (type, shape) of each array, in place of the arrays."""
     width, byte, report = constants.width + sum(_DRAWN), np.uint8, len(REPORT)
     ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
     return DeviceArrays(
@@ -328,12 +327,7 @@ def _store_element(array, value, i, j=None):
 
 
 def make_kernel(constants: KernelConstants, real: Real) -> Any:
-    """Make the kernel, a function of N, whether rows are reset, and pointers to `DeviceArrays`.
-
-    Args:
-        constants: Constants of the kernel.
-        real: Type of floats.
-    """
+    """Make the kernel, a function of N, whether rows are reset, and pointers to `DeviceArrays`."""
     step, make_array = _to_cuda(_step_row, real), carray
     if SIMULATED:
         make_array = lambda pointer, shape: pointer.numbers  # noqa: E731

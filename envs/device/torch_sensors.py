@@ -2,6 +2,11 @@
 
 A car's packets are sorted by (arrived, captured, sensor). An env-step appends the new ones, sorts
 all, and removes those that have arrived from the front.
+
+Args:
+    state: State of the slow sensors.
+    states: Packed states of the cars, shape (STATE_WIDTH, N).
+    capacity: Largest number of packets under way.
 """
 
 from collections.abc import Sequence
@@ -160,12 +165,7 @@ def _remove_first(queue: Tensor, count: Tensor) -> Tensor:
 
 
 def read_packed(states: Tensor, capacity: int) -> SlowState:
-    """Read the slow sensors' part of packed states.
-
-    Args:
-        states: Packed states, shape (STATE_WIDTH, N).
-        capacity: Largest number of packets under way.
-    """
+    """Read the slow sensors' part of packed states."""
     if bool((states[Z.under_way] > capacity).any()):
         raise ValueError(f"a state has more than {capacity} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
@@ -176,12 +176,7 @@ def read_packed(states: Tensor, capacity: int) -> SlowState:
 
 
 def write_packed(state: SlowState, states: Tensor) -> None:
-    """Write the slow sensors' part into packed states.
-
-    Args:
-        state: State of the slow sensors.
-        states: Packed states, shape (STATE_WIDTH, N).
-    """
+    """Write the slow sensors' part into packed states."""
     count = states.shape[1]
     states[Z.slow[0].frames : Z.queue] = state.slow.reshape(-1, count)
     states[Z.queue : Z.driver] = 0.0
