@@ -1,7 +1,7 @@
 """The base of all classical controllers: named inputs, batches, memory outside the object."""
 
 import math
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from numbers import Real
 from typing import Any
 
@@ -22,12 +22,13 @@ _torque_limit = as_python(compute_torque_limit, ARRAYS)
 FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, where it is there
 
 
-class Controller(ABC):
+class Controller:
     """The base of controllers: stable-baselines3's `predict` around a compiled law.
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
-    remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
-    (N, memory). A controller serves a single env or all rows of a vector env, with one design.
+    remembers (`memory`), and has a compiled `law`, or fills `_law`. `predict` is pure: all memory
+    is in `state`, an array (N, memory). A controller serves a single env or all rows of a vector
+    env, with one design.
 
     Where an entry is not finite the action is NaN and the memory stays as it was, which makes a
     failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
@@ -44,7 +45,8 @@ class Controller(ABC):
     memory = 0  # numbers of memory for each row
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
     vehicle: Vehicle  # the car that the controller is designed for
-    _design: tuple[Any, ...]  # the last argument of a compiled law
+    law: Callable[..., None]  # of inputs, state, action as `_law`, largest moments, and `_design`
+    _design: tuple[Any, ...]
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = get_env_facts(env)
@@ -93,7 +95,6 @@ class Controller(ABC):
         per_friction = self.grip * load * car.rear_track / self.full_scale
         return np.minimum(per_friction * self._get_friction(inputs), max_share)
 
-    @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         """Compute the action and the next memory, in place; NaN in an action: the law failed.
 
@@ -103,11 +104,12 @@ class Controller(ABC):
             action: Zeros of shape (N, width), to be filled: yaw moment as a fraction of full scale
                 and, where the env steers, added steering as a fraction of the vehicle's authority.
         """
+        self.law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
-    def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:  # noqa: B027
+    def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
-    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
+    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
         """Note in the state that the env gets an action other than the controller's own."""
 
     def predict(

@@ -354,7 +354,7 @@ def _make_lane_model(
 
 
 @jit
-def _lane_keeping_law(x: Matrix, state: Matrix, action: Matrix, design: tuple[Any, ...]) -> None:
+def _lane_keeping_law(x: Matrix, state: Matrix, action: Matrix, _: Vector, design: Any) -> None:
     """Compute the actions from `LaneInputs` x and update the `LaneMemory` state."""
     table, axes, share_per_torque, preview, filter_time, dt, authority = design
     m, n = table.shape[3:]
@@ -398,6 +398,7 @@ class LaneKeeping(Controller):
         moment: Whether to use the yaw moment beside the steering.
     """
 
+    law = staticmethod(_lane_keeping_law)
     needs = LaneInputs._fields
     memory = len(LaneMemory._fields)
 
@@ -413,6 +414,3 @@ class LaneKeeping(Controller):
         share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         filter_time = max(_CURVATURE_TIME, time)
         self._design = table, axes, share, car.preview, filter_time, time, self.authority
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _lane_keeping_law(inputs, state, action, self._design)

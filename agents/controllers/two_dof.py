@@ -14,7 +14,6 @@ from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import read, write
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
-from ...envs.record import Array
 from ...envs.validation import check_choice
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
@@ -26,6 +25,7 @@ SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
 PLACEMENTS = ("radius", "real")
+FEEDFORWARDS = ("reference", "zero-slip")
 
 # Columns of the laws' inputs; the feedforward reads the first three alone.
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
@@ -110,7 +110,7 @@ def _interpolate_column(table: Vector, v: Scalar) -> Scalar:
 
 
 @jit
-def _feedforward_law(x: Matrix, action: Matrix, design: tuple[Any, ...]) -> None:
+def _feedforward_law(x: Matrix, _: Matrix, action: Matrix, _max_share: Vector, design: Any) -> None:
     car, full_scale = design
     for n in range(len(x)):
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
@@ -121,7 +121,7 @@ def _feedforward_law(x: Matrix, action: Matrix, design: tuple[Any, ...]) -> None
 @jit
 def _two_dof_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: Any) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state."""
-    car, k_p, k_i, full_scale, wait, dt = design
+    follows, car, k_p, k_i, full_scale, wait, dt = design
     for n in range(len(x)):
         row, last = read(x[n], IN), read(state[n], LAST)
         if last.wait > 0.0:
@@ -131,7 +131,8 @@ def _two_dof_law(x: Matrix, state: Matrix, action: Matrix, max_share: Vector, de
         v = 0.5 * (row.wheel_left + row.wheel_right)
         error = row.beta_ref - row.beta_hat
         forward = _compute_static_gain(car, maximum(v, MIN_SPEED)) * row.steer_command
-        forward += _compute_sideslip_gain(car, maximum(v, MIN_SPEED)) * row.beta_ref
+        if follows:
+            forward += _compute_sideslip_gain(car, maximum(v, MIN_SPEED)) * row.beta_ref
         unlimited = forward + _interpolate_column(k_p, v) * error + last.integral
         limit = max_share[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
@@ -148,21 +149,18 @@ class Feedforward(Controller):
         env: Env of the controller.
     """
 
+    law = staticmethod(_feedforward_law)
     needs = Inputs._fields[: IN.beta_hat]
 
     def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
         self._design = self._bicycle, self.full_scale
 
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _feedforward_law(inputs, action, self._design)
-
 
 class TwoDof(Controller):
     """Feedforward plus a PI on beta_ref - beta_hat, tie-vision section V.
 
-    The feedforward holds beta_ref in the nominal car's steady turn; of zero slip it is (24). Raises
-    ValueError for an unknown rate.
+    Raises ValueError for an unknown rate or feedforward.
 
     Args:
         env: Env of the controller, with beta_hat in its observation; ValueError without it.
@@ -170,24 +168,24 @@ class TwoDof(Controller):
         gain: Factor on the PI's gains.
         pole: Pole of the closed loop (rad/s), as for `design_pi`.
         grip: Grip limit, as for `Controller`.
+        feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip": (24).
     """
 
+    law = staticmethod(_two_dof_law)
     needs = Inputs._fields
     memory = len(Memory._fields)
 
     def __init__(
         self, env: AnyEnv, rate: str = "control", gain: float = 1.0, pole: float = POLE,
-        grip: float | None = None,
+        grip: float | None = None, feedforward: str = FEEDFORWARDS[0],
     ) -> None:  # fmt: skip
         super().__init__(env, grip)
+        check_choice("feedforward", feedforward, FEEDFORWARDS)
         check_choice("rate", rate, ("control", "camera"))
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         factor = check_positive("gain", gain, allow_zero=True)
         pis = [design_pi(self.nominal, float(v), pole) for v in SPEEDS]
         self.k_p, self.k_i = np.ascontiguousarray((factor * np.array(pis)).T)
-        gains = self.k_p, self.k_i
-        self._design = self._bicycle, *gains, self.full_scale, wait, wait * period
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
+        follows, gains = int(feedforward == FEEDFORWARDS[0]), (self.k_p, self.k_i)
+        self._design = follows, self._bicycle, *gains, self.full_scale, wait, wait * period

@@ -15,7 +15,6 @@ from ...envs.numerics.functions import TICK
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import read, write
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
-from ...envs.record import Array
 from ...envs.task import LAGGED, LIMITED, ZERO_SLIP, ReferenceParams, compute_reference
 from ...envs.vehicle.linear import BicyclePlant, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
@@ -112,6 +111,7 @@ class Esc(Controller):
         grip: Grip limit, as for `Controller`.
     """
 
+    law = staticmethod(_esc_law)
     memory = 1
 
     def __init__(
@@ -127,9 +127,6 @@ class Esc(Controller):
         gains = np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS])
         scales, table = (self.full_scale, self.control_period * TICK), (np.array(SPEEDS), gains)
         self._design = self._target, *table, band, *bound, *scales
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _esc_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
 
 # Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate.
@@ -202,6 +199,7 @@ class SlidingMode(Controller):
         grip: Grip limit, as for `Controller`.
     """
 
+    law = staticmethod(_sliding_mode_law)
     memory = len(SlidingModeMemory._fields)
 
     def __init__(
@@ -215,9 +213,6 @@ class SlidingMode(Controller):
         surface = self.pole, self.rate, check_positive("layer", layer)
         scales = self.full_scale, self.control_period * TICK
         self._design = self._bicycle, self._target, self._reference_kind, *surface, *scales
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
 
 # Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`.
@@ -290,6 +285,7 @@ class ModelFollowing(Controller):
         grip: Grip limit, as for `Controller`.
     """
 
+    law = staticmethod(_model_following_law)
     memory = len(ModelMemory._fields)
 
     def __init__(
@@ -308,6 +304,3 @@ class ModelFollowing(Controller):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
         car = self._bicycle, self._target, self._reference_kind, np.array(K), float(rejection)
         self._design = *car, self.full_scale, self.authority, self.control_period * TICK
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _model_following_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -57,6 +57,7 @@ VALUES: list[Refusal] = [
     ),
     ("nmpc", "slip", {"horizon": -1.0}, "horizon is a positive number"),
     ("two-dof", "bare", {}, r"beta_hat.*EstimateObservation"),
+    ("two-dof", "slip", {"feedforward": "none"}, "unknown feedforward 'none'"),
     ("two-dof", "slip", {"rate": "fast"}, "unknown rate 'fast'; known: control, camera"),
     ("two-dof", "slip", {"pole": -1.0}, "pole is a positive number"),
     ("lqr", "slip", {"vehicle": "lorry"}, "lorry"),

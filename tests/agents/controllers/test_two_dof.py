@@ -114,3 +114,6 @@ def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
         share, _ = make_agent("two-dof", env).predict(obs)
         turn = np.linalg.solve(model.A, -model.B @ [delta, share[0] * COMS.yaw_moment_limit])
         assert turn[0] == pytest.approx(beta, abs=1e-8)
+        papers, _ = make_agent("two-dof", env, feedforward="zero-slip").predict(obs)
+        turn = np.linalg.solve(model.A, -model.B @ [delta, papers[0] * COMS.yaw_moment_limit])
+        assert turn[0] == pytest.approx(0.0, abs=1e-8)
