@@ -2,6 +2,8 @@
 
 Args:
     path: File.
+    paths: Files, None for none.
+    text: Content of a file.
     rows: Rows of a run's suites.
 """
 
@@ -155,11 +157,7 @@ class Suite:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Check before the work that files can be written; OSError otherwise.
-
-    Args:
-        paths: Files, None for none.
-    """
+    """Check before the work that files can be written; OSError otherwise."""
     for path in paths:
         if path is None:
             continue
@@ -175,12 +173,7 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, whole or not at all.
-
-    Args:
-        path: File.
-        text: Content.
-    """
+    """Write a text file, whole or not at all."""
     write_atomic(path, text.encode())
 
 

@@ -74,6 +74,11 @@ class Bound(NamedTuple):
         return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
 
 
+def compute_range(values: Array) -> Estimate:
+    """Compute the median, with the smallest and largest number as bounds."""
+    return Estimate(*(float(statistic(values)) for statistic in (np.median, np.min, np.max)))
+
+
 def root_mean(squares: Array, axis: int = -1) -> Array:
     """Compute the square root of the mean over the seeds: RMSE from squared errors.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...envs.record import Array
-from ..harness.stats import Bound, Estimate
+from ..harness.stats import Bound, Estimate, compute_range
 
 Results = Mapping[str, Mapping[tuple[str, str], Array]]
 """Numbers (seeds,) by subject and quantity, by the name of the simulation or analysis."""
@@ -80,7 +80,7 @@ class MeasuredPart:
     @property
     def number(self) -> Estimate:
         """The median over the seeds, with their range as its bounds."""
-        return Estimate(*(float(f(self.values)) for f in (np.median, np.min, np.max)))
+        return compute_range(self.values)
 
     @property
     def agreement(self) -> float:

@@ -25,7 +25,7 @@ from ...estimators.make import make_estimator
 from ...estimators.wires import AS_LOGGED, SignalCalibration, apply_wires
 from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import HONESTY, Column, ResultTable, Suite
-from ..harness.stats import Estimate, compute_honesty
+from ..harness.stats import Estimate, compute_honesty, compute_range
 from ..report.study import describe_innovations, describe_leader, format_verdict
 from .identify import identify_file
 from .quality import TRUTH, sort_remarks
@@ -135,7 +135,7 @@ class ReplayResult:
     @property
     def rmse(self) -> dict[str, Estimate]:
         """RMS errors over the seeds (rad), best first."""
-        ranges = {name: _compute_range(np.sqrt(x[:, 0])) for name, x in self.scores.items()}
+        ranges = {name: compute_range(np.sqrt(x[:, 0])) for name, x in self.scores.items()}
         return dict(sorted(ranges.items(), key=lambda item: item[1].value))
 
     def compare(self, name: str, other: str = GYRO_ONLY) -> Estimate:
@@ -145,11 +145,7 @@ class ReplayResult:
             name: Estimator.
             other: The other one.
         """
-        return _compute_range(np.sqrt(self.scores[name][:, 0] / self.scores[other][:, 0]))
-
-
-def _compute_range(values: Array) -> Estimate:
-    return Estimate(*(float(function(values)) for function in (np.median, np.min, np.max)))
+        return compute_range(np.sqrt(self.scores[name][:, 0] / self.scores[other][:, 0]))
 
 
 def _run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
@@ -375,7 +371,7 @@ def _add_rows(
             errors = {"rmse": result.rmse[name], "ratio": result.compare(name)}
             record |= errors | {"n": len(scores)}
             for column, values in zip(HONESTY, scores.T[1:], strict=True):
-                record[column.key] = _compute_range(values)
+                record[column.key] = compute_range(values)
         if name in result.nis:
             record["nis"] = result.nis[name]
         records[name] = record

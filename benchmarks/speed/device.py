@@ -28,7 +28,7 @@ from ...envs.numerics.torch_backend import torch
 from ...envs.vector import StabilityVectorEnv
 from ..harness.parallel import report_user_errors
 from ..harness.results import check_writable, write_text
-from .timing import Taken
+from ..harness.stats import compute_range
 
 _COUNTS = (1024, 16384, 65536, 262144, 1048576)
 _ROUNDS, _STEPS = 5, 20  # rounds that count, each of so many steps
@@ -69,17 +69,12 @@ def _measure(env: Any, copied: float) -> list[str]:
             env.step(actions)
 
     taken = [_measure_seconds(run_steps, env.device) for _ in range(_ROUNDS + 1)][1:]
-    rate, low, high = Taken(env.num_envs * _STEPS / x for x in taken).range
     size, moved = env.num_envs, _count_bytes(env)
+    rate, low, high = compute_range(size * _STEPS / np.array(taken))
     return [
-        f"{size}",
-        f"{env.dtype}".removeprefix("torch."),
-        f"{rate:.3g}",
-        f"{low:.3g} .. {high:.3g}",
-        f"{1e6 * size / rate:.4g}",
-        f"{moved:.0f}",
-        f"{100.0 * rate * moved / copied:.2g} %",
-    ]
+        f"{size}", f"{env.dtype}".removeprefix("torch."), f"{rate:.3g}", f"{low:.3g} .. {high:.3g}",
+        f"{1e6 * size / rate:.4g}", f"{moved:.0f}", f"{100.0 * rate * moved / copied:.2g} %",
+    ]  # fmt: skip
 
 
 _HEADS: Sequence[str] = (

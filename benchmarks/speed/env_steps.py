@@ -7,7 +7,6 @@ PPO and the gradient steps on it, with the same settings for both environments.
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,8 +20,7 @@ from ...estimators.filters import FILTERS
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..harness.results import ResultTable, Suite
-from .timing import Effort, Taken, Workload, WorkloadSet, measure_interleaved
+from .timing import Effort, TimeTable, Workload, measure_interleaved
 
 COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
 EPISODE, _CHUNK = 500, 50  # steps, the most; in one call
@@ -94,57 +92,54 @@ def _make_cartpoles() -> Workload:
 def _make_lane_keeping() -> Workload:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return _make_episode(gym.make("highway_env:lane-keeping-v0"))
+        import highway_env  # noqa: F401  registers it
+
+        return _make_episode(gym.make("lane-keeping-v0"))
 
 
-def make_workloads() -> WorkloadSet:
-    """Make all workloads of steps but those of packages that are not installed."""
+_make_vec = gym.make_vec
+_WORKLOADS: dict[str, Callable[[], Workload]] = {
+    FUSION: lambda: _make_episode(gym.make(_FUSION_ID)),
+    AT_ONCE: lambda: _make_batch(_make_vec(_FUSION_ID, COUNT)),
+    FUSION_V1: lambda: _make_episode(gym.make(f"sideslip/{FUSION_V1}")),
+    V1_AT_ONCE: lambda: _make_batch(_make_vec(f"sideslip/{FUSION_V1}", COUNT)),
+    FILTERED: lambda: _make_batch(EstimateObservations(_make_vec(_FUSION_ID, COUNT), **_FILTER)),
+    LATE: lambda: _make_batch(_make_vec(_VISION_ID, COUNT), _FRAMES),
+    NONE_LATE: lambda: _make_batch(_make_vec(_VISION_ID, COUNT, **_PROMPT), _FRAMES),
+    CARTPOLE: lambda: _make_episode(gym.make(CARTPOLE), _choose_upright_action),
+    LANE: _make_lane_keeping,
+    CARTPOLES: _make_cartpoles,
+    # Pendulum has no batch of arrays
+    PENDULUMS: lambda: _make_batch(_make_vec("Pendulum-v1", COUNT, "sync"), 1),
+}
+
+
+def measure_steps(effort: Effort) -> TimeTable:
+    """Measure steps, but those of packages that are not installed."""
     note = (
         "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
         f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
         "of a batch. Filters with full P compute the covariance of six states at every tick; a "
         "filter's own cost is the difference to the line without."
     )
-    field, make = WorkloadSet("Cost of an env-step", "step", note), gym.make_vec
-    field.add(FUSION, lambda: _make_episode(gym.make(_FUSION_ID)))
-    field.add(AT_ONCE, lambda: _make_batch(make(_FUSION_ID, COUNT)))
-    field.add(FUSION_V1, lambda: _make_episode(gym.make(f"sideslip/{FUSION_V1}")))
-    field.add(V1_AT_ONCE, lambda: _make_batch(make(f"sideslip/{FUSION_V1}", COUNT)))
-    field.add(
-        FILTERED, lambda: _make_batch(EstimateObservations(make(_FUSION_ID, COUNT), **_FILTER))
-    )
-    field.add(LATE, lambda: _make_batch(make(_VISION_ID, COUNT), _FRAMES))
-    field.add(NONE_LATE, lambda: _make_batch(make(_VISION_ID, COUNT, **_PROMPT), _FRAMES))
-    field.add(CARTPOLE, lambda: _make_episode(gym.make(CARTPOLE), _choose_upright_action))
-    field.add(LANE, _make_lane_keeping, "highway-env")
-    field.add(CARTPOLES, _make_cartpoles)
-    # Pendulum has no batch of arrays
-    field.add(PENDULUMS, lambda: _make_batch(make("Pendulum-v1", COUNT, "sync"), 1))
-    return field
+    table = TimeTable("Cost of an env-step", "us_per_step", "us per step", note)
+    return table.measure(_WORKLOADS, effort)
 
 
-def add_filters(suite: Suite, effort: Effort) -> None:
-    """Add rows and a table of the CPU time that each filter adds, in a third of the rounds.
-
-    Args:
-        suite: Suite that gets the results.
-        effort: Rounds and time of each.
-    """
-    bare_one, bare_batch = gym.make(_FUSION_ID), gym.make_vec(_FUSION_ID, FEWER)
-    envs = {"one": _make_episode(bare_one), "many": _make_batch(bare_batch)}
-    header = ("", "one", "range", f"of {FEWER}", "range")
-    fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
-    for name in FILTERS:
-        taken = measure_interleaved(envs | _make_filtered(name), fewer)
-        bare, bare_many, one, many = (np.array(values) for values in taken.values())
-        cells.append([name])
-        for env, added in ((FUSION, one - bare), (f"{FUSION} x {FEWER}", many - bare_many)):
-            cells[-1] += Taken(added).add_row(suite, f"{env} + {name}", "us_added").cells
+def measure_filters(effort: Effort) -> TimeTable:
+    """Measure the CPU time that each filter adds to a step."""
     note = (
         f"CPU us that a filter adds to an env-step of {FUSION}, its first two states and their "
         "deviations in the observation: differences round by round."
     )
-    suite.tables.append(ResultTable("Cost of a filter", header, cells, note, keyed=False))
+    table = TimeTable("Cost of a filter", "us_added", "us added", note)
+    bare_one, bare_batch = gym.make(_FUSION_ID), gym.make_vec(_FUSION_ID, FEWER)
+    envs = {"one": _make_episode(bare_one), "many": _make_batch(bare_batch)}
+    for name in FILTERS:
+        taken = measure_interleaved(envs | _make_filtered(name), effort.quarter)
+        table.times[f"{FUSION} + {name}"] = taken["one filtered"] - taken["one"]
+        table.times[f"{FUSION} x {FEWER} + {name}"] = taken["many filtered"] - taken["many"]
+    return table
 
 
 def _make_filtered(name: str) -> dict[str, Workload]:
@@ -169,32 +164,24 @@ def _make_learner(env_id: str) -> Workload:
     from stable_baselines3.common import env_util
 
     from ...agents import vec_env
+    from ...agents.training.config import TrainingTask
 
+    options = TrainingTask(_FUSION_ID, num_envs=_LEARNERS).make_model_options(10 * TICK)
+    settings = {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
     make = vec_env.make_vec_env if env_id == _FUSION_ID else env_util.make_vec_env
     env = make(env_id, _LEARNERS, seed=0)
-    model = PPO("MlpPolicy", env, seed=0, device="cpu", **_get_settings())
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", **settings)
     steps = _LEARNERS * model.n_steps
     return Workload(lambda: model.learn(steps, reset_num_timesteps=False), steps)
 
 
-def _get_settings() -> dict[str, Any]:
-    """Get the settings of PPO that `sideslip train` uses."""
-    from ...agents.training.config import TrainingTask
-
-    options = TrainingTask(_FUSION_ID, num_envs=_LEARNERS).make_model_options(10 * TICK)
-    return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
-
-
-def make_learners() -> WorkloadSet:
-    """Make both learners, unless stable-baselines3 is not installed."""
-    field = WorkloadSet("Cost of a learned env-step", "step", "", is_slow=True)
-    for name, env_id in ((PPO_YAW, _FUSION_ID), (PENDULUM, "Pendulum-v1")):
-        field.add(name, partial(_make_learner, env_id), "stable-baselines3")
-    settings = _get_settings() if field.workloads else {}
-    field.note = (
-        "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "
-        f"{_LEARNERS}, YawFusion-v0 through the bridge; "
-        f"{', '.join(f'{name} = {value}' for name, value in settings.items())}, the rest is its "
-        "default."
+def measure_learners(effort: Effort) -> TimeTable:
+    """Measure both learners, unless stable-baselines3 is not installed."""
+    note = (
+        f"PPO of stable-baselines3, rollout and gradient steps, on {_LEARNERS} environments each, "
+        "YawFusion-v0 through the bridge; n_steps, n_epochs, batch_size and gamma are those of "
+        "`sideslip train`, the rest is its default."
     )
-    return field
+    table = TimeTable("Cost of a learned env-step", "us_per_step", "us per step", note)
+    ids = {PPO_YAW: _FUSION_ID, PENDULUM: "Pendulum-v1"}
+    return table.measure({x: partial(_make_learner, ids[x]) for x in ids}, effort.quarter)

@@ -26,7 +26,7 @@ from ...envs.record import Array
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
 from ...envs.vehicle.tyres import FIALA, PlantVariant, TyreInputs, compute_tyre_load
-from .timing import AbsentError, Workload, WorkloadSet
+from .timing import AbsentError, Effort, TimeTable, Workload
 
 _FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
 _VECTOR_FLAGS = """
@@ -53,11 +53,11 @@ def read_source() -> str:
     return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
 
 
-def _load_c_plant(block: int) -> Any:
-    """Compile and load the function `plant` of `plant.c` for blocks of so many cars."""
+def _load_c_plant() -> Any:
+    """Compile and load the function `plant` of `plant.c`."""
     with TemporaryDirectory() as folder:
         library = Path(folder) / "plant.so"
-        flags = [*_FLAGS, *_VECTOR_FLAGS.split(), f"-DBLOCK={block}", "-shared", "-fPIC"]
+        flags = [*_FLAGS, *_VECTOR_FLAGS.split(), f"-DBLOCK={LANES}", "-shared", "-fPIC"]
         command = [_find_compiler(), *flags, "-x", "c", "-", "-o", str(library)]
         run = subprocess.run(command, input=read_source(), capture_output=True, text=True)
         if run.returncode:
@@ -140,7 +140,7 @@ def _advance(lanes: Cars, ticks: int) -> None:
 
 def make_c_advance() -> _Advance:
     """Make the function that moves cars in C; RuntimeError where its numbers are not ours."""
-    function = _load_c_plant(LANES)
+    function = _load_c_plant()
 
     def advance_in_c(cars: Cars, ticks: int) -> None:
         function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
@@ -165,14 +165,17 @@ def _make_workload(advance: _Advance, cars: Cars) -> Workload:
     return Workload(lambda: advance(running, _TICKS), CARS * _TICKS, reset_cars)
 
 
-def make_workloads() -> WorkloadSet:
-    """Make the workloads of both plants; without a compiler the one in C is absent."""
+def measure_plants(effort: Effort) -> TimeTable:
+    """Measure both plants; without a compiler the one in C is absent."""
     note = (
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Kutta's rule; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "
         "(-O3 -march=native, no fused multiply-add), with the same numbers."
     )
-    cars, field = _make_cars(CARS), WorkloadSet("Cost of a tick of the plant", "tick", note)
-    field.add(PLANT, lambda: _make_workload(_advance, cars))
-    field.add(C, lambda: _make_workload(make_c_advance(), cars))
-    return field
+    cars = _make_cars(CARS)
+    table = TimeTable("Cost of a tick of the plant", "us_per_tick", "us per tick", note)
+    workloads = {
+        PLANT: lambda: _make_workload(_advance, cars),
+        C: lambda: _make_workload(make_c_advance(), cars),
+    }
+    return table.measure(workloads, effort)

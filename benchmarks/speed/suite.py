@@ -8,18 +8,18 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 
-from ..harness.results import ResultTable, Suite
-from ..harness.stats import Bound
+from ..harness.results import Cell, Column, Line, ResultTable, Suite
+from ..harness.stats import Bound, compute_range
 from ..report.study import Request, Study, format_verdict, summarise_names
 from . import env_steps, plant
-from .timing import FULL, QUICK, AbsentError, Taken, format_absences, format_three_digits
+from .timing import FULL, QUICK, TimeTable
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"
@@ -69,10 +69,7 @@ run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
 
 def _measure_first_step() -> dict[str, float]:
     """Measure the CPU seconds of what a process does up to its first step; kernels are cached."""
-    try:
-        marks = json.loads(_run_python(f"{_WARM}print(json.dumps(marks))", limit=LIMIT))
-    except subprocess.TimeoutExpired:
-        raise AbsentError("no kernels are cached on disk here") from None
+    marks = json.loads(_run_python(f"{_WARM}print(json.dumps(marks))", limit=LIMIT))
     return dict(zip(_STEPS, np.diff(marks, prepend=0.0).tolist(), strict=True))
 
 
@@ -96,36 +93,28 @@ def _run_python(
     return run.stdout.splitlines()[-1]
 
 
-def _add_first_use(suite: Suite, quick: bool) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table; returns CPU seconds of the targets, and reasons of absence, by name.
-
-    In a quick run a few processes do, and nothing is compiled, which takes minutes.
-    """
-    columns, absent = dict[str, Taken](), dict[str, str]()
-    try:
-        taken = [_measure_first_step() for _ in range((_QUICK_RUNS if quick else _RUNS) + 1)][1:]
-        columns = {f"first use: {name}": Taken(run[name] for run in taken) for name in taken[0]}
-        counted = ("import numba", "gym.make", "first reset", "first step")
-        columns[FIRST] = Taken(sum(run[name] for name in counted) for run in taken)
-    except AbsentError as error:
-        absent[FIRST] = str(error)
-    if not quick:
-        kernels = _measure_compilation()
-        columns["cold compile of all kernels"] = Taken([sum(seconds for _, seconds in kernels)])
-        columns[KERNEL] = Taken([max(seconds for _, seconds in kernels)])
-    else:
-        absent[KERNEL] = "in the full form only"
-    cells = []
-    for name, values in columns.items():
-        middle, low, high = values.add_row(suite, name, "cpu_seconds").range
-        cells.append([name, f"{middle:.3f}", f"{low:.3f} .. {high:.3f}"])
+def _measure_first_use(quick: bool) -> TimeTable:
+    """Measure the first use; in a quick run by a few processes, and nothing is compiled."""
     note = (
         "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "
         "Cold: environment and exact-kf, single and batch, with nothing on disk."
     )
-    header = ("", "CPU-s", "range")
-    suite.tables.append(ResultTable("Cost of the first use", header, cells, note, False))
-    return {name: columns[name] for name in (FIRST, KERNEL) if name in columns}, absent
+    table = TimeTable("Cost of the first use", "cpu_seconds", "CPU-s", note)
+    try:
+        runs = [_measure_first_step() for _ in range((_QUICK_RUNS if quick else _RUNS) + 1)][1:]
+        for name in _STEPS:
+            table.times[f"first use: {name}"] = np.array([run[name] for run in runs])
+        counted = ("import numba", "gym.make", "first reset", "first step")
+        table.times[FIRST] = np.sum([table.times[f"first use: {name}"] for name in counted], axis=0)
+    except subprocess.TimeoutExpired:
+        table.absent[FIRST] = "no kernels are cached on disk here"
+    if quick:
+        table.absent[KERNEL] = "in the full form only"  # it takes minutes
+    else:
+        seconds = [kernel_seconds for _, kernel_seconds in _measure_compilation()]
+        table.times["cold compile of all kernels"] = np.array([sum(seconds)])
+        table.times[KERNEL] = np.array([max(seconds)])
+    return table
 
 
 class _Target(NamedTuple):
@@ -154,69 +143,66 @@ TARGETS = (
 )  # fmt: skip
 
 
-def _add_targets(suite: Suite, taken: Mapping[str, Taken], absent: Mapping[str, str]) -> None:
-    """Add rows of measured targets, and before all tables that of all; `absent` has reasons."""
-    cells, missing = [], dict[str, str]()
-    for target in TARGETS:
-        needed = [target.over, target.workload] if target.over else [target.workload]
-        absent_names = [name for name in needed if name not in taken]
-        unit = "x" if target.over else "CPU-s"
-        cells.append([target.name, f"{target.limit} {unit}", "", "", "not measured"])
-        if absent_names:
-            missing |= {name: absent.get(name, "not run") for name in absent_names}
-            continue
-        if target.over:
-            pairs = zip(taken[target.over], taken[target.workload], strict=True)
-            measured = Taken(over / workload for over, workload in pairs)
-            measured.add_row(suite, target.name, "ratio")
-        else:
-            measured = taken[target.workload]
-        met = "met" if target.limit.is_met(measured.range.value) else "not met"
-        cells[-1][2:] = *measured.cells, met
-    header = ("figure", "target", "measured", "range", "")
-    note = "Ratios are taken round by round, in CPU time; the median counts."
-    note += format_absences(missing)
-    suite.tables.insert(0, ResultTable("Targets", header, cells, note, keyed=False))
+def _evaluate_targets(tables: Sequence[TimeTable]) -> list[Line]:
+    """Make a line of each target: what was measured, in ratios round by round, and whether met."""
+    times = {name: taken for table in tables for name, taken in table.times.items()}
+    lines = list[Line]()
+    for name, over, workload, limit in TARGETS:
+        goal = f"{limit} {'x' if over else 'CPU-s'}"
+        line: dict[str, Cell] = {"scenario": name, "goal": goal, "outcome": "not measured"}
+        if workload in times and (not over or over in times):
+            rounds = times[over] / times[workload] if over else times[workload]
+            measured = compute_range(rounds)
+            outcome = "met" if limit.is_met(measured.value) else "not met"
+            line |= {"n": len(rounds), "measured": measured, "outcome": outcome}
+            line |= {"ratio": measured} if over else {}
+        lines.append(line)
+    return lines
 
 
-_SpeedResults = tuple[Mapping[str, Taken], Suite]  # us a unit by name, and all rows and tables
-
-
-def _measure(request: Request) -> _SpeedResults:
+def _measure(request: Request) -> list[TimeTable]:
     """Measure in this process, where workloads take turns; a quick run compiles nothing."""
-    measured, effort = Suite("speed", "", ""), QUICK if request.quick else FULL
-    taken, absent = dict[str, Taken](), dict[str, str]()
-    for make in (env_steps.make_workloads, plant.make_workloads, env_steps.make_learners):
-        workloads = make()
-        taken |= workloads.measure(measured, effort)
-        absent |= workloads.absent
-        if make is env_steps.make_workloads:
-            env_steps.add_filters(measured, effort)
-    seconds, more_absent = _add_first_use(measured, request.quick)
-    _add_targets(measured, taken | seconds, absent | more_absent)
-    return taken, measured
+    effort = QUICK if request.quick else FULL
+    return [
+        env_steps.measure_steps(effort),
+        env_steps.measure_filters(effort),
+        plant.measure_plants(effort),
+        env_steps.measure_learners(effort),
+        _measure_first_use(request.quick),
+    ]
 
 
-def _add_tables(suite: Suite, results: _SpeedResults) -> None:
-    _, measured = results
-    suite.rows += measured.rows
-    suite.tables += measured.tables
+def _add_tables(suite: Suite, tables: Sequence[TimeTable]) -> None:
+    lines = _evaluate_targets(tables)
+    suite.add_rows(lines, salt="", env_version="")
+    measured = Column("measured", "measured [range]", form=".3g")
+    columns = (
+        Column("scenario", "figure"),
+        Column("goal", "target"),
+        measured,
+        Column("outcome", " "),
+    )
+    note = "Ratios are taken round by round, in CPU time; the median counts."
+    suite.tables.append(ResultTable("Targets", columns, lines, note, keyed=False))
+    for table in tables:
+        table.add_table(suite)
 
 
-def _make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    us = {name: times.range.value for name, times in taken.items()}
+def _make_verdict(tables: Sequence[TimeTable]) -> str:
+    us = {name: np.median(taken) for table in tables for name, taken in table.times.items()}
     step_time, batch_time = us[env_steps.FUSION_V1], us[env_steps.V1_AT_ONCE]
     rivals = (env_steps.CARTPOLE, env_steps.LANE)
-    over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in rivals if x in us]
-    met = [line[0] for line in goals.cells if line[-1] == "met"]
-    missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, outcome in goals.cells
-              if outcome == "not met"]  # fmt: skip
+    over = [f"{us[x] / step_time:.3g} for {x}" for x in rivals if x in us]
+    lines = _evaluate_targets(tables)
+    met = [line for line in lines if line["outcome"] == "met"]
+    missed = [f"{line['scenario']} ({line['measured'].value:.3g} of {line['goal']})"
+              for line in lines if line["outcome"] == "not met"]  # fmt: skip
     shortfall = f"; not met: {summarise_names(missed, 1)}" if missed else ""
     return format_verdict(
-        f"10 ms of driving cost {format_three_digits(step_time)} us on one core, "
-        f"{format_three_digits(batch_time)} us a car where {env_steps.COUNT} drive at once.",
+        f"10 ms of driving cost {step_time:.3g} us on one core, {batch_time:.3g} us a car where "
+        f"{env_steps.COUNT} drive at once.",
         f"One env-step of ours is 1; it is {' and '.join(over)}." if over else "",
-        f"{len(met)} of {len(goals.cells)} goals are met{shortfall}.",
+        f"{len(met)} of {len(lines)} goals are met{shortfall}.",
         "Why: one compiled call an env-step, cars side by side in the processor's wide registers.",
         "Not covered: other machines; compare ratios, not microseconds.",
     )
@@ -226,7 +212,5 @@ STUDY = Study(
     "speed", "What a step costs",
     "CPU time on one thread, median and range of rounds in which the entries of a table "
     "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
-    (0, 0),
-    _measure, _add_tables,
-    lambda results: _make_verdict(results[0], results[1].tables[0]),
+    (0, 0), _measure, _add_tables, _make_verdict,
 )  # fmt: skip

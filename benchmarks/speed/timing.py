@@ -1,14 +1,16 @@
 """CPU times of workloads that take turns in one process, on one thread, and the table of them."""
 
 import math
-import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-from ..harness.results import ResultTable, Suite
-from ..harness.stats import Estimate
+import numpy as np
+
+from ...envs.record import Array
+from ..harness.results import Column, ResultTable, Suite
+from ..harness.stats import compute_range
 
 
 @dataclass(frozen=True)
@@ -27,55 +29,23 @@ class Effort:
     rounds: int
     seconds: float
 
+    @property
+    def quarter(self) -> "Effort":
+        """A quarter of the rounds, for what is slow."""
+        return replace(self, rounds=max(1, self.rounds // 4))
+
 
 QUICK = Effort(9, 0.01)
 FULL = Effort(25, 0.04)
 """Many short rounds: what the machine does meanwhile falls on all workloads of one round."""
 
-_MAX_SLOW_ROUNDS = 5
 
-
-class Taken(list[float]):
-    """CPU times of rounds (us a unit, or s), or the ratios of two workloads'."""
-
-    @property
-    def range(self) -> Estimate:
-        """The median, with the smallest and largest number as bounds."""
-        return Estimate(statistics.median(self), min(self), max(self))
-
-    @property
-    def cells(self) -> tuple[str, str]:
-        """The median and range, to three digits, as two cells of a table."""
-        middle, low, high = map(format_three_digits, self.range)
-        return middle, f"{low} .. {high}"
-
-    def add_row(self, suite: Suite, name: str, metric: str) -> "Taken":
-        """Add the median and range as a row of a suite.
-
-        Args:
-            suite: Suite that gets the row.
-            name: Name of the workload.
-            metric: Metric of the row.
-        """
-        columns = {"salt": "", "env_version": "", "scenario": name}
-        suite.add_rows([{metric: self.range}], n=len(self), **columns)
-        return self
-
-
-def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
-    """Measure CPU time a unit (us) of each round by name, workloads in turn, after a first round.
-
-    Args:
-        workloads: Workloads by name.
-        effort: Rounds and time of each.
-    """
+def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Array]:
+    """Measure CPU time a unit (us) of each round by name, in turn, after a first round."""
     with limit_threads():
-        calls = {name: _count_calls(x, effort.seconds) for name, x in workloads.items()}
-        taken = {name: Taken() for name in workloads}
-        for _ in range(effort.rounds):
-            for name, workload in workloads.items():
-                taken[name].append(_measure_calls(workload, calls[name]))
-    return taken
+        calls = [(x, _count_calls(x, effort.seconds)) for x in workloads.values()]
+        rounds = [[_measure_calls(*pair) for pair in calls] for _ in range(effort.rounds)]
+    return dict(zip(workloads, np.array(rounds).T, strict=True))
 
 
 def _measure_calls(workload: Workload, calls: int) -> float:
@@ -107,76 +77,39 @@ def limit_threads() -> Iterator[None]:
 
 
 class AbsentError(Exception):
-    """A workload cannot be made; the message says why."""
+    """Something cannot be measured; the message says why."""
 
 
 @dataclass
-class WorkloadSet:
-    """Workloads of a table by name, and the reasons why others are absent."""
+class TimeTable:
+    """CPU times by name, and the reasons why others are absent."""
 
-    title: str  # title of the table
-    unit: str  # unit of the workloads, "step" or "tick"
-    note: str  # note of the table
-    is_slow: bool = False  # whether few rounds suffice
-    workloads: dict[str, Workload] = field(default_factory=dict)
+    title: str
+    metric: str  # metric of its rows
+    unit: str  # unit of its numbers
+    note: str = ""
+    times: dict[str, Array] = field(default_factory=dict)  # shape (rounds,) each
     absent: dict[str, str] = field(default_factory=dict)
 
-    def add(self, name: str, make: Callable[[], Workload], package: str | None = None) -> None:
-        """Add a workload, or why it is absent.
+    def measure(
+        self, workloads: Mapping[str, Callable[[], Workload]], effort: Effort
+    ) -> "TimeTable":
+        """Measure workloads in turn, but for those that this machine or its packages lack."""
+        made = dict[str, Workload]()
+        for name, make in workloads.items():
+            try:
+                made[name] = make()
+            except (AbsentError, ModuleNotFoundError) as error:
+                self.absent[name] = str(error)
+        self.times |= measure_interleaved(made, effort)
+        return self
 
-        Args:
-            name: Name of the workload.
-            make: Function that makes it, or raises `AbsentError`.
-            package: Optional package that it needs, None for none.
-        """
-        try:
-            self.workloads[name] = make()
-        except AbsentError as error:
-            self.absent[name] = str(error)
-        except ModuleNotFoundError:
-            if package is None:
-                raise
-            self.absent[name] = f"{package} is not installed"
-
-    def measure(self, suite: Suite, effort: Effort) -> dict[str, Taken]:
-        """Measure CPU time a unit (us) of each round by name, and add rows and a table to a suite.
-
-        Args:
-            suite: Suite that gets the results.
-            effort: Rounds and time of each.
-        """
-        if self.is_slow:
-            effort = replace(effort, rounds=max(1, min(effort.rounds // 2, _MAX_SLOW_ROUNDS)))
-        taken, cells = measure_interleaved(self.workloads, effort), []
-        for name, values in taken.items():
-            values.add_row(suite, name, f"us_per_{self.unit}")
-            rate = f"{float(f'{1e6 / values.range.value:.3g}'):,.0f}"
-            cells.append([name, *values.cells, rate])
-        if cells:
-            header = ("", f"us per {self.unit}", "range", "per CPU-s")
-            text = self.note + format_absences(self.absent)
-            suite.tables.append(ResultTable(self.title, header, cells, text, keyed=False))
-        return taken
-
-
-def format_absences(absent: Mapping[str, str]) -> str:
-    """Format a sentence on the absent workloads, "" without any.
-
-    Args:
-        absent: Reasons by name.
-    """
-    if not absent:
-        return ""
-    return f" Not measured: {'; '.join(f'{name} ({reason})' for name, reason in absent.items())}."
-
-
-def format_three_digits(value: float) -> str:
-    """Format a number to three digits, without an exponent.
-
-    Args:
-        value: Number to format.
-
-    >>> format_three_digits(0.04431), format_three_digits(7.2), format_three_digits(1004.0)
-    ('0.0443', '7.2', '1000')
-    """
-    return f"{float(f'{value:.3g}'):g}"
+    def add_table(self, suite: Suite) -> None:
+        """Add rows and a table to a suite."""
+        times = self.times.items()
+        records = [{"scenario": x, self.metric: compute_range(y), "n": len(y)} for x, y in times]
+        suite.add_rows(records, salt="", env_version="")
+        reasons = "; ".join(f"{name} ({reason})" for name, reason in self.absent.items())
+        note = self.note + (f" Not measured: {reasons}." if reasons else "")
+        columns = Column("scenario", " "), Column(self.metric, f"{self.unit} [range]", form=".3g")
+        suite.tables.append(ResultTable(self.title, columns, records, note.lstrip(), keyed=False))

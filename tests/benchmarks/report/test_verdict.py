@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Bound, Estimate
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.ledger import Claim, ClaimPart, MeasuredClaim, MeasuredPart
@@ -19,7 +18,7 @@ from sideslip.benchmarks.recorded.replay import ReplayResult as Replayed
 from sideslip.benchmarks.report.study import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
-from sideslip.benchmarks.speed.timing import Taken
+from sideslip.benchmarks.speed.timing import TimeTable
 from sideslip.benchmarks.studies import estimation
 
 RNG = np.random.default_rng(0)
@@ -90,7 +89,7 @@ def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
 def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.MonkeyPatch) -> None:
     def sine(fails: bool) -> Any:
         ratio = 0.9 if fails else 0.1
-        runs = (SineDwellRun(1.0, 3.0, 0.1, 0.1, 2.0), SineDwellRun(2.0, 6.0, ratio, 0.1, 2.0))
+        runs = (SineDwellRun(3.0, 0.1, 0.1, 2.0), SineDwellRun(6.0, ratio, 0.1, 2.0))
         return [SineDwellResult(0.3, runs)]
 
     track = next(iter(iso.TRACKS))
@@ -125,11 +124,10 @@ def test_a_replay_without_truth_has_no_winner() -> None:
 
 
 def test_speed_counts_its_goals_and_names_those_that_are_missed() -> None:
-    rounds = {env_steps.FUSION_V1: [9.0, 10.0, 11.0], env_steps.V1_AT_ONCE: [0.5]}
-    taken = {name: Taken(x) for name, x in {**rounds, env_steps.LANE: [300.0]}.items()}
-    cells = [["a", ">= 2 x", "3", "", "met"], ["b", ">= 9 x", "3", "", "not met"]]
-    cells.append(["c", ">= 1 x", "", "", "not measured"])
-    lines = fits(speed._make_verdict(taken, ResultTable("Targets", ("",) * 5, cells)))
+    rounds = {env_steps.FUSION_V1: [9.0, 10.0, 11.0], env_steps.V1_AT_ONCE: [0.5] * 3}
+    rounds |= {env_steps.FUSION: [10.0] * 3, env_steps.LANE: [300.0] * 3, speed.FIRST: [0.6]}
+    times = {name: np.array(x) for name, x in rounds.items()}
+    lines = fits(speed._make_verdict([TimeTable("", "", "", times=times)]))
     assert lines[0].startswith("10 ms of driving cost 10 us on one core, 0.5 us a car")
     assert "it is 30 for lane-keeping" in lines[1]
-    assert lines[2] == "1 of 3 goals are met; not met: b (3 of >= 9 x)."
+    assert lines[2] == f"1 of 10 goals are met; not met: {speed.FIRST} (0.6 of <= 0.5 CPU-s)."

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.results import Suite
-from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.speed import env_steps, plant, suite, timing
 from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
@@ -28,10 +27,11 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plant, "CARS", 32)
 
 
-def measure(workloads: Any) -> tuple[Suite, dict[str, Any], dict[str, str]]:
-    """The suite, the times taken and the reasons of the absent ones of some workloads."""
-    measured = Suite("speed", "", "")
-    return measured, workloads.measure(measured, SHORT), workloads.absent
+def make_suite(table: timing.TimeTable) -> Suite:
+    """A suite with one table."""
+    made = Suite("speed", "", "")
+    table.add_table(made)
+    return made
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
@@ -42,37 +42,29 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the optional packages: the suite needs none of them."""
     without(monkeypatch, "highway_env")
-    measured, taken, absent = measure(env_steps.make_workloads())
-    assert {env_steps.FUSION_V1, env_steps.V1_AT_ONCE, env_steps.FILTERED} <= set(taken)
-    assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
-    assert absent == {env_steps.LANE: "highway-env is not installed"}
-    rows = {(row.scenario, row.metric) for row in measured.rows}
-    assert rows == {(name, "us_per_step") for name in taken}
-    assert all(0.0 < row.low <= row.value <= row.high for row in measured.rows)
-    (table,) = measured.tables
-    assert all(f"{name} ({why})" in table.note for name, why in absent.items())
+    measured = env_steps.measure_steps(SHORT)
+    assert set(measured.times) == set(env_steps._WORKLOADS) - {env_steps.LANE}
+    assert list(measured.absent) == [env_steps.LANE]
+    made = make_suite(measured)
+    rows = [(row.scenario, row.metric) for row in made.rows]
+    assert rows == [(name, "us_per_step") for name in measured.times]
+    assert all(0.0 < row.low <= row.value <= row.high for row in made.rows)
+    (table,) = made.tables
+    assert f"Not measured: {env_steps.LANE} (" in table.note and "highway_env" in table.note
 
 
 def test_every_filter_of_the_catalogue_has_its_line() -> None:
     """All names that make a filter, in one environment and in several."""
-    measured = Suite("speed", "", "")
-    env_steps.add_filters(measured, SHORT)
     names = set(ESTIMATORS)
     assert set(FILTERS) <= names
     envs = env_steps.FUSION, f"{env_steps.FUSION} x 2"
-    rows = [(row.scenario, row.metric) for row in measured.rows]
-    assert sorted(rows) == sorted((f"{e} + {name}", "us_added") for e in envs for name in names)
-    (table,) = measured.tables
-    assert {cells[0] for cells in table.cells} == names
-    assert {len(cells) for cells in table.cells} == {len(table.columns)}
+    times = env_steps.measure_filters(SHORT).times
+    assert sorted(times) == sorted(f"{env} + {name}" for env in envs for name in names)
 
 
 def test_the_lane_keeping_environment_runs() -> None:
     pytest.importorskip("highway_env")
-    contestants = timing.WorkloadSet("", "step", "")
-    contestants.add(env_steps.LANE, env_steps._make_lane_keeping, "highway-env")
-    contestants.workloads[env_steps.LANE].work()
-    assert contestants.absent == {}
+    env_steps._make_lane_keeping().work()
 
 
 def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
@@ -120,18 +112,18 @@ def test_a_compiler_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
 def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
-    measured, taken, absent = measure(plant.make_workloads())
-    assert set(taken) == {plant.PLANT}
-    assert absent == {plant.C: "no C compiler"}
-    assert "no C compiler" in measured.tables[0].note
+    measured = plant.measure_plants(SHORT)
+    assert set(measured.times) == {plant.PLANT}
+    assert measured.absent == {plant.C: "no C compiler"}
 
 
 def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "torch", "stable_baselines3")
     monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
-    measured, taken, absent = measure(env_steps.make_learners())
-    assert taken == {} and measured.tables == []
-    assert absent[env_steps.PENDULUM] == "stable-baselines3 is not installed"
+    measured = env_steps.measure_learners(SHORT)
+    assert measured.times == {} and "stable_baselines3" in measured.absent[env_steps.PENDULUM]
+    (table,) = make_suite(measured).tables
+    assert not table.cells and env_steps.PENDULUM in table.note
 
 
 def test_compilation_is_counted_at_the_top_alone() -> None:
@@ -154,37 +146,35 @@ outer(1); outer(1.0); outer(2); inner(1)
 
 def test_without_kernels_on_disk_the_first_step_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "LIMIT", 0.01)
-    measured = Suite("speed", "", "")
-    seconds, absent = suite._add_first_use(measured, quick=True)
-    assert seconds == {} and measured.rows == []
-    assert absent[suite.FIRST] == "no kernels are cached on disk here"
+    measured = suite._measure_first_use(quick=True)
+    assert measured.times == {}
+    assert measured.absent[suite.FIRST] == "no kernels are cached on disk here"
+
+
+def make_table(**times: list[float]) -> timing.TimeTable:
+    """A table of times by name."""
+    arrays = {name: np.array(rounds) for name, rounds in times.items()}
+    return timing.TimeTable("", "us_per_step", "us", times=arrays)
 
 
 def test_ratios_are_taken_round_by_round() -> None:
-    """Their median is not the ratio of the medians."""
+    """Their median is not the ratio of the medians; times of two tables make one."""
     target = suite.TARGETS[0]
-    taken = {
-        target.over: timing.Taken([20.0, 300.0, 80.0]),
-        target.workload: timing.Taken([1.0, 10.0, 2.0]),
-    }
-    measured = Suite("speed", "", "")
-    suite._add_targets(measured, taken, {})
-    (row,) = measured.rows
-    assert (row.scenario, row.metric) == (target.name, "ratio")
+    over = make_table(**{target.over: [20.0, 300.0, 80.0]})
+    made = Suite("speed", "", "")
+    suite._add_tables(made, [over, make_table(**{target.workload: [1.0, 10.0, 2.0]})])
+    (row,) = (row for row in made.rows if row.metric == "ratio")
+    assert row.scenario == target.name
     assert (row.value, row.low, row.high, row.n) == (30.0, 20.0, 40.0, 3)
-    cells = measured.tables[0].cells[0]
-    assert cells[1:] == [">= 30 x", "30", "20 .. 40", "met"]
+    line = made.tables[0].cells[0]
+    assert (line["goal"], line["measured"], line["outcome"]) == (">= 30 x", (30, 20, 40), "met")
 
 
 def test_every_target_stands_in_the_table() -> None:
-    measured = Suite("speed", "", "")
-    suite._add_targets(measured, {suite.FIRST: timing.Taken([0.6])}, {env_steps.LANE: "it rains"})
-    (table,) = measured.tables
-    assert [cells[0] for cells in table.cells] == [target.name for target in suite.TARGETS]
-    said = [cells[-1] for cells in table.cells]
-    assert said == ["not measured"] * 8 + ["not met", "not measured"]
-    assert f"{env_steps.LANE} (it rains)" in table.note
-    assert f"{env_steps.CARTPOLE} (not run)" in table.note
+    lines = suite._evaluate_targets([make_table(**{suite.FIRST: [0.6]})])
+    assert [line["scenario"] for line in lines] == [target.name for target in suite.TARGETS]
+    outcomes = [line["outcome"] for line in lines]
+    assert outcomes == ["not measured"] * 8 + ["not met", "not measured"]
 
 
 def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
@@ -197,7 +187,6 @@ def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
     b = ["start of b", "b"]
     assert order == ["a", "a", *b, *b] + ["a", *b] * 3
     assert {name: len(each) for name, each in taken.items()} == {"a": 3, "b": 3}
-    assert timing.Taken([3.0, 1.0, 2.0]).range == (2.0, 1.0, 3.0)
 
 
 def test_learning_runs_on_one_thread() -> None:
@@ -205,28 +194,3 @@ def test_learning_runs_on_one_thread() -> None:
     pytest.importorskip("threadpoolctl")
     with timing.limit_threads():
         assert torch.get_num_threads() == 1
-
-
-def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What each of them measured, and what it could not for want of a package."""
-    held: list[Any] = []
-
-    def judge(found: Any, *numbers: Any) -> None:
-        found.tables.append(None)
-        held.extend(numbers)
-
-    makers = ((env_steps, "make_workloads"), (plant, "make_workloads"),
-              (env_steps, "make_learners"))  # fmt: skip
-    names = [f"{part.__name__}.{make}" for part, make in makers] + ["first use"]
-    for name, (part, make) in zip(names, makers, strict=False):
-        workloads = timing.WorkloadSet("", "", "", absent={name: "not there"})
-        monkeypatch.setattr(workloads, "measure", lambda *_, name=name: {name: (1.0,)})
-        monkeypatch.setattr(part, make, lambda workloads=workloads: workloads)
-    monkeypatch.setattr(env_steps, "add_filters", lambda *_: None)
-    first = {"first use": (1.0,)}, {"first use": "not there"}
-    monkeypatch.setattr(suite, "_add_first_use", lambda *_: first)
-    monkeypatch.setattr(suite, "_add_targets", judge)
-    monkeypatch.setattr(suite, "_make_verdict", lambda *_: "")
-    suite.STUDY.run(Request(quick=True))
-    taken, absent = held
-    assert list(taken) == names and list(absent) == names
