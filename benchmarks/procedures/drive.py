@@ -35,7 +35,6 @@ class Series:
     psi: Array
     X: Array
     Y: Array
-    moment: Array  # N m, the yaw moment delivered
     failed: bool = False  # the episode ended by a failure
 
     @property
@@ -123,8 +122,8 @@ class ProcedureEntry:
             env, agent = self.make(car, ENV_ID, scenario=CALM | dict(fields), **options)
             rows = []
             for step in iterate_steps(env, agent, seed or 0):
-                t, steer, moment = (step.info[name] for name in ("t", "steer", "yaw_moment"))
-                rows.append([t, steer, *env.unwrapped.motion[:POSE], moment])
+                pose = env.unwrapped.motion[:POSE]
+                rows.append([step.info["t"], step.info["steer"], *pose])
             env.close()
             return replace(Series(*np.array(rows).T), failed=bool(step.info["failure"]))
 

@@ -3,6 +3,10 @@
 Slowly increasing steer gives A, the steering wheel angle at 0.3 g; then one period of a sine with a
 dwell after its third quarter, coasting, to both sides, from 1.5 A on. The peak of the yaw rate is
 that between reversal and completion of steer: a car that spins has no later one.
+
+Args:
+    A: Reference angle (rad at the steering wheel).
+    multiples: Amplitudes (of A); None: the standard's series.
 """
 
 import math
@@ -35,7 +39,6 @@ COMPLETION = ONSET + 1.0 / FREQUENCY + DWELL
 class SineDwellRun:
     """A sine with dwell and its measures, which are NaN from where the car's drive ended."""
 
-    amplitude: float  # rad at the steering wheel, with its sign
     multiple: float  # of A
     ratio_1: float  # yaw rate over its peak at the first time of `RATIOS`
     ratio_2: float
@@ -104,7 +107,7 @@ def _evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
     dX, dY = (interpolate(name, ONSET + SIDEWAYS_AT) - start[name] for name in ("X", "Y"))
     # across the heading at the beginning of steer
     sideways = abs(dY * math.cos(start["psi"]) - dX * math.sin(start["psi"]))
-    return SineDwellRun(amplitude, multiple, ratio_1, ratio_2, sideways)
+    return SineDwellRun(multiple, ratio_1, ratio_2, sideways)
 
 
 @dataclass(frozen=True)
@@ -135,14 +138,7 @@ def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
 def run(
     drive: DriveFunction, car: TestCar, A: float, multiples: Sequence[float] | None = None
 ) -> SineDwellResult:
-    """Run the procedure, to both sides with each amplitude.
-
-    Args:
-        drive: Function that drives the car through a scenario.
-        car: Car under test, with speed and steering ratio.
-        A: Reference angle (rad at the steering wheel).
-        multiples: Amplitudes (of A); None: the standard's series.
-    """
+    """Run the procedure, to both sides with each amplitude."""
     angles = _list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
     runs = [_evaluate_run(drive(_make_sine_with_dwell(car, angle)), angle, A) for angle in signed]

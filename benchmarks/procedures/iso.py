@@ -3,10 +3,15 @@
 ISO 3888: double lane change (part 1, at a held speed) and obstacle avoidance (part 2, coasting).
 The highest clean speed is that of car and drivers together, below what test drivers do. A slower
 car's tracks are shortened by its speed over the standards' 80 km/h, but for the lanes' widths.
+
+Args:
+    track: One of `TRACKS`.
+    speed: Speed (m/s).
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -114,14 +119,7 @@ def _evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> Tra
 
 
 def run_track(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
-    """Drive at a speed with each driver until a run is clean, and return that or the closest run.
-
-    Args:
-        drive: Function that drives the car through a scenario.
-        car: Car under test, with speed and steering ratio.
-        track: One of `TRACKS`.
-        speed: Speed (m/s).
-    """
+    """Drive with each driver until a run is clean, and return that or the closest run."""
     runs, fields = list[TrackRun](), _make_lane_change(car, track, speed)
     for driver in DRIVERS:
         runs.append(_evaluate_run(drive({**fields, **driver}), car, track, speed))
@@ -134,22 +132,11 @@ _SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope
 
 
-@dataclass(frozen=True)
-class Handling:
-    """ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y, (n,) each, and its slope.
+def _compute_understeer(series: Series, car: TestCar) -> float:
+    """Compute a circle's understeer gradient K (rad s2/m); ValueError where it stays below 0.25 g.
 
-    The slope is minus the understeer gradient K: delta_f = l / R + K a_y. The linear model's is
-    l G of dakf-stability (24).
+    By ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y: delta_f = l / R + K a_y.
     """
-
-    a_y: Array  # m/s2
-    angle: Array  # rad
-    K: float  # understeer gradient, rad s2/m
-    theory: float  # K of the linear model
-
-
-def _compute_handling(series: Series, car: TestCar) -> Handling:
-    """Compute a circle's handling diagram and slope; ValueError where it stays below 0.25 g."""
     settled = series.t >= _SETTLE
     side = np.sign(np.mean(series.gamma[settled]))
     a_y = side * (series.v_x * series.gamma)[settled]  # quasi-steady: v_y' is left out
@@ -158,12 +145,11 @@ def _compute_handling(series: Series, car: TestCar) -> Handling:
     linear = (a_y >= LINEAR_FROM) & (a_y <= LINEAR_TO)
     if a_y.max() < LINEAR_TO or linear.sum() < 2:
         raise ValueError(f"the circle reached {a_y.max():.2f} m/s2, not {LINEAR_TO:.2f}")
-    slope = float(np.polyfit(a_y[linear], angle[linear], 1)[0])
-    return Handling(a_y, angle, -slope, car.understeer_gradient)
+    return -float(np.polyfit(a_y[linear], angle[linear], 1)[0])
 
 
-def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
-    """Measure the handling diagram on a circle where the linear car reaches 0.5 g at full speed.
+def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> float:
+    """Measure K (rad s2/m) on a circle where the linear car reaches 0.5 g at full speed.
 
     Args:
         drive: Function that drives the car through a scenario.
@@ -178,7 +164,7 @@ def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Han
         "speed_change": v - first, "change_start": _SETTLE, "change_length": seconds,
         "duration": _SETTLE + seconds,
     }  # fmt: skip
-    return _compute_handling(drive(circle), car)
+    return _compute_understeer(drive(circle), car)
 
 
 LOWEST, HIGHEST = 0.2, 2.0  # Hz
@@ -204,7 +190,6 @@ class FrequencyResponse:
 
     frequency: Array  # Hz
     H: _Complex  # per rad of steering
-    coherence: Array
     sd: Array  # of the real or the imaginary part of H
 
 
@@ -257,7 +242,7 @@ def _estimate_frequency_response(t: Array, steer: Array, output: Array) -> Frequ
     coherence = (np.abs(S_xy) ** 2 / (S_xx * S_yy))[in_range]
     segments = 2 * len(t) // length - 1  # they overlap by half
     sd = np.abs(H) * np.sqrt((1.0 - coherence) / (2.0 * coherence * segments))
-    return FrequencyResponse(frequency[in_range], H, coherence, sd)
+    return FrequencyResponse(frequency[in_range], H, sd)
 
 
 def _compute_linear_response(
@@ -283,39 +268,35 @@ def _compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict
     return {name: _compute_step_response(series.t, series.steer, y) for name, y in outputs}
 
 
-def _compute_responses(series: Series) -> dict[str, StepResponse]:
-    t, steer = series.t, series.steer
-    return {name: _compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
-
-
-def _run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
-    """Drive a sine from 0.05 to 2.5 Hz, and estimate the responses; steer: amplitude (rad)."""
+def _make_sweep(car: TestCar, steer: float) -> Fields:
+    """Make a sine of the steering angle (rad) from 0.05 to 2.5 Hz."""
     seconds = 100.0  # half a segment has passed when it comes to the standard's lowest frequency
-    series = drive({
+    return {
         "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
         "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,
         "duration": ONSET + seconds + 2.0,
-    })  # fmt: skip
-    t, steered = series.t, series.steer
-    return {x: _estimate_frequency_response(t, steered, getattr(series, x)) for x in OUTPUTS}
+    }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Transient:
-    """The responses of a car by output, measured and of the linear model."""
+class Transient(NamedTuple):
+    """The responses of an output, measured and of the linear model."""
 
-    step: dict[str, StepResponse]
-    linear_step: dict[str, StepResponse]
-    sweep: dict[str, FrequencyResponse]
-    linear_sweep: dict[str, _Complex]
+    step: StepResponse
+    linear_step: StepResponse
+    sweep: FrequencyResponse
+    linear_sweep: _Complex
 
 
-def run_transient(drive: DriveFunction, car: TestCar) -> Transient:
-    """Drive the step and the sweep."""
+def run_transient(drive: DriveFunction, car: TestCar) -> dict[str, Transient]:
+    """Drive the step and the sweep; the responses by output."""
     vehicle, speed = car.vehicle, car.speed
     per = vehicle.wheelbase / speed**2 + car.understeer_gradient  # rad s2/m
     stepped = drive(_make_step(car, per * _STEP_ACCELERATION))
-    sweep = _run_sweep(drive, car, per * _SWEEP_ACCELERATION)
-    linear_step = _compute_linear_step(vehicle, speed, stepped)
-    linear = _compute_linear_response(vehicle, speed, sweep[OUTPUTS[0]].frequency)
-    return Transient(_compute_responses(stepped), linear_step, sweep, linear)
+    swept = drive(_make_sweep(car, per * _SWEEP_ACCELERATION))
+    linear_step, responses = _compute_linear_step(vehicle, speed, stepped), {}
+    for name in OUTPUTS:
+        step = _compute_step_response(stepped.t, stepped.steer, getattr(stepped, name))
+        sweep = _estimate_frequency_response(swept.t, swept.steer, getattr(swept, name))
+        linear = _compute_linear_response(vehicle, speed, sweep.frequency)[name]
+        responses[name] = Transient(step, linear_step[name], sweep, linear)
+    return responses

@@ -4,7 +4,7 @@ The check (FMVSS 126 at 80 km/h, steering prescribed): without control the car f
 most 500 N m, by the yaw rate's error against a neutral car's within friction, it passes at 6.5 A.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -35,18 +35,18 @@ _SCENARIO: dict[str, Any] = {
 }  # fmt: skip
 """A lane change within what the outside car was made for, drawn by the seed."""
 
-Law = Callable[[Motion, float], float]  # N m, from the true motion and the steering angle
 _SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
 
 
 def _compute_limited_moment(motion: Motion, steer: float) -> float:
+    """Compute the law's yaw moment (N m) from the true motion and the steering angle."""
     car = make_outside_vehicle()
     max_yaw_rate = 0.85 * GRAVITY * car.friction / motion.v_x
     goal = min(max(motion.v_x * steer / car.wheelbase, -max_yaw_rate), max_yaw_rate)
     return float(min(max(_GAIN * (goal - motion.gamma), -_LIMIT), _LIMIT))
 
 
-def _make_plant_drive(law: Law | None = None) -> DriveFunction:
+def _make_plant_drive(is_controlled: bool) -> DriveFunction:
     """Make drives of the plant alone, straight ahead at first, its steering prescribed."""
 
     def run_drive(fields: Fields) -> Series:
@@ -54,17 +54,17 @@ def _make_plant_drive(law: Law | None = None) -> DriveFunction:
         profile, speed = _make_steering_profile(scenario), scenario.range("speed")[0]
         hold = scenario.acceleration is None  # a force keeps the speed; 0: the car coasts
         plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        rows = [[0.0, 0.0, *plant.motion[:POSE], 0.0]]  # no steering begins at once
+        rows = [[0.0, 0.0, *plant.motion[:POSE]]]  # no steering begins at once
         for k in range(round(scenario.duration / TICK)):
             t, motion = k * TICK, plant.motion
             steer = float(profiles.compute_steering(t / TICK, profile))
-            moment = 0.0 if law is None else law(motion, steer)
+            moment = _compute_limited_moment(motion, steer) if is_controlled else 0.0
             push = plant.p.m * plant.p.R_w * _SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
             turn = plant.p.R_w / plant.p.T_r * moment
             plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
             if not plant.is_finite:
                 break
-            rows.append([(k + 1) * TICK, steer, *plant.motion[:POSE], moment])
+            rows.append([(k + 1) * TICK, steer, *plant.motion[:POSE]])
         return replace(Series(*np.array(rows).T), failed=not plant.is_finite)
 
     return run_drive
@@ -81,8 +81,7 @@ def _make_steering_profile(scenario: Scenario) -> Array:
 def run_check() -> list[fmvss126.SineDwellResult]:
     """Drive the check without control and with the law, to both sides; A is the former's."""
     car = TestCar(make_outside_vehicle(), 80.0 / 3.6, 16.0, 4.508, 0.8)  # a BMW 320i
-    none = _make_plant_drive()
-    law = _make_plant_drive(_compute_limited_moment)
+    none, law = map(_make_plant_drive, (False, True))
     A = fmvss126.measure_reference_angle(none, car)
     pairs = ((none, _FAILS_AT), (law, _PASSES_AT))
     return [fmvss126.run(drive, car, A, [multiple]) for drive, multiple in pairs]

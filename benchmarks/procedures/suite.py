@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from itertools import product
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -74,25 +75,25 @@ def _make_cases(quick: bool) -> list[ProcedureCase]:
     return cases + [ProcedureCase("outside", *pair, seeds[:OUTSIDE_EPISODES]) for pair in pairs]
 
 
-def _group_results(done: CaseResults) -> dict[str, CaseResults]:
-    names = dict.fromkeys(case.procedure for case in done)
-    return {name: {x: y for x, y in done.items() if x.procedure == name} for name in names}
+def _select_results(done: CaseResults, procedure: str, car: str) -> dict[str, Any]:
+    """Select the results of a procedure with a car by controller."""
+    where = procedure, car
+    return {x.agent: result for x, result in done.items() if (x.procedure, x.car) == where}
 
 
 def _make_verdict(done: CaseResults) -> str:
     """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
     passed, lanes = [], []
     for car in CARS:
-        results = _group_results({case: y for case, y in done.items() if case.car == car})
-        sines = {case.agent: item for case, item in results["fmvss-126"].items()}
+        sines = _select_results(done, "fmvss-126", car)
         passing = [name for name, items in sines.items() if all(x.passed for x in items)]
         medians = {name: np.median([x.highest for x in items]) for name, items in sines.items()}
         weakest = min(medians, key=lambda name: float(medians[name]))
         failing = f"; {weakest} fails above {medians[weakest]:.3g} A in half of the cars"
         failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
-        runs = results[iso.TRACKS[0]]
-        speeds = {c.agent: 3.6 * _find_highest_speed(item) for c, item in runs.items()}
+        runs = _select_results(done, iso.TRACKS[0], car)
+        speeds = {name: 3.6 * _find_highest_speed(items) for name, items in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
         lanes.append(f"{car} {max_speed:.0f} with {fast} (none {speeds['none']:.0f})")
@@ -114,15 +115,6 @@ def _measure(request: Request) -> CaseResults:
     return dict(zip(cases, request.run_cases(_measure_case, cases, NAME), strict=True))
 
 
-class _Table(NamedTuple):
-    """A procedure's table: title and note may name what the first line has."""
-
-    title: str
-    columns: Sequence[object]
-    make_records: Callable[[CaseResults], list[dict[str, object]]]
-    note: str
-
-
 def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
     """Make a line of a table, and the columns of its rows; output: if a case measures several."""
     estimator = ENTRIES[case.agent].get_configuration(case.car)[1]
@@ -132,15 +124,14 @@ def _make_record(case: ProcedureCase, **more: object) -> dict[str, object]:
 
 
 def _add_tables(suite: Suite, done: CaseResults) -> None:
-    results = _group_results(done)
-    for name, table in _TABLES.items():
-        if name in results:
-            records = table.make_records(results[name])
+    for name, (make_records, table) in _TABLES.items():
+        records = make_records({x: y for x, y in done.items() if x.procedure == name})
+        if records:
             suite.add_rows(records)
             title, note = (text.format(**records[0]) for text in (table.title, table.note))
-            suite.tables.append(ResultTable(title, table.columns, records, note, name != "check"))
+            suite.tables.append(replace(table, title=title, cells=records, note=note))
         if name == "fmvss-126":
-            _add_tracks(suite, {track: results[track] for track in iso.TRACKS})
+            _add_tracks(suite, done)
 
 
 def _make_sine_records(done: CaseResults) -> list[dict[str, object]]:
@@ -174,30 +165,32 @@ def _describe_failure(run: fmvss126.SineDwellRun) -> str:
     return f"{run.sideways:.2f} m sideways (at least {fmvss126.SIDEWAYS} m)"
 
 
-def _add_tracks(suite: Suite, done: dict[str, CaseResults]) -> None:
+def _add_tracks(suite: Suite, done: CaseResults) -> None:
     lines: dict[tuple[str, str], dict[str, object]] = {}
-    for track, results in done.items():
-        for case, runs in results.items():
+    for case, runs in done.items():
+        if case.procedure in iso.TRACKS:
             speed = _find_highest_speed(runs)
             suite.add_rows([_make_record(case, speed=speed, n=len(runs))])
             line = lines.setdefault((case.agent, case.car), _make_record(case))
-            line[track] = 3.6 * speed if speed else "none clean"
-    speeds = (Column(track, f"{track} / (km/h)", form=".0f") for track in done)
+            line[case.procedure] = 3.6 * speed if speed else "none clean"
+    speeds = (Column(track, f"{track} / (km/h)", form=".0f") for track in iso.TRACKS)
     note = "The highest speed without a cone; any of five drivers may do it."
     title = "ISO 3888, lane change and obstacle avoidance"
     suite.tables.append(ResultTable(title, (*_KEYS, *speeds), list(lines.values()), note))
 
 
 def _make_circle_records(done: CaseResults) -> list[dict[str, object]]:
-    pairs = done.items()
-    return [_make_record(case, understeer_gradient=x.K, theory=x.theory) for case, x in pairs]
+    return [
+        _make_record(case, understeer_gradient=K, theory=CARS[case.car].understeer_gradient)
+        for case, K in done.items()
+    ]
 
 
 def _make_step_records(done: CaseResults) -> list[dict[str, object]]:
     records = []
-    for case, transient in done.items():
-        for name in iso.OUTPUTS:
-            one, other = vars(transient.step[name]), vars(transient.linear_step[name])
+    for case, responses in done.items():
+        for name, transient in responses.items():
+            one, other = vars(transient.step), vars(transient.linear_step)
             pairs = {f"both {key}": (number, other[key]) for key, number in one.items()}
             numbers = {key: one[key] for key in ("response_time", "overshoot")}
             records.append(_make_record(case, output=name, **numbers, **pairs))
@@ -218,17 +211,18 @@ def _make_outside_records(done: CaseResults) -> list[dict[str, object]]:
 
 
 def _make_check_records(done: CaseResults) -> list[dict[str, object]]:
-    ((none, law),) = done.values()
-    case = ProcedureCase("fmvss-126", f"outside {outside.MODEL}")
-    is_reproduced = law.passed and not any(run.passed for run in none.runs)
-    claim = {"verdict": "reproduced" if is_reproduced else "not reproduced", "paper": _CLAIM}
-    records = []
-    for control, result in (("none", none), ("500 N m", law)):
-        worst = max(result.runs, key=lambda run: run.ratio_1 if run.ratio_1 < np.inf else np.inf)
-        numbers = {"multiple": worst.multiple, "ratio": worst.ratio_1, "later": worst.ratio_2}
-        numbers |= {"n": len(result.runs), "sideways": min(run.sideways for run in result.runs)}
-        text = "passes" if result.passed else "fails"
-        records.append(_make_record(case, **numbers, **claim, text=text) | {"controller": control})
+    case, records = ProcedureCase("fmvss-126", f"outside {outside.MODEL}"), []
+    for none, law in done.values():  # of the only check
+        is_reproduced = law.passed and not any(run.passed for run in none.runs)
+        claim = {"verdict": "reproduced" if is_reproduced else "not reproduced", "paper": _CLAIM}
+        for control, result in (("none", none), ("500 N m", law)):
+            ratios = [run.ratio_1 if run.ratio_1 < np.inf else np.inf for run in result.runs]
+            worst = result.runs[int(np.argmax(ratios))]
+            numbers = {"multiple": worst.multiple, "ratio": worst.ratio_1, "later": worst.ratio_2}
+            numbers["sideways"] = min(run.sideways for run in result.runs)
+            text = "passes" if result.passed else "fails"
+            more = {"n": len(result.runs), "controller": control, "text": text}
+            records.append(_make_record(case, **numbers, **claim) | more)
     return records
 
 
@@ -240,63 +234,60 @@ _CIRCLE = {"understeer_gradient": "measured / (deg/g)", "theory": "linear model 
 _STEP = {"gain": "gain / (1/rad)", "response_time": "90 % after / s",
          "peak_time": "peak after / s", "overshoot": "overshoot"}  # fmt: skip
 _SHARES = {"ratio": "at 1.00 s / %", "later": "at 1.75 s / %"}
-_TABLES = {
-    "fmvss-126": _Table(
+# by procedure: its lines, and its table without them, whose title and note may name what the first
+# line has
+_TABLES: dict[str, tuple[Callable[[CaseResults], list[dict[str, object]]], ResultTable]] = {
+    "fmvss-126": (_make_sine_records, ResultTable(
         "FMVSS 126, sine with dwell",
-        (*_KEYS, Column("A", "A / deg", form=".1f"), _OF, Column("text", "weakest car")),
-        _make_sine_records,
+        (*_KEYS, Column("A", "A / deg", form=".1f"), _OF, Column("text", "weakest car")), [],
         "{n} cars of world v1, both sides; the last amplitude is the larger of 6.5 A and 270 deg, "
         "at most 300 deg. The filter starts with the run.",
-    ),
-    "iso-4138": _Table(
+    )),
+    "iso-4138": (_make_circle_records, ResultTable(
         "ISO 4138, understeer gradient",
-        (*_KEYS, *(Column(key, text, _PER_G, "+.3f") for key, text in _CIRCLE.items())),
-        _make_circle_records,
+        (*_KEYS, *(Column(key, text, _PER_G, "+.3f") for key, text in _CIRCLE.items())), [],
         "At the front wheels, between 0.05 and 0.25 g; negative: the car oversteers.",
-    ),
-    "iso-7401": _Table(
+    )),
+    "iso-7401": (_make_step_records, ResultTable(
         "ISO 7401, step response",
         (*_KEYS, "output",
-            *(Column(f"both {key}", text, form=_PAIR) for key, text in _STEP.items())),
-        _make_step_records,
+            *(Column(f"both {key}", text, form=_PAIR) for key, text in _STEP.items())), [],
         "In brackets the linear model's under the same steering. No control.",
-    ),
-    "outside": _Table(
+    )),
+    "outside": (_make_outside_records, ResultTable(
         "CommonRoad's models of a BMW 320i",
         ("controller", Column("car", "model"), Column("cost", form=".3g"),
             Column("ratio", f"of {RIVAL}'s / %", 100.0, ".0f"),
             Column("share", "failed / %", 100.0, ".0f"),
-            Column("peak", "peak slip / mrad", 1e3, ".0f")),
-        _make_outside_records,
+            Column("peak", "peak slip / mrad", 1e3, ".0f")), [],
         "{n} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are drawn by seed. "
         f"of {RIVAL}'s: geometric mean, paired. peak slip: median.",
-    ),
-    "check": _Table(
+    )),
+    "check": (_make_check_records, ResultTable(
         f"Sine with dwell on the drift model at 80 km/h: {_CLAIM}: {{verdict}}",
         (Column("controller", "control"), Column("multiple", "amplitude / A", form=".3g"),
             *(Column(key, text, 100.0, ".0f") for key, text in _SHARES.items()),
-            Column("sideways", "sideways / m", form=".2f"), Column("text", " ")),
-        _make_check_records,
-        "Worst of both sides.",
-    ),
+            Column("sideways", "sideways / m", form=".2f"), Column("text", " ")), [],
+        "Worst of both sides.", keyed=False,
+    )),
 }  # fmt: skip
 
 
 def _add_figures(suite: Suite, done: CaseResults, draw: ModuleType) -> None:
     """Draw tracks with their cones, and frequency responses beside the linear model's."""
-    for case, result in _group_results(done)["iso-7401"].items():
-        for name, unit in zip(iso.OUTPUTS, ("yaw rate / (1/s)", "a_y / (m/s2/rad)"), strict=True):
-            measured, linear = result.sweep[name], result.linear_sweep[name]
-            lines = {"measured": np.abs(measured.H), "linear model": np.abs(linear)}
-            figure = draw.draw_curves(measured.frequency, lines, "frequency / Hz", unit)
-            title = f"ISO 7401, {case.car}: response to steering, {unit}"
+    for car in CARS:
+        responses = _select_results(done, "iso-7401", car)["none"]
+        for name, unit in (("gamma", "yaw rate / (1/s)"), ("a_y", "a_y / (m/s2/rad)")):
+            sweep, linear = responses[name].sweep, responses[name].linear_sweep
+            lines = {"measured": np.abs(sweep.H), "linear model": np.abs(linear)}
+            figure = draw.draw_curves(sweep.frequency, lines, "frequency / Hz", unit)
+            title = f"ISO 7401, {car}: response to steering, {unit}"
             suite.figures.append((title, figure, "Measured by a swept sine, no control."))
     for track, car in product(iso.TRACKS, CARS):
         runs = dict[str, iso.TrackRun]()
-        for case, result in done.items():
-            if (case.procedure, case.car) == (track, car):
-                clean = (run for run in result if run.passed)
-                runs[case.agent] = max(clean, key=lambda run: run.speed, default=result[0])
+        for agent, result in _select_results(done, track, car).items():
+            clean = (run for run in result if run.passed)
+            runs[agent] = max(clean, key=lambda run: run.speed, default=result[0])
         speeds = ", ".join(f"{agent} {3.6 * run.speed:.0f} km/h" for agent, run in runs.items())
         text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
         suite.figures.append((f"{track}, {car}: way and cones", _draw_cones(runs, draw), text))

@@ -39,7 +39,7 @@ def test_a_car_that_passes_its_own_series_does_not_fail_beside_one_with_a_longer
     (case, *_) = suite._make_cases(quick=True)
     results = [
         fmvss126.SineDwellResult(
-            1.0, tuple(fmvss126.SineDwellRun(k, k, 0.0, 0.0, 9.0) for k in multiples)
+            1.0, tuple(fmvss126.SineDwellRun(k, 0.0, 0.0, 9.0) for k in multiples)
         )
         for multiples in ((1.5, 6.5), (1.5, 6.5, 8.5), (1.5, 7.5))
     ]
@@ -53,7 +53,7 @@ def test_the_interval_of_the_median_amplitude_holds_it() -> None:
     held = []
     for _ in range(400):
         multiples = 0.5 * np.round(10.0 * rng.lognormal(0.0, 0.3, 16))
-        runs = [(fmvss126.SineDwellRun(k, k, 0.0, 0.0, 9.0),) for k in multiples.tolist()]
+        runs = [(fmvss126.SineDwellRun(k, 0.0, 0.0, 9.0),) for k in multiples.tolist()]
         records = suite._make_sine_records({case: [fmvss126.SineDwellResult(1.0, x) for x in runs]})
         amplitude: Any = records[0]["amplitude"]
         held.append(amplitude.low <= 5.0 <= amplitude.high)
