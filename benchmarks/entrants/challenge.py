@@ -2,6 +2,11 @@
 
 The package's own are reused as long as their stored episodes cost the same. `python -m
 sideslip.benchmarks.entrants.challenge` drives them all and writes the file.
+
+Args:
+    agent: Name, file's class or path of `make_agent`, or an object or factory.
+    estimator: The same of `make_estimator`, or a name in `SETUPS`, "" for none.
+    trust: Whether a zip may be read.
 """
 
 import json
@@ -61,13 +66,7 @@ _TAKEN = {*ORACLE_NAMES, *CONTROLLERS[YAW], REFERENCE_CONTROLLER, "none", TRUTH,
 
 
 def make_user_entry(agent: object, estimator: object, trust: bool = False) -> Entry:
-    """Make the entry of a user's agent and estimator.
-
-    Args:
-        agent: Name, file's class or path of `make_agent`, or an object or factory.
-        estimator: The same of `make_estimator`, or a name in `SETUPS`, "" for none.
-        trust: Whether a zip may be read.
-    """
+    """Make the entry of a user's agent and estimator."""
     parts = {"agent": agent, "estimator": estimator}
     objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
     label = _label(agent)  # of a zip alone: what else is trusted would lose its tuned options
@@ -116,11 +115,7 @@ def make_user_entries(
 
 
 def choose_estimator(agent: str) -> str:
-    """Choose the estimator of an agent: a policy's own, "" for what saw an env alone.
-
-    Args:
-        agent: Name, file's class or path.
-    """
+    """Choose the estimator of an agent: a policy's own, "" for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
     if agent.endswith(ZIP):

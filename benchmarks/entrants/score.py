@@ -245,11 +245,7 @@ def score(
 
 
 STUDY = Study(
-    "control",
-    "Your own beside the package's",
+    "control", "Your own beside the package's",
     "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours.",
-    (EPISODES, QUICK_EPISODES),
-    _compare,
-    _add_tables,
-    _compose_verdict,
-)
+    (EPISODES, QUICK_EPISODES), _compare, _add_tables, _compose_verdict,
+)  # fmt: skip

@@ -69,13 +69,9 @@ class _ChildProcess:
         with child_end:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", _START, str(child_end.fileno())],
-                env=variables,
-                stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=self._log,
-                pass_fds=(child_end.fileno(),),
-                start_new_session=True,
-            )
+                env=variables, stdin=subprocess.DEVNULL, stdout=self._log, stderr=self._log,
+                pass_fds=(child_end.fileno(),), start_new_session=True,
+            )  # fmt: skip
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # of a message that stops halfway
             with socket.socket(fileno=os.dup(self._pipe.fileno())) as end:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))

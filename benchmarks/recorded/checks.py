@@ -1,6 +1,6 @@
 """The checks of `sideslip inspect`: whether a log is worth estimating from, channel by channel.
 
-A check is a function of a drive that yields findings; `CHECKS` names them. Limits are twice what
+A check is a function of a drive that yields findings; `CHECKS` has them all. Limits are twice what
 the filter `joint` allows for, or what an ordinary car of world v1 shows.
 """
 
@@ -303,17 +303,8 @@ def _check_excitation(drive: InspectedDrive) -> Iterator[LogFinding]:
         yield _judge("excitation", "yaw_rate", size < MIN_TURNING, text, cure)
 
 
-CHECKS: dict[str, Callable[[InspectedDrive], Iterable[LogFinding]]] = {
-    "missing channels": _check_missing,
-    "stamps": _check_stamps,
-    "gaps": _check_gaps,
-    "held or interpolated": _check_sampling,
-    "stuck": _check_stuck,
-    "swapped, signs, units, jumps, limits": operator.attrgetter("contradictions"),
-    "scales": _check_scale,
-    "biases": _check_bias,
-    "clocks": _check_clocks,
-    "resolution": _check_resolution,
-    "excitation": _check_excitation,
-}
-"""What is asked of a log; another check is another line."""
+CHECKS: Sequence[Callable[[InspectedDrive], Iterable[LogFinding]]] = (
+    _check_missing, _check_stamps, _check_gaps, _check_sampling, _check_stuck,
+    operator.attrgetter("contradictions"),  # swapped columns, signs, units, jumps, limits
+    _check_scale, _check_bias, _check_clocks, _check_resolution, _check_excitation,
+)  # fmt: skip

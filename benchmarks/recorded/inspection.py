@@ -103,7 +103,7 @@ def _read_drive(
     except ValueError as error:
         text = str(error).removeprefix(f"{name_log(source)}: ")
         return drive, [LogFinding("reading", BLOCKER, "", text, "mend the file")], remarks
-    return drive, [finding for check in CHECKS.values() for finding in check(drive)], remarks
+    return drive, [finding for check in CHECKS for finding in check(drive)], remarks
 
 
 def _predict(log: Log, car: Vehicle) -> Prediction:

@@ -1,4 +1,12 @@
-"""Columns of a drive that contradict each other."""
+"""Columns of a drive that contradict each other.
+
+Args:
+    log: Part of a recorded drive.
+    name: Column, as "gyro" or "accel_y".
+    steady: Whether steady turns count alone.
+    tyres: Factor of the understeer gradient, 0 for a neutral car.
+    stated: Calibration of the steering that was applied to the logs.
+"""
 
 import math
 from collections.abc import Sequence
@@ -158,14 +166,7 @@ def _describe_contradiction(
 
 
 def fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
-    """Fit the linear car's steering for its yaw rate over the logged one; None if constant.
-
-    Args:
-        logs: Parts of the log.
-        car: Stated car.
-        steady: Whether steady turns count alone.
-        tyres: Factor of the understeer gradient, 0 for a neutral car.
-    """
+    """Fit the linear car's steering for its yaw rate over the logged one; None if constant."""
     speed, gyro, steer, accel_y = smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
@@ -188,12 +189,7 @@ def estimate_resolution(values: Array) -> float:
 
 
 def find_saturated(log: Log, name: str = "gyro") -> npt.NDArray[np.bool_]:
-    """Mark rows in which a column stays at its limit: long, many steps of its resolution.
-
-    Args:
-        log: Recorded drive.
-        name: Column, "gyro" or "accel_y".
-    """
+    """Mark rows in which a column stays at its limit: long, many steps of its resolution."""
     x = log.record.fast[:, getattr(FAST, name)]
     runs = np.cumsum(np.diff(x, prepend=x[0]) != 0.0)
     length = np.bincount(runs)
@@ -323,13 +319,7 @@ def _describe_course(line: Any, turned: Array) -> list[LogFinding]:
 def find_contradictions(
     logs: Sequence[Log], car: Vehicle, stated: SignalCalibration = AS_LOGGED
 ) -> list[LogFinding]:
-    """Find what does not fit together in a drive: findings that are not OK.
-
-    Args:
-        logs: Parts of the log.
-        car: The car that is assumed.
-        stated: Calibration of the steering that was applied to the logs.
-    """
+    """Find what does not fit together in a drive: findings that are not OK."""
     sentences: list[LogFinding] = []
     if what := find_swapped(logs):
         text, channel = f"columns seem to be swapped, {what}", what.split()[0]

@@ -279,15 +279,12 @@ def _add_table(
         records.append(record | gain)
     suite.add_rows(records, salt="", env_version=f"replay {__version__}")
     columns = (
-        Column("estimator", "noise"),
-        Column("noise", f"at HDOP 1 / {unit}", scale, ".3g"),
-        Column("median", form=".2f", scale=scale),
-        Column(_ROWS[signal.name], "rms", scale, ".2f"),
+        Column("estimator", "noise"), Column("noise", f"at HDOP 1 / {unit}", scale, ".3g"),
+        Column("median", form=".2f", scale=scale), Column(_ROWS[signal.name], "rms", scale, ".2f"),
         Column("high", "95 %", scale, ".2f"),
-        Column("log_likelihood", "log-likelihood", form=".2f"),
-        Column("nis", "NIS", form=".2f"),
+        Column("log_likelihood", "log-likelihood", form=".2f"), Column("nis", "NIS", form=".2f"),
         Column("difference", "against constant", form="+.3f"),
-    )
+    )  # fmt: skip
     note = (
         f"Errors in {unit} of {records[0]['n']} fixes. constant, half, table: how the noise "
         "follows HDOP. NIS is 1 for a filter that knows its errors; intervals by blocks of fixes."

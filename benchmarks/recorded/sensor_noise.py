@@ -1,4 +1,12 @@
-"""Noise and latency of the sensors in a recorded drive; intervals are jackknives over blocks."""
+"""Noise and latency of the sensors in a recorded drive; intervals are jackknives over blocks.
+
+Args:
+    value: Place in a fix's values, `COURSE` or `SPEED`.
+    slips: Sideslip angle (rad) of each log, shape (rows,), by which the course differs from the
+        heading; None: none.
+    times: Latencies (s), shape (times,).
+    share: Share of the slip in the values, None: the one that leaves least.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -48,14 +56,7 @@ class FixDifferences(NamedTuple):
     def from_logs(
         cls, logs: Sequence[Log], value: int, slips: Sequence[Array] | None, times: Array
     ) -> "FixDifferences":
-        """Collect the differences in blocks of each log.
-
-        Args:
-            logs: Recorded drives; those without a GPS have no fixes.
-            value: Place in a fix's values, `COURSE` or `SPEED`.
-            slips: Sideslip angle (rad), shape (rows,), which the value has a share of; None: none.
-            times: Latencies (s), shape (times,).
-        """
+        """Collect the differences in blocks of each log; those without a GPS have no fixes."""
         blocks = []
         for i, log in enumerate(logs):
             packets = log.record.select_packets("gps")
@@ -81,11 +82,7 @@ class FixDifferences(NamedTuple):
         return cls(times, blocks)
 
     def find_latency(self, share: float | None = None) -> tuple[float, float]:
-        """Find the latency that leaves least, and half of its 95 % interval (s).
-
-        Args:
-            share: Share of the slip in the values, None: the one that leaves least.
-        """
+        """Find the latency that leaves least, and half of its 95 % interval (s)."""
 
         def find_minimum(sums: Array) -> float:  # between the samples by a parabola
             lefts = _compute_remainder(sums, share)
@@ -137,12 +134,7 @@ def _estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
 def make_sensor_findings(
     logs: Sequence[Log], slips: Sequence[Array]
 ) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
-    """Make findings of the sensors, noise by the estimators' options, and latency by sensor (s).
-
-    Args:
-        logs: Parts of the log.
-        slips: Sideslip angle (rad) of each, shape (rows,), by which the course is predicted.
-    """
+    """Make findings of the sensors, noise by the estimators' options, and latency by sensor (s)."""
     findings: list[Finding] = []
     noise: dict[str, float] = {}
     for channel, unit in _FAST.items():

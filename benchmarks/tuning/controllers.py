@@ -207,16 +207,10 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
     if rows[0] not in complete and start is not None:  # it lost to others on a few seeds
         start = round(_compute_objective(task, task.seeds, task.start), 5)
     return {
-        "contestant": task.name,
-        "class": task.kind,
-        "world_version": WORLD_VERSION,
-        "contests": [item.name for item in task.tasks],
-        "seeds": list(task.seeds),
-        "start": start,
-        "best": best,
-        "options": task._make_options(best["numbers"]),
-        "trials": rows,
-    }
+        "contestant": task.name, "class": task.kind, "world_version": WORLD_VERSION,
+        "contests": [item.name for item in task.tasks], "seeds": list(task.seeds), "start": start,
+        "best": best, "options": task._make_options(best["numbers"]), "trials": rows,
+    }  # fmt: skip
 
 
 def write_log(path: Path, log: dict[str, Any]) -> None:
