@@ -154,7 +154,7 @@ def _make_rich_table(title: str, columns: list[TextColumn], width: int) -> RichT
         longest = max(map(len, [column.heading, *column.texts]))
         limit = _NAME if i == 0 and width >= _NARROW else _MIN_WIDTH
         shown.add_column(
-            column.heading,
+            escape(column.heading),
             justify="right" if right else "left",
             no_wrap=right,
             min_width=longest if right else min(longest, limit),

@@ -97,20 +97,19 @@ def _make_lane_keeping() -> Workload:
         return _make_episode(gym.make("lane-keeping-v0"))
 
 
-_make_vec = gym.make_vec
 _WORKLOADS: dict[str, Callable[[], Workload]] = {
     FUSION: lambda: _make_episode(gym.make(_FUSION_ID)),
-    AT_ONCE: lambda: _make_batch(_make_vec(_FUSION_ID, COUNT)),
+    AT_ONCE: lambda: _make_batch(gym.make_vec(_FUSION_ID, COUNT)),
     FUSION_V1: lambda: _make_episode(gym.make(f"sideslip/{FUSION_V1}")),
-    V1_AT_ONCE: lambda: _make_batch(_make_vec(f"sideslip/{FUSION_V1}", COUNT)),
-    FILTERED: lambda: _make_batch(EstimateObservations(_make_vec(_FUSION_ID, COUNT), **_FILTER)),
-    LATE: lambda: _make_batch(_make_vec(_VISION_ID, COUNT), _FRAMES),
-    NONE_LATE: lambda: _make_batch(_make_vec(_VISION_ID, COUNT, **_PROMPT), _FRAMES),
+    V1_AT_ONCE: lambda: _make_batch(gym.make_vec(f"sideslip/{FUSION_V1}", COUNT)),
+    FILTERED: lambda: _make_batch(EstimateObservations(gym.make_vec(_FUSION_ID, COUNT), **_FILTER)),
+    LATE: lambda: _make_batch(gym.make_vec(_VISION_ID, COUNT), _FRAMES),
+    NONE_LATE: lambda: _make_batch(gym.make_vec(_VISION_ID, COUNT, **_PROMPT), _FRAMES),
     CARTPOLE: lambda: _make_episode(gym.make(CARTPOLE), _choose_upright_action),
     LANE: _make_lane_keeping,
     CARTPOLES: _make_cartpoles,
     # Pendulum has no batch of arrays
-    PENDULUMS: lambda: _make_batch(_make_vec("Pendulum-v1", COUNT, "sync"), 1),
+    PENDULUMS: lambda: _make_batch(gym.make_vec("Pendulum-v1", COUNT, "sync"), 1),
 }
 
 
