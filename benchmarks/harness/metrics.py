@@ -13,7 +13,7 @@ from ...envs.engine.layout import P, Z
 from ...envs.engine.step import make_step_variant
 from ...envs.engine.tick import apply_tyre_change
 from ...envs.numerics.functions import sincos
-from ...envs.numerics.jit import jit
+from ...envs.numerics.jit import jit_nrt
 from ...envs.numerics.packed import read
 from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import Array
@@ -136,7 +136,8 @@ METRICS = {metric.name: metric.unit for metric in EPISODE} | {
 }  # unit of every metric that a row may have
 
 
-def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
+@jit_nrt
+def compute_dissipation(params: Matrix, states: Matrix, switches: Matrix) -> Vector:
     """Compute the power (W), shape (N,), of both axles' lateral sliding: -F_y times sliding speed.
 
     Args:
@@ -145,12 +146,6 @@ def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
         switches: Packed switches of the engine, likewise.
     """
     out = np.empty(len(params))
-    _write(params, states, switches, out)
-    return out
-
-
-@jit
-def _write(params: Matrix, states: Matrix, switches: Matrix, out: Vector) -> None:
     for i in range(len(params)):
         p, z = params[i], states[i]
         motion, drive, change = read(z, Z.motion), read(z, Z.drive), read(p, P.tyre_change)
@@ -162,3 +157,4 @@ def _write(params: Matrix, states: Matrix, switches: Matrix, out: Vector) -> Non
         sin_d, cos_d = sincos(drive.delta_f)
         front = (motion.v_y + car.l_f * motion.gamma) * cos_d - motion.v_x * sin_d
         out[i] = -F_yf * front - F_yr * (motion.v_y - car.l_r * motion.gamma)
+    return out
