@@ -153,18 +153,18 @@ def _drive_car(condition: Condition, seed: int, has_errors: bool = True) -> tupl
     scenario = _DRIVE | {"duration": condition.duration, "speed": speed} | dict(condition.scenario)
     scenario["trace"] = tuple(draw_steering(rng, amplitude, condition.duration))
     scenario["gyro_bias"] = (-0.005, 0.005) if has_errors else 0.0
+    world = {"base": "ideal" if condition.env_id.endswith("0") else "v1"}
+    world |= {} if has_errors else {name: getattr(IDEAL, name) for name in CONSTANT_ERRORS}
     options: dict[str, Any] = {"vehicle": "passenger-car", "control_period": 10}
-    env: Any = gym.make(condition.env_id, scenario=scenario, **options)
-    if not has_errors:
-        absent = {name: getattr(IDEAL, name) for name in CONSTANT_ERRORS}
-        options["world"] = replace(env.unwrapped.config.world, **absent)
-        env = gym.make(condition.env_id, scenario=scenario, **options)
+    env: Any = gym.make(condition.env_id, scenario=scenario, world=world, **options)
     return record_drive(env, seed), env.unwrapped
 
 
-_KNOWN: dict[str, float] = dict.fromkeys(
-    ("accel_bias_sd", "accel_scale_sd", "steer_offset_sd", "camera_yaw_sd", "map_heading_sd"), 0.0
-) | {"bias_sd": 0.0, "map_lag_sd": 0.0, "front_tyres_sd": 0.1, "rear_tyres_sd": 0.1}
+_KNOWN: dict[str, float] = {
+    "accel_bias_sd": 0.0, "accel_scale_sd": 0.0, "bias_sd": 0.0, "steer_offset_sd": 0.0,
+    "camera_yaw_sd": 0.0, "map_heading_sd": 0.0, "map_lag_sd": 0.0, "front_tyres_sd": 0.1,
+    "rear_tyres_sd": 0.1, "inverse_friction_sd": 0.1,
+}  # fmt: skip
 """Levels of who knows sensors and car; tyres to a tenth, since the law has no lag (as oracles)."""
 _NOISE = {"": ("gyro_noise", "accel_y_noise"), "camera": ("psi_noise", "y_l_noise")}
 
@@ -173,8 +173,7 @@ def _run_informed_filter(condition: Condition, seed: int) -> Estimates:
     """Run the filter that is told what the seed draws, on a record without errors of sensors."""
     log, base = _drive_car(condition, seed, has_errors=False)
     base.reset(seed=seed)  # to the tyres of the start
-    record, scenario, truth = log.record, base.scenario, base.car_truth
-    options = _KNOWN | {"inverse_friction_sd": 0.1}
+    record, scenario, truth, options = log.record, base.scenario, base.car_truth, dict(_KNOWN)
     if base.config.world.is_ideal:  # its errors are noise and disturbances alone
         options |= {name: NOISE[name] for key in ("", *log.slow) for name in _NOISE.get(key, ())}
         if "gps" in log.slow:

@@ -128,7 +128,7 @@ def evaluate_policy(
     """
     loaded = load_policy(policy)
     card, home = loaded.card, env_id or loaded.card.env_id
-    options = dict(card.env_options) if env_id in (None, card.env_id) else {}
+    options = dict(card.env_options) if home == card.env_id else {}
     options |= {} if scenario is None else {"scenario": scenario}
     base: Any = gym.make(home, **options).unwrapped
     salt, seeds = loaded.salt, make_salted_seeds(loaded.salt, episodes)
@@ -156,17 +156,16 @@ def record_evaluation(path: Path, episodes: int = 256, kind: str = "") -> JsonMa
         episodes: Episodes of each entry, in the policy's own env and in each task.
         kind: Class of tasks that it drives too, beside their baselines; "" for none.
     """
-    evaluation = evaluate_policy(str(path), episodes)
+    evaluation, names = evaluate_policy(str(path), episodes), ("mean", "low", "high")
     policy, costs = evaluation.policy, dict[str, JsonMap]()
     for name, drive in evaluation.drives.items():
-        numbers = (round(number, 6) for number in interval(drive.costs))
-        costs[name] = dict(zip(("mean", "low", "high"), numbers, strict=True))
+        costs[name] = dict(zip(names, _list_rounded(interval(drive.costs), 6), strict=True))
     record: JsonMap = {"salt": evaluation.salt, "episodes": len(evaluation.seeds), "cost": costs}
     if kind:
         tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
         of_nominal = run_cases(evaluate, tasks, "tasks", jobs=1)
-        names = (task.scenario for task in tasks)
-        record["cost in % of nominal"] = dict(zip(names, of_nominal, strict=True))
+        scenarios = (task.scenario for task in tasks)
+        record["cost in % of nominal"] = dict(zip(scenarios, of_nominal, strict=True))
     save_policy(path, policy.network, replace(policy.card, evaluation=record))
     return record
 
@@ -313,12 +312,12 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     nominal, policy_costs, shown = results[NOMINAL].costs, results["policy"].costs, JsonMap()
     for name in ("policy", _RIVAL, PARAMETERS):
         ratio = geometric_mean(-compute_log_ratios(nominal, results[name]))
-        shown[name] = _list_rounded(ratio, 100.0)
+        shown[name] = _list_rounded(ratio.rescale(100.0))
     for name in (NOMINAL, _RIVAL):
         rate = compute_win_rate(policy_costs, results[name].costs)
-        shown[f"better than {name}"] = _list_rounded(rate, 1.0)
+        shown[f"better than {name}"] = _list_rounded(rate)
     return shown | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
 
 
-def _list_rounded(numbers: Estimate, unit: float) -> Sequence[float]:
-    return [round(unit * number, 3) for number in numbers]
+def _list_rounded(numbers: Estimate, digits: int = 3) -> Sequence[float]:
+    return [round(number, digits) for number in numbers]
