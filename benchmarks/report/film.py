@@ -37,8 +37,7 @@ class FilmDriver(NamedTuple):
 def check_film(path: Path | None) -> None:
     """Check a film's ending (ValueError), folder (OSError) and modules (ModuleNotFoundError) first.
 
-    Args:
-        path: File, None for none; it needs the extra `render`.
+    It needs the extra `render`.
     """
     if path is None:
         return

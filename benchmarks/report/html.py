@@ -102,12 +102,7 @@ def check_page(path: Path | None, names: Sequence[str]) -> None:
 
 
 def write_page(path: Path, suites: Sequence[Suite]) -> None:
-    """Write a page with new tables of its marked suites, but for details.
-
-    Args:
-        path: File of the page.
-        suites: Results.
-    """
+    """Write a page with new tables of its marked suites, but for details."""
     text = path.read_text(encoding="utf-8")
     for suite in suites:
         made = "\n".join(_format_page_table(table) for table in suite.tables if not table.detail)

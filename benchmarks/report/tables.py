@@ -35,11 +35,7 @@ class TextColumn(NamedTuple):
 
 
 def format_columns(table: ResultTable) -> list[TextColumn]:
-    """Format the columns of a table.
-
-    Args:
-        table: Table.
-    """
+    """Format the columns of a table."""
     columns = []
     for i, source in enumerate(table.columns):
         column = source if isinstance(source, Column) else Column(str(source))
@@ -113,12 +109,7 @@ def _print_head(console: Console, suite: Suite, lines: Sequence[str]) -> None:
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """Print title, verdict, text, and each table with its note, without tables of details.
-
-    Args:
-        console: Console to print to.
-        suite: Results.
-    """
+    """Print title, verdict, text, and each table with its note, without tables of details."""
     _print_head(console, suite, suite.headlines)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     shown = [table for table in suite.tables if not table.detail]
