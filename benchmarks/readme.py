@@ -284,25 +284,18 @@ SYSTEMS = (
         Entry("two-dof", "multirate-residual-kf", {"filter": {}, "controller": {}}),  # untuned
         _RECOMMENDED_ENTRY,
         _make_ground("YawVision", tie_vision.FIG8, "zero-slip", control_period=1),
-        "rms_slip",
-        "sideslip angle",
-        common_entry=Entry("two-dof", REFERENCE_FILTER),
+        "rms_slip", "sideslip angle", common_entry=Entry("two-dof", REFERENCE_FILTER),
     ),
     _System(*_FOLLOWING, "rms_slip_error", _SLIP),
     _System(*_FOLLOWING, "rms_yaw_error", "error of the yaw rate"),
     *(
         _System(
-            module.PAPER,
-            Entry(REFERENCE_CONTROLLER, name),
-            Entry(REFERENCE_CONTROLLER, JOINT),
-            _make_ground(sensors, scenario),
-            *criterion,
-            module.SIMULATIONS,
-            label,
+            module.PAPER, Entry(REFERENCE_CONTROLLER, name), Entry(REFERENCE_CONTROLLER, JOINT),
+            _make_ground(sensors, scenario), *criterion, module.SIMULATIONS, label,
         )
         for module, name, sensors, scenario, label, criterion in _FILTERS
     ),
-)
+)  # fmt: skip
 
 
 def _measure_systems(

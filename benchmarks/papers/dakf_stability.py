@@ -1,8 +1,5 @@
 """dakf-stability: slip from a GPS course and a gyro by disturbance accommodation, and control."""
 
-from collections.abc import Iterator
-from functools import partial
-
 from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
 from .ledger import Analysis, Claim, ClaimPart, compare
@@ -14,7 +11,7 @@ FIG7, LARGER, FIG9 = "dakf-fig7", "dakf-fig7-larger", "dakf-fig9"
 BIAS, RANKS = "dakf-bias", "dakf-rank"
 DAKF, KF, LOB = "dakf", "course-kf", "lob"
 WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no rejection"
-_ERRORS = ("rms_slip_error", "rms_yaw_error")
+_TEXTS, _ERRORS = ("sideslip", "yaw rate"), ("rms_slip_error", "rms_yaw_error")
 _GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 _ENV = "sideslip/YawGps-v0"
@@ -45,54 +42,50 @@ SIMULATIONS = (
 # fmt: on
 
 
-def _make_tracking_parts(scenario: str, *thresholds: float | None) -> Iterator[ClaimPart]:
-    for text, metric, max_ratio in zip(("sideslip", "yaw rate"), _ERRORS, thresholds, strict=True):
-        label = f"{text} error, with / without"
-        yield compare(label, scenario, WITH, WITHOUT, max_ratio, metric)
+def _make_tracking_parts(scenario: str, *thresholds: float | None) -> list[ClaimPart]:
+    return [
+        compare(f"{text} error, with / without", scenario, WITH, WITHOUT, max_ratio, metric)
+        for text, metric, max_ratio in zip(_TEXTS, _ERRORS, thresholds, strict=True)
+    ]
 
 
-claim = partial(Claim, PAPER)
 # fmt: off
 CLAIMS = (
-    claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
-        compare("DAKF / KF", FIG6, DAKF, KF, 0.75),
+    Claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
+        [compare("DAKF / KF", FIG6, DAKF, KF, 0.75),
         compare("KF / LOB", FIG6, KF, LOB, 0.80),
         compare("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
-        compare("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
-    claim("Fig. 6", "the DAKF is better during the outage too",
-        *(
-            compare(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, quantity="outage")
+        compare("KF / LOB at 0.4 Hz", FASTER, KF, LOB)]),
+    Claim("Fig. 6", "the DAKF is better during the outage too",
+        [compare(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, quantity="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
-            for rival, filter_ in (("KF", KF), ("LOB", LOB))
-        )),
-    claim("Sec. IV.D", "slip and disturbances are observable",
-        ClaimPart("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
+            for rival, filter_ in (("KF", KF), ("LOB", LOB))]),
+    Claim("Sec. IV.D", "slip and disturbances are observable",
+        [ClaimPart("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
             Bound("=", 4.0), "rank"),
         ClaimPart("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
             "last", None, Bound(">=", 0.05), "drift"),
-        ClaimPart("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift"),
+        ClaimPart("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift")],
         note="A constant slip is the same to the sensors as a heading the other way with constant "
         "d1 and d2."),
-    claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
-        *_make_tracking_parts(FIG7, 0.80, 0.50),
+    Claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
+        [*_make_tracking_parts(FIG7, 0.80, 0.50),
         compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_slip"),
         ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "full_command",
             metric="share"),
-        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "full_command", metric="share")),
-    claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
-        *(
-            compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
+        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "full_command", metric="share")]),
+    Claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
+        [compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
                 quantity=metric)
-            for text, metric in zip(("sideslip", "yaw rate"), _ERRORS, strict=True)
-        ),
+            for text, metric in zip(_TEXTS, _ERRORS, strict=True)],
         note="The feedback's integrals already take away what is constant."),
-    claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
-        compare("DAKF / KF", FIG8, DAKF, KF),
+    Claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
+        [compare("DAKF / KF", FIG8, DAKF, KF),
         compare("KF / LOB", FIG8, KF, LOB),
         compare("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, quantity="outage"),
-        compare("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, quantity="outage"),
+        compare("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, quantity="outage")],
         note="At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its "
         "sign, there is little slip to see, and no course while it is there."),
-    claim("Fig. 9 (twin)", "with control the car tracks on the road too",
-        *_make_tracking_parts(FIG9, None, None)),
+    Claim("Fig. 9 (twin)", "with control the car tracks on the road too",
+        _make_tracking_parts(FIG9, None, None)),
 )

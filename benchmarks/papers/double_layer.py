@@ -1,7 +1,5 @@
 """double-layer-gps: slip, roll and velocities from a single-antenna GPS in two layers."""
 
-from functools import partial
-
 from ...estimators.filters import FILTERS
 from ..harness.stats import Bound
 from .ledger import Claim, ClaimPart, compare
@@ -41,74 +39,61 @@ _SKIES = (
 SIMULATIONS = (
     *(EstimationSimulation(name, _ENV, name, _FILTERS) for name in (FIG9, FASTER, PERIODS, ROAD)),
     EstimationSimulation(CALM, _ENV, CALM, (_FILTERS[0], PaperFilter(ROLL, ROLL))),
-    *(
-        EstimationSimulation(name, _ENV,
+    *(EstimationSimulation(name, _ENV,
             {"base": FIG9, "name": name, "hdop": hdop, "hdop_spread": spread, "hdop_law": law},
             (*_FILTERS[:2],
                 PaperFilter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
                 PaperFilter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
-        for name, (hdop, spread), law, _ in _SKIES
-    ),
+        for name, (hdop, spread), law, _ in _SKIES),
 )
 # fmt: on
 
-claim = partial(Claim, PAPER)
 # fmt: off
 CLAIMS = (
-    claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
-        *(
-            compare(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
+    Claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
+        [*(compare(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
             for scenario, text in _SLALOMS
             for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
-                ("double layer", PROPOSED, 0.95))
-        ),
-        *(compare(f"three-state / two-state, {text}", name, THREE, LOB) for name, text in _SLALOMS),
+                ("double layer", PROPOSED, 0.95))),
+        *(compare(f"three-state / two-state, {x}", name, THREE, LOB) for name, x in _SLALOMS)],
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
-    claim("Fig. 9 (b)", "the smallest error between courses",
-        *(
-            compare(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
-            for name, text in _SLALOMS
-        ),
-        *(
-            compare(f"jump at a course, double layer / three-state, {text}", name,
+    Claim("Fig. 9 (b)", "the smallest error between courses",
+        [*(compare(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
+            for name, text in _SLALOMS),
+        *(compare(f"jump at a course, double layer / three-state, {text}", name,
                 PROPOSED, THREE, quantity="jump")
-            for name, text in _SLALOMS
-        ),
+            for name, text in _SLALOMS)],
         note="The error over all milliseconds is that between courses: there are 200 to a course."),
-    claim("Fig. 9 (c)", "the yaw angle at 1 kHz from courses at 5 Hz",
-        compare("double layer / three-state", FIG9, PROPOSED, THREE, quantity="psi")),
-    claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
-        compare("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
-        compare("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, quantity="phi"),
+    Claim("Fig. 9 (c)", "the yaw angle at 1 kHz from courses at 5 Hz",
+        [compare("double layer / three-state", FIG9, PROPOSED, THREE, quantity="psi")]),
+    Claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
+        [compare("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
+        compare("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, quantity="phi")],
         note="30 % on inertia, damping and stiffness cancel except in the input gain."),
-    claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
-        compare("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
+    Claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
+        [compare("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
         compare("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, quantity="v_x"),
-        *(
-            compare(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, quantity=state)
-            for state in ("v_y", "v_x")
-        ),
+        *(compare(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, quantity=state)
+            for state in ("v_y", "v_x"))],
         note="The kinematic KF with the process noise of its accelerometers, and with one tuned "
         "to the drive, which takes roll for noise. v_x: it has the wheels at 1 kHz, the double "
         "layer the GPS's speed at 5 Hz."),
-    claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
-        *(
-            compare(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
+    Claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
+        [compare(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
             for label, filter_, limited in (("disturbance KF", WALKS, True),
                 ("double layer", PROPOSED, False))
             for name, _, _, max_ratio in _SKIES
-            for threshold in (max_ratio if limited else None,)
-        ),
+            for threshold in (max_ratio if limited else None,)],
         note="Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the "
         "noise follows it; where the noise does not, it is a wrong R. The double layer, which "
         "corrects between courses, gains nothing. On three real receivers the spread hardly "
         "follows HDOP (docs/howto/receivers.md)."),
-    claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
-        ClaimPart("slip, double layer / best rival", ROAD, PROPOSED, stated=Bound("<", 1.0),
+    Claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
+        [ClaimPart("slip, double layer / best rival", ROAD, PROPOSED, stated=Bound("<", 1.0),
             rivals=(THREE, LOB)),
         compare("slip, three-state / two-state", ROAD, THREE, LOB),
         compare("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, quantity="phi"),
         compare("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_y"),
-        compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")),
+        compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")]),
 )

@@ -95,35 +95,28 @@ class MeasuredPart:
         return None if threshold is None else bool(threshold.is_met(self.number.value))
 
 
+@dataclass(frozen=True)
 class Claim:
-    """A claim of a paper.
+    """A claim of a paper."""
 
-    Args:
-        paper: Short name of the paper.
-        source: Equation, figure or section.
-        text: What is claimed.
-        *parts: Numbers that show it.
-        note: What was found, for the report.
-    """
-
-    def __init__(
-        self, paper: str, source: str, text: str, *parts: ClaimPart, note: str = ""
-    ) -> None:
-        self.paper, self.source, self.text = paper, source, text
-        self.parts, self.note = parts, note
+    source: str  # equation, figure or section
+    text: str
+    parts: Sequence[ClaimPart]  # numbers that show it
+    note: str = ""  # what was found, for the report
 
 
 @dataclass(frozen=True)
 class MeasuredClaim:
     """A claim with the numbers of its parts."""
 
+    paper: str  # short name
     claim: Claim
     parts: Sequence[MeasuredPart]
 
     @property
     def source(self) -> str:
         """The paper, and the equation, figure or section."""
-        return f"{self.claim.paper} {self.claim.source}"
+        return f"{self.paper} {self.claim.source}"
 
     @property
     def verdict(self) -> str:
@@ -144,18 +137,12 @@ class MeasuredClaim:
 Numbers = dict[tuple[str, str], float | Array]  # of one seed, by subject and quantity
 
 
-class Example(NamedTuple):
-    """Signals of the first seed, for figures."""
-
-    time: Array  # s, (K,)
-    curves: dict[str, dict[str, Array]]  # (K,) by subject (truth, reference, ...) and signal
-
-
 class SeedResult(NamedTuple):
-    """What a seed gives."""
+    """What a seed of a simulation gives; signals are for figures."""
 
     numbers: Numbers
-    example: Example | None = None
+    time: Array | None = None  # s, (K,)
+    curves: Mapping[str, Mapping[str, Array]] = {}  # (K,) by subject (truth, ...) and signal
 
 
 def join_numbers(results: Sequence[SeedResult]) -> dict[tuple[str, str], Array]:

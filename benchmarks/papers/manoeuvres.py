@@ -21,7 +21,7 @@ from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ...estimators.wrappers.estimate import make_spec
 from ..harness.drives import SETTLED, call_quietly, make_env, make_filter_arguments
-from .ledger import Example, Numbers, SeedResult, Simulation
+from .ledger import Numbers, SeedResult, Simulation
 
 if TYPE_CHECKING:
     from ...envs.stability import StabilityEnv
@@ -50,14 +50,12 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
         filters: Filters of a simulation.
         base: Env without wrappers, in an episode.
     """
-    facts, present = make_filter_arguments(base), make_spec(base)
-    cars = {"nominal": present.vehicle, "true": present.replace_vehicle(base.vehicle).vehicle}
-    by_label = {}
-    for spec in filters:
-        options = {**PAPER_TUNINGS.get(spec.name, {}), **spec.options}
-        facts["vehicle"] = cars[spec.vehicle]
-        by_label[spec.label] = call_quietly(make_estimator, spec.name, **facts | options)
-    return by_label
+    nominal, made = make_spec(base), dict[str, Estimator]()
+    specs = {"nominal": nominal, "true": nominal.replace_vehicle(base.vehicle)}
+    for x in filters:
+        facts = specs[x.vehicle]._asdict() | PAPER_TUNINGS.get(x.name, {}) | dict(x.options)
+        made[x.label] = call_quietly(make_estimator, x.name, dt=base.dt, **facts)
+    return made
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class EstimationSimulation(Simulation):
                 std = compute_error_bound(record=log.record, **facts)
                 numbers[BOUND, "beta"] = _rms(std[settled])
                 numbers[BOUND, "square"] = float(np.mean(std[settled] ** 2))
-            yield SeedResult(numbers, Example(log.time, curves))
+            yield SeedResult(numbers, log.time, curves)
 
 
 def _rms(values: npt.ArrayLike) -> float:
@@ -171,7 +169,7 @@ class ControlSimulation(Simulation):
                 numbers |= {(label, name): value for name, value in values.items()}
                 curves[label] = {name: episode[name] for name in ("beta", "gamma", "yaw_moment")}
             curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
-            yield SeedResult(numbers, Example(episode["t"], curves))
+            yield SeedResult(numbers, episode["t"], curves)
 
     def drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         """Drive an episode, and measure its numbers by quantity.

@@ -10,20 +10,18 @@ from . import dakf_stability, double_layer, dual_rate, tie_vision, tie_vision_th
 from .ledger import (
     CHUNK,
     Claim,
-    Example,
     MeasuredClaim,
     MeasuredPart,
+    SeedResult,
     Simulation,
     join_numbers,
     run_simulation,
 )
 
-_MODULES = (
-    tie_vision, tie_vision_theory, uneven_delay, double_layer, dual_rate, dakf_stability,
-)  # fmt: skip
+_MODULES = (tie_vision, tie_vision_theory, uneven_delay, double_layer, dual_rate, dakf_stability)
 
 SIMULATIONS: dict[str, Simulation] = {x.name: x for y in _MODULES for x in y.SIMULATIONS}
-CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
+CLAIMS: list[tuple[str, Claim]] = [(y.PAPER, x) for y in _MODULES for x in y.CLAIMS]
 
 NAME = "papers"
 
@@ -39,26 +37,29 @@ _TEXT = (
 )
 
 
-Results = tuple[list[MeasuredClaim], dict[str, Example]]  # signals by the simulation's name
+Results = tuple[list[MeasuredClaim], dict[str, SeedResult]]  # the first seeds' by simulation
 
 
 def _measure(request: Request) -> Results:
     seeds = request.episodes or 0
     counts = [max(1, round(x.share * seeds)) for x in SIMULATIONS.values()]
-    outcomes = request.run_seeds(run_simulation, list(SIMULATIONS.values()), counts, CHUNK, NAME)
-    by_name = dict(zip(SIMULATIONS, outcomes, strict=True))
-    results = {name: join_numbers(items) for name, items in by_name.items()}
-    ledger = [MeasuredClaim(x, [part.measure(results) for part in x.parts]) for x in CLAIMS]
-    return ledger, {name: x.example for name, (x, *_) in by_name.items() if x.example is not None}
+    runs = request.run_seeds(run_simulation, list(SIMULATIONS.values()), counts, CHUNK, NAME)
+    by_name = dict(zip(SIMULATIONS, runs, strict=True))
+    results = {name: join_numbers(run) for name, run in by_name.items()}
+    ledger = [
+        MeasuredClaim(paper, claim, [part.measure(results) for part in claim.parts])
+        for paper, claim in CLAIMS
+    ]
+    return ledger, {name: run[0] for name, run in by_name.items()}
 
 
 def _compose_verdict(results: Results) -> str:
     ledger, _ = results
     counted = Counter(entry.verdict for entry in ledger)
-    papers = dict.fromkeys(entry.claim.paper for entry in ledger)
+    papers = dict.fromkeys(entry.paper for entry in ledger)
     held = []
     for paper in papers:
-        items = [entry.verdict for entry in ledger if entry.claim.paper == paper]
+        items = [entry.verdict for entry in ledger if entry.paper == paper]
         if stated := [item for item in items if item != VERDICTS[-1]]:
             held.append(f"{paper} {stated.count(VERDICTS[1])} of {len(stated)}")
     failed = [entry.source for entry in ledger if entry.verdict == "not reproduced"]
@@ -94,7 +95,7 @@ def _add_tables(suite: Suite, results: Results) -> None:
         verdicts.append([entry.source, claim.text, entry.verdict, checks])
         remarks += [[entry.source, claim.note]] if claim.note else []
         lines = [_make_line(claim.source, item) for item in entry.parts]
-        numbers.setdefault(claim.paper, []).extend(lines)
+        numbers.setdefault(entry.paper, []).extend(lines)
     title = "The claims and what became of them"
     header = ("paper", "claim", "verdict", "thresholds")
     suite.tables.append(ResultTable(title, header, verdicts, keyed=False))
@@ -121,10 +122,10 @@ _SIGNALS = {"beta": "sideslip angle / rad", "yaw_moment": "yaw moment / (N m)"}
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
     """Draw the signals of the first seed of each simulation."""
-    for (name, example), (signal, label) in product(results[1].items(), _SIGNALS.items()):
-        curves = example.curves.items()
+    for (name, first), (signal, label) in product(results[1].items(), _SIGNALS.items()):
+        curves = first.curves.items()
         if series := {subject: x[signal] for subject, x in curves if signal in x}:
-            figure = draw.draw_time_series(example.time, series, label)
+            figure = draw.draw_time_series(first.time, series, label)
             suite.figures.append((f"{name}: {label.partition(' /')[0]}", figure, ""))
 
 

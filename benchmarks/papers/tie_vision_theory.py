@@ -148,29 +148,24 @@ _FUNCTIONS = {TUNINGS: _measure_tunings, MAPS: _measure_maps, APPENDIX: _compute
 SIMULATIONS = tuple(Analysis(name, function) for name, function in _FUNCTIONS.items())
 
 _zero = Bound("<=", 1e-12)
-claim = partial(Claim, PAPER)
 # fmt: off
 CLAIMS = (
-    claim("Appendix",
+    Claim("Appendix",
         "pseudo-residuals let the estimate converge, as measurements at every step would",
-        ClaimPart("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
+        [ClaimPart("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
             "difference", Bound("<=", 1e-9), metric="difference"),
-        *(
-            ClaimPart(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
+        *(ClaimPart(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
                 "share", Bound("=", 0.0), metric="share")
-            for gain in (LITERAL, SPREAD)
-        ),
+            for gain in (LITERAL, SPREAD))],
         note="C has full row rank only: (20) cannot know the error that the sample does not see. "
         "How often the filter diverges depends on the gain between samples, which the paper "
         "leaves open."),
-    claim("Appendix", "the error recursions of the three cases",
-        *(
-            ClaimPart(f"{case}, residual", APPENDIX, case, "residual", None if corrected else _zero,
+    Claim("Appendix", "the error recursions of the three cases",
+        [ClaimPart(f"{case}, residual", APPENDIX, case, "residual", None if corrected else _zero,
                 _zero if corrected or not case.endswith("printed") else None, "residual")
             for case, corrected in (("case 1", False), ("case 2", False), ("case 3 (a)", True),
                 ("case 3 (a), printed", False), ("case 3 (b)", True),
-                ("case 3 (b), printed", False))
-        ),
+                ("case 3 (b), printed", False))],
         note="Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the "
         "residual C G e nothing multiplies w; printed is (I - K C) w."),
 )

@@ -1,7 +1,5 @@
 """uneven-delay: the lateral offset from a camera whose delay varies and is time-stamped."""
 
-from functools import partial
-
 from ..harness.stats import Bound
 from .dual_rate import compute_coms_ranks
 from .ledger import Analysis, Claim, ClaimPart, compare
@@ -36,38 +34,31 @@ SIMULATIONS = (
 )
 
 _NOISES = ((FIG5, ""), (NOISY, ", three times the noise"))
-claim = partial(Claim, PAPER)
 # fmt: off
 CLAIMS = (
-    claim("Sec. 1.3", "slip is observable from vision alone",
-        ClaimPart("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
+    Claim("Sec. 1.3", "slip is observable from vision alone",
+        [ClaimPart("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
             Bound("=", 4.0), "rank"),
-        compare("vision alone / the slip itself", FIG5, VISION, "truth")),
-    claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
-        *(
-            compare(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
+        compare("vision alone / the slip itself", FIG5, VISION, "truth")]),
+    Claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
+        [compare(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
                 max_ratio, "y_l")
             for scenario, text in _NOISES
             for delay, rival, max_ratio in (("33 ms", FRAME, 0.80),
-                ("17 ms, near the mean", MEAN, None))
-        ),
+                ("17 ms, near the mean", MEAN, None))],
         note="Against one frame the time stamps win; against the true mean delay there is no "
         "gain. One process noise for all; with one tuned to the offset for each of them the order "
         "is the same."),
-    claim("Fig. 5", "what exact handling of the delay is worth, lateral offset",
-        *(
-            ClaimPart(f"exact rollback / constant 17 ms{text}", scenario, EXACT, "y_l",
+    Claim("Fig. 5", "what exact handling of the delay is worth, lateral offset",
+        [ClaimPart(f"exact rollback / constant 17 ms{text}", scenario, EXACT, "y_l",
                 threshold=Bound("<=", 0.95) if scenario == FIG5 else None, rivals=(ROLLBACK_17,))
-            for scenario, text in _NOISES
-        )),
-    claim("Fig. 5", "what the delay does to the slip",
-        *(
-            ClaimPart(f"slip, proposed / constant 33 ms{text}", scenario, PROPOSED, rivals=(FRAME,))
-            for scenario, text in _NOISES
-        ),
+            for scenario, text in _NOISES]),
+    Claim("Fig. 5", "what the delay does to the slip",
+        [ClaimPart(f"slip, proposed / constant 33 ms{text}", scenario, PROPOSED, rivals=(FRAME,))
+            for scenario, text in _NOISES],
         note="The paper shows the lateral offset alone. A delay of one frame too many turns the "
         "phase of the slip as too soft tyres do, the other way: with noise the two errors cancel."),
-    claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
-        compare("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, quantity="y_l"),
-        compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")),
+    Claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
+        [compare("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, quantity="y_l"),
+        compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")]),
 )

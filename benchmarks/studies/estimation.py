@@ -13,7 +13,7 @@ import numpy as np
 from ...envs.record import Array
 from ..harness.results import Column, ResultTable, Suite
 from ..harness.stats import interval, ratio_of_roots, root_mean
-from ..papers.ledger import CHUNK, Example, join_numbers, run_simulation
+from ..papers.ledger import CHUNK, SeedResult, join_numbers, run_simulation
 from ..papers.manoeuvres import BOUND, EstimationSimulation, PaperFilter
 from ..report.study import Request, Study, describe_leader, format_verdict
 
@@ -26,7 +26,7 @@ _COLUMNS = (
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
 Numbers = Mapping[tuple[str, str], Array]  # (seeds,) by filter or `BOUND` and quantity
-Results = list[tuple[Numbers, Example | None]]  # of each experiment
+Results = list[tuple[Numbers, SeedResult]]  # of each experiment, with its first seed
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def _measure(request: Request) -> Results:
     simulations = [experiment.simulation for experiment in EXPERIMENTS]
     seeds = request.episodes or 0
     runs = request.run_seeds(run_simulation, simulations, seeds, CHUNK, "estimation")
-    return [(join_numbers(run), run[0].example) for run in runs]
+    return [(join_numbers(run), run[0]) for run in runs]
 
 
 def _get_squares(numbers: Numbers) -> dict[str, Array]:
@@ -121,17 +121,15 @@ def _compose_verdict(results: Results) -> str:
 
 def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
     groups = {}
-    for experiment, (numbers, example) in zip(EXPERIMENTS, results, strict=True):
+    for experiment, (numbers, first) in zip(EXPERIMENTS, results, strict=True):
         records = sorted(_make_records(numbers)[:-1], key=lambda x: x["rmse_over_bound"].value)
         ratios = {record["estimator"]: record["rmse_over_bound"] for record in records}
         groups[f"{experiment.brief} ({experiment.paper})"] = ratios
-        if example is not None:
-            lines = {name: 1e3 * curves["beta"] for name, curves in example.curves.items()}
-            figure = draw.draw_time_series(example.time, lines, "sideslip angle / mrad")
-            title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
-            suite.figures.append((title, figure, experiment.text))
-    ratio = "error / the least possible: less is better"
-    bars = draw.draw_groups(groups, ratio, {1.0: BOUND})
+        lines = {name: 1e3 * curves["beta"] for name, curves in first.curves.items()}
+        figure = draw.draw_time_series(first.time, lines, "sideslip angle / mrad")
+        title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
+        suite.figures.append((title, figure, experiment.text))
+    bars = draw.draw_groups(groups, "error / the least possible: less is better", {1.0: BOUND})
     text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
     suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
 

@@ -27,7 +27,7 @@ from sideslip.benchmarks.report.study import Request
 
 def measure(results: Results, *parts: ClaimPart) -> MeasuredClaim:
     measured = [part.measure(results) for part in parts]
-    return MeasuredClaim(Claim("p", "(1)", "t", *parts), measured)
+    return MeasuredClaim("p", Claim("(1)", "t", parts), measured)
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
@@ -83,15 +83,15 @@ def test_ratios_are_taken_seed_by_seed() -> None:
 
 
 def test_the_ledger_names_what_exists() -> None:
-    for claim in CLAIMS:
+    for _, claim in CLAIMS:
         for part in claim.parts:
             assert part.scenario in SIMULATIONS and part.metric in METRICS
 
 
 def test_every_simulation_has_its_share_of_the_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     """All seven, but for what nothing is drawn in, for shares, and for five times as many."""
-    numbers: Numbers = {(x.subject, x.quantity): 1.0 for claim in CLAIMS for x in claim.parts}
-    numbers |= {(rival, x.quantity): 1.0 for y in CLAIMS for x in y.parts for rival in x.rivals}
+    numbers: Numbers = {(x.subject, x.quantity): 1.0 for _, claim in CLAIMS for x in claim.parts}
+    numbers |= {(rival, x.quantity): 1.0 for _, y in CLAIMS for x in y.parts for rival in x.rivals}
     seen = dict[str, list[int]]()
 
     def run(case: tuple[Simulation, Sequence[int]]) -> list[SeedResult]:

@@ -52,8 +52,8 @@ def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
 def test_the_first_seed_leaves_its_signals() -> None:
     short = EstimationSimulation("short", VISION, SHORT, (PaperFilter("a", "bicycle-kf"),))
     first, second = run_simulation((short, (0, 1)))
-    assert first.example is not None and set(first.example.curves) == {"truth", "a"}
-    assert second.example is None and second.numbers.keys() == first.numbers.keys()
+    assert set(first.curves) == {"truth", "a"}
+    assert not second.curves and second.numbers.keys() == first.numbers.keys()
 
 
 def test_a_car_that_fails_is_no_estimation() -> None:
@@ -73,22 +73,12 @@ def test_options_of_a_contestant_reach_its_agent() -> None:
     assert numbers[label, "total_variation"] > 2.0 * numbers["multirate", "total_variation"]
 
 
-def follow(scenario: Any) -> ControlSimulation:
-    drawn = next(x for x in dakf_stability.SIMULATIONS if isinstance(x, ControlSimulation))
-    return replace(drawn, scenario=scenario)
-
-
-@QUIET
-def test_following_has_the_reference_beside_the_car() -> None:
-    label = dakf_stability.WITHOUT
-    simulation = follow({"base": "dakf-fig7", "name": "short", "duration": 1.5})
-    outcome = next(replace(simulation, drivers={label: simulation.drivers[label]}).run((0,)))
-    assert outcome.example is not None
-    curves = outcome.example.curves
-    error = curves[label]["gamma"] - curves["reference"]["gamma"]
-    expected = np.sqrt(np.mean(error**2))
-    assert outcome.numbers[label, "rms_yaw_error"] == pytest.approx(expected)
-    assert outcome.numbers[label, "full_command"] == 0.0
+def follow(**changes: Any) -> ControlSimulation:
+    """dakf-stability Fig. 7; ten seconds of a turn leave any proving ground."""
+    scenario = {"base": "dakf-fig7", "name": "step steer by wire", "half_width": 1e6}
+    drawn = next(x for x in dakf_stability.SIMULATIONS if x.name == "dakf-fig7")
+    assert isinstance(drawn, ControlSimulation)
+    return replace(drawn, scenario=scenario | changes)
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:
@@ -104,35 +94,15 @@ def test_claims_are_judged_with_the_papers_tuning() -> None:
     assert (Q[0] != Q[2]).all()
 
 
-# dakf-stability Fig. 7: the thresholds of an honest implementation, and what they leave out.
-FIG7: dict[str, Any] = {
-    "base": "dakf-fig6",
-    "name": "step steer by wire",
-    "steering": "step",
-    "onset": 1.0,
-    "amplitude": 0.06,
-    "hold": 100.0,
-    "gps_outage": None,
-    "half_width": 1e6,  # ten seconds of a turn leave any proving ground
-    "lags": True,
-    "vehicle": {
-        "front_stiffness": 7000.0,
-        "rear_stiffness": 7000.0,
-        "motor_lag": 0.0,
-        "steering_lag": 0.03,
-    },
-}
-
-
-def compared(seeds: Iterable[int], scenario: Any) -> dict[str, Any]:
+def compared(seeds: Iterable[int], **changes: Any) -> dict[str, Any]:
     """With control over without it, (seeds,) each: RMS errors of beta and gamma, peak of beta.
 
     `full_command` and `failed` are those with control.
     """
     rows = []
     for seed in seeds:
-        _, none = follow(scenario).drive(dakf_stability.WITHOUT, seed)
-        episode, ours = follow(scenario).drive(dakf_stability.WITH, seed)
+        _, none = follow(**changes).drive(dakf_stability.WITHOUT, seed)
+        episode, ours = follow(**changes).drive(dakf_stability.WITH, seed)
         ours["failed"] = episode.failed
         ratios = {x: ours[x] / none[x] for x in ("rms_slip_error", "rms_yaw_error", "peak_slip")}
         rows.append(ours | ratios)
@@ -140,27 +110,26 @@ def compared(seeds: Iterable[int], scenario: Any) -> dict[str, Any]:
 
 
 @QUIET
-def test_the_numbers_are_those_of_the_episode() -> None:
-    simulation = follow(FIG7 | {"duration": 2.0})
+def test_following_has_the_reference_beside_the_car() -> None:
+    simulation, label = follow(duration=2.0), dakf_stability.WITHOUT
     episode, found = simulation.drive(dakf_stability.WITH, 0)
-    assert found["rms_slip_error"] == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
-    assert found["rms_yaw_error"] == np.sqrt(
-        np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2)
-    )
+    for quantity, name in (("rms_slip_error", "beta"), ("rms_yaw_error", "gamma")):
+        error = episode[name] - episode[f"{name}_ref"]
+        assert found[quantity] == np.sqrt(np.mean(error**2))
     assert found["peak_slip"] == np.max(np.abs(episode["beta"]))
-    assert not episode.failed
-    assert episode["t"][-1] == 2.0
-    assert len(episode["t"]) == 2001
+    assert not episode.failed and episode["t"][-1] == 2.0 and len(episode["t"]) == 2001
     assert 0.0 < np.abs(episode["action_1"]).max() < 1.0
-    _, none = simulation.drive(dakf_stability.WITHOUT, 0)
-    assert none["full_command"] == 0.0
+    none = next(replace(simulation, drivers={label: simulation.drivers[label]}).run((0,)))
+    error = none.curves[label]["gamma"] - none.curves["reference"]["gamma"]
+    assert none.numbers[label, "rms_yaw_error"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert none.numbers[label, "full_command"] == 0.0
 
 
 @QUIET
 @pytest.mark.long
 def test_control_tracks_better_than_none() -> None:
     """Worst of ten seeds: beta at most 0.80 of the error without control, gamma 0.50."""
-    found = compared(range(10), FIG7)
+    found = compared(range(10))
     assert found["rms_slip_error"].max() <= 0.80
     assert found["rms_yaw_error"].max() <= 0.50
     assert not found["failed"].any()
@@ -169,6 +138,6 @@ def test_control_tracks_better_than_none() -> None:
 @QUIET
 @pytest.mark.long
 def test_a_larger_step_saturates_the_motors() -> None:
-    small, large = (compared(range(3), FIG7 | {"amplitude": a}) for a in (0.06, 0.1))
+    small, large = (compared(range(3), amplitude=a) for a in (0.06, 0.1))
     assert (large["full_command"] > 3.0 * small["full_command"]).all()
     assert (large["full_command"] > 0.02).all()

@@ -74,7 +74,7 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
 def claim(paper: str, stated: str, value: float) -> Any:
     part = ClaimPart("x", "s", "a", stated=Bound(stated, 1.0), threshold=Bound("<", 9.0))
     parts = (MeasuredPart(part, np.full(4, value)),)
-    return MeasuredClaim(Claim(paper, "Fig. 1", "smaller", part), parts)
+    return MeasuredClaim(paper, Claim("Fig. 1", "smaller", [part]), parts)
 
 
 def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
