@@ -84,7 +84,7 @@ def make_estimator_tuning(
         raise ValueError(f"scenarios are one or more, each once, got {', '.join(scenarios)}")
     held = dict(options or {})
     ESTIMATORS.load(estimator)  # or ValueError
-    env_id, facts, filter_ = _find_env(estimator, scenarios, env_id, held)
+    env_id, arguments, filter_ = _find_env(estimator, scenarios, env_id, held)
     states = filter_.names
     if target not in states:
         raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
@@ -94,15 +94,15 @@ def make_estimator_tuning(
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
     if search is None:
         names = [f"q_{state}" for state in states if f"q_{state}" not in held]
-        search = {name: None for name in names if _has_option(estimator, name, held, facts)}
+        search = {name: None for name in names if _has_option(estimator, name, arguments)}
     searched = {**search, **(noises or {})}
     if not searched:
         raise ValueError(f"{estimator} has no process noise to search; name the options to search")
     for option in searched:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
-        if not _has_option(estimator, option, held, facts):  # it raises with what it has
-            call_quietly(make_estimator, estimator, **{**facts, **held, option: 1.0})
+        if not _has_option(estimator, option, arguments):  # it raises with what it has
+            call_quietly(make_estimator, estimator, **{**arguments, option: 1.0})
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
@@ -117,19 +117,11 @@ def _check_range(option: str, limits: Range | None) -> Range:
     return float(low), float(high)
 
 
-def _make_unstable_option(estimator: str) -> dict[str, bool]:
-    """Make the option that lets our filters be built though their error grows."""
-    return {"allow_unstable": True} if estimator in FILTERS else {}
-
-
-def _has_option(
-    estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
-) -> bool:
+def _has_option(estimator: str, option: str, arguments: Mapping[str, Any]) -> bool:
     """Check whether the estimator has an option, whatever number suits it."""
-    options = {**_make_unstable_option(estimator), **held, option: 1e-3}
     try:
         with suppress(ValueError):
-            call_quietly(make_estimator, estimator, **facts, **options)
+            call_quietly(make_estimator, estimator, **{**arguments, option: 1e-3})
     except TypeError:
         return False
     return True
@@ -138,7 +130,8 @@ def _has_option(
 def _find_env(
     estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
-    """Find an env that suits; its id, its facts, and the untuned estimator."""
+    """Find an env that suits; its id, the arguments of the untuned estimator, and this itself."""
+    unstable = {"allow_unstable": True} if estimator in FILTERS else {}  # its error may grow
     drives = (experiment.simulation for experiment in EXPERIMENTS)
     first = [simulation.env_id for simulation in drives if simulation.name in scenarios]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
@@ -149,13 +142,12 @@ def _find_env(
             for scenario in scenarios:
                 env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
                 env.reset(seed=FIRST_SEED)
-                facts = make_filter_arguments(env.unwrapped)
-                options = {**_make_unstable_option(estimator), **held}
-                filter_ = call_quietly(make_estimator, estimator, **facts, **options)
+                arguments = make_filter_arguments(env.unwrapped) | unstable | held
+                filter_ = call_quietly(make_estimator, estimator, **arguments)
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
-            return name, facts, filter_
+            return name, arguments, filter_
     reasons = "; ".join(f"{name}: {text}" for text, name in refused.items())
     raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {reasons}")
 
