@@ -48,15 +48,14 @@ class EstimatorTuning:
     seeds: tuple[int, ...]
 
     @property
-    def subject(self) -> str:
-        """Names of the scenarios."""
-        return ", ".join(self.scenarios)
+    def title(self) -> str:
+        """Names of the estimator and the scenarios."""
+        return f"{self.estimator} on {', '.join(self.scenarios)}"
 
     @property
     def study(self) -> str:
         """Name of the study."""
-        title = f"{self.estimator} on {self.subject}"
-        return make_study_name(title, self, hash_sources("estimators"))
+        return make_study_name(self.title, self, hash_sources("estimators"))
 
 
 def make_estimator_tuning(
@@ -243,7 +242,7 @@ def run(
     )
     comparisons = _make_comparisons(task, (training, test), numbers)
     tables = [*comparisons, make_result_table(numbers, task.search)]
-    return Suite("tune", f"Tuning {task.estimator} on {task.subject}", text, tables=tables), numbers
+    return Suite("tune", f"Tuning {task.title}", text, tables=tables), numbers
 
 
 def _make_comparisons(
