@@ -181,7 +181,8 @@ class _RemoteEstimators:
     def __call__(self, **arguments: object) -> "_RemoteRow":
         """Let the child build one more estimator."""
         row, self._rows = self._rows, self._rows + 1
-        return _RemoteRow(self._child, self.name, row, arguments)
+        names = json.loads(self._child.call("estimator", row, self.name, arguments))
+        return _RemoteRow(self._child, row, tuple(names) if isinstance(names, list) else ())
 
 
 class _RemoteBatch(ForeignBatch):
@@ -197,19 +198,16 @@ class _RemoteBatch(ForeignBatch):
         yield from rows
 
 
+@dataclass(eq=False)
 class _RemoteRow:
     """One estimator of a child, as an `EstimatorLike`."""
 
-    batch = _RemoteBatch
+    child: _ChildProcess
+    row: int
+    names: tuple[str, ...]
     x: Array | None = None
     P: Array | None = None
-
-    def __init__(
-        self, child: _ChildProcess, source: str, row: int, arguments: dict[str, object]
-    ) -> None:
-        self.child, self.row = child, row
-        names = json.loads(child.call("estimator", row, source, arguments))
-        self.names = tuple(names) if isinstance(names, list) else ()
+    batch = _RemoteBatch
 
     def reset(self, sensors: Mapping[str, SlowSensor], first: int) -> None:
         """Start anew, as `EstimatorLike.reset`."""
