@@ -83,9 +83,7 @@ class SlowSensors:
         new_packets: list[Tensor] = []
         for sensor, capacity in self.capacities.items():
             for _ in range(capacity.frames):
-                sensors[sensor], packets = self._capture_frame(
-                    sensor, p, keys, sensors[sensor], window
-                )
+                sensors[sensor], packets = self._capture(sensor, p, keys, sensors[sensor], window)
                 new_packets += packets
         queue = _sort_packets(torch.cat([state.queue, torch.stack(new_packets)]))
         arrived = queue[:, PACKET.arrived]
@@ -95,7 +93,7 @@ class SlowSensors:
         remaining = _remove_first(queue, count)[: len(state.queue)]
         return SlowState(slow, remaining), Delivered(queue, count)
 
-    def _capture_frame(
+    def _capture(
         self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: TickWindow
     ) -> tuple[list[Tensor], list[Tensor]]:
         """Capture a sensor's next frame if it is in the window: (sensor's state, its packets)."""
