@@ -1,6 +1,5 @@
 """Environments around a plant that is not ours: our sensors, scenarios, references and cost."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -35,13 +34,11 @@ _OWN_PLANT_FIELDS = (
 
 def _check_scenario(scenario: Scenario, model: str) -> None:
     """Raise ValueError for a scenario that a model of `OUTSIDE_PLANTS` cannot drive."""
-    name = f"scenario {scenario.name!r}"
-    defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
-    for field in _OWN_PLANT_FIELDS:
-        value = getattr(scenario, field)
-        if value and value != defaults[field]:
-            rule = "an outside plant is what it is, on a straight and level road"
-            raise ValueError(f"{name}: {field} {value!r} is of our own plant and road; {rule}")
+    name, changed = f"scenario {scenario.name!r}", scenario.to_dict()
+    if field := next((field for field in _OWN_PLANT_FIELDS if field in changed), None):
+        value, rule = getattr(scenario, field), "an outside plant is what it is"
+        text = f"{field} {value!r} is of our own plant and road"
+        raise ValueError(f"{name}: {text}; {rule}, on a straight and level road")
     if model != "multi-body":
         if scenario.wind_height:
             wind = f"wind_height {scenario.wind_height!r} rolls the body"

@@ -127,10 +127,6 @@ def draw_stable(
 
 WORLD_VERSION = 1
 """Version of plant, sensors and world "v1": what was measured in another is measured anew."""
-GROUPS = (
-    "camera", "steering", "wheels and motors", "inertial", "GPS and map", "load", "road", "tyres",
-)  # fmt: skip
-"""Groups of ranges, each of which can be doubled or set to zero."""
 
 
 def _draw(group: str, unit: str, limits: Range, ideal: float, text: str) -> Any:
@@ -235,6 +231,9 @@ class World:
         }
 
 
+_METADATA = [entry.metadata for entry in dataclasses.fields(World)]
+GROUPS = tuple(dict.fromkeys(entry["group"] for entry in _METADATA if "group" in entry))
+"""Groups of ranges, each of which can be doubled or set to zero."""
 _SHAPES = ("course_period", "map_length", "bank_length", "friction_length", "torque_rate")
 IDEAL = World()
 _FILE = read_document(Path(__file__).with_name("v1.toml"), "world")
