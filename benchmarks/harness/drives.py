@@ -101,8 +101,7 @@ def call_quietly(make: Callable[..., T], *args: object, **options: object) -> T:
         args: Its positional arguments.
         options: Its other arguments.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnobservableWarning)
+    with warnings.catch_warnings(action="ignore", category=UnobservableWarning):
         return make(*args, **options)
 
 

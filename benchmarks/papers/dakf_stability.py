@@ -53,9 +53,9 @@ def _make_tracking_parts(scenario: str, *thresholds: float | None) -> list[Claim
 CLAIMS = (
     Claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
         [compare("DAKF / KF", FIG6, DAKF, KF, 0.75),
-        compare("KF / LOB", FIG6, KF, LOB, 0.80),
-        compare("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
-        compare("KF / LOB at 0.4 Hz", FASTER, KF, LOB)]),
+         compare("KF / LOB", FIG6, KF, LOB, 0.80),
+         compare("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
+         compare("KF / LOB at 0.4 Hz", FASTER, KF, LOB)]),
     Claim("Fig. 6", "the DAKF is better during the outage too",
         [compare(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, quantity="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
@@ -63,17 +63,17 @@ CLAIMS = (
     Claim("Sec. IV.D", "slip and disturbances are observable",
         [ClaimPart("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
             Bound("=", 4.0), "rank"),
-        ClaimPart("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
+         ClaimPart("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
             "last", None, Bound(">=", 0.05), "drift"),
-        ClaimPart("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift")],
+         ClaimPart("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift")],
         note="A constant slip is the same to the sensors as a heading the other way with constant "
         "d1 and d2."),
     Claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
         [*_make_tracking_parts(FIG7, 0.80, 0.50),
-        compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_slip"),
-        ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "full_command",
+         compare("peak of the slip, with / without", FIG7, WITH, WITHOUT, quantity="peak_slip"),
+         ClaimPart("share of time at the yaw moment's limit", FIG7, WITH, "full_command",
             metric="share"),
-        ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "full_command", metric="share")]),
+         ClaimPart("the same, a step of 0.1 rad", LARGER, WITH, "full_command", metric="share")]),
     Claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
         [compare(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
                 quantity=metric)
@@ -81,9 +81,9 @@ CLAIMS = (
         note="The feedback's integrals already take away what is constant."),
     Claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
         [compare("DAKF / KF", FIG8, DAKF, KF),
-        compare("KF / LOB", FIG8, KF, LOB),
-        compare("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, quantity="outage"),
-        compare("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, quantity="outage")],
+         compare("KF / LOB", FIG8, KF, LOB),
+         compare("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, quantity="outage"),
+         compare("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, quantity="outage")],
         note="At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its "
         "sign, there is little slip to see, and no course while it is there."),
     Claim("Fig. 9 (twin)", "with control the car tracks on the road too",

@@ -46,22 +46,20 @@ SIMULATIONS = (
                 PaperFilter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
         for name, (hdop, spread), law, _ in _SKIES),
 )
-# fmt: on
 
-# fmt: off
 CLAIMS = (
     Claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
         [*(compare(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
             for scenario, text in _SLALOMS
             for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
                 ("double layer", PROPOSED, 0.95))),
-        *(compare(f"three-state / two-state, {x}", name, THREE, LOB) for name, x in _SLALOMS)],
+         *(compare(f"three-state / two-state, {x}", name, THREE, LOB) for name, x in _SLALOMS)],
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
     Claim("Fig. 9 (b)", "the smallest error between courses",
         [*(compare(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
             for name, text in _SLALOMS),
-        *(compare(f"jump at a course, double layer / three-state, {text}", name,
+         *(compare(f"jump at a course, double layer / three-state, {text}", name,
                 PROPOSED, THREE, quantity="jump")
             for name, text in _SLALOMS)],
         note="The error over all milliseconds is that between courses: there are 200 to a course."),
@@ -69,22 +67,21 @@ CLAIMS = (
         [compare("double layer / three-state", FIG9, PROPOSED, THREE, quantity="psi")]),
     Claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
         [compare("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
-        compare("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, quantity="phi")],
+         compare("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, quantity="phi")],
         note="30 % on inertia, damping and stiffness cancel except in the input gain."),
     Claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
         [compare("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
-        compare("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, quantity="v_x"),
-        *(compare(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, quantity=state)
+         compare("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, quantity="v_x"),
+         *(compare(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, quantity=state)
             for state in ("v_y", "v_x"))],
         note="The kinematic KF with the process noise of its accelerometers, and with one tuned "
         "to the drive, which takes roll for noise. v_x: it has the wheels at 1 kHz, the double "
         "layer the GPS's speed at 5 Hz."),
     Claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
-        [compare(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
+        [compare(f"{label}, {x}", x, filter_, filter_ + FIXED, max_ratio if limited else None)
             for label, filter_, limited in (("disturbance KF", WALKS, True),
                 ("double layer", PROPOSED, False))
-            for name, _, _, max_ratio in _SKIES
-            for threshold in (max_ratio if limited else None,)],
+            for x, _, _, max_ratio in _SKIES],
         note="Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the "
         "noise follows it; where the noise does not, it is a wrong R. The double layer, which "
         "corrects between courses, gains nothing. On three real receivers the spread hardly "
@@ -92,8 +89,8 @@ CLAIMS = (
     Claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
         [ClaimPart("slip, double layer / best rival", ROAD, PROPOSED, stated=Bound("<", 1.0),
             rivals=(THREE, LOB)),
-        compare("slip, three-state / two-state", ROAD, THREE, LOB),
-        compare("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, quantity="phi"),
-        compare("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_y"),
-        compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")]),
+         compare("slip, three-state / two-state", ROAD, THREE, LOB),
+         compare("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, quantity="phi"),
+         compare("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_y"),
+         compare("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, quantity="v_x")]),
 )

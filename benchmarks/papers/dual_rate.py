@@ -200,7 +200,7 @@ CLAIMS = (
     Claim("Sec. 4.1",
         "slip can be estimated from the GPS's course alone, robustly by disturbance accommodation",
         [compare("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
-        compare("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN)],
+         compare("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN)],
         note="At 25 km/h the course alone hardly tells slip from heading: an estimate of zero is "
         "about as good."),
     Claim("Fig. 4 (c)", "the pseudo measurement is smoother",
@@ -211,7 +211,7 @@ CLAIMS = (
     Claim("(33)", "the error dynamics are those of fast measurements",
         [ClaimPart("difference of the maps, square C", MAPS, SQUARE, "difference",
             Bound("<=", 1e-9), Bound("<=", 1e-9), "difference"),
-        ClaimPart("difference of the maps, course only", MAPS, APPLICATION, "difference",
+         ClaimPart("difference of the maps, course only", MAPS, APPLICATION, "difference",
             Bound("<=", 1e-9), Bound(">=", 0.2), "difference")],
         note="(30) has no exact solution unless C is invertible, and with disturbance "
         "accommodation it never is: C = [c 0]."),

@@ -269,7 +269,7 @@ _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
 # fmt: off
 CLAIMS = (
     Claim("Fig. 7", "the bicycle model's filter is the poorest",
-          [_make_poorest_part(FIG7, Bound(">=", 1.05))]),
+        [_make_poorest_part(FIG7, Bound(">=", 1.05))]),
     Claim("Fig. 7", "the multirate filter with pseudo-residuals is the best",
         _make_best_parts(FIG7, 1.10),
         note="For an optimal gain the expected error given the residual is zero: the correction "
@@ -277,9 +277,9 @@ CLAIMS = (
     Claim("Fig. 7", "how far from the best possible, and what the delay costs",
         [ClaimPart("exact filter of the true model / bound, pooled", FIG7, EXACT,
             threshold=Bound("<=", 1.03), rivals=(BOUND,), is_pooled=True),
-        ClaimPart("multirate / bound: the stiffness error", FIG7, MULTI_KF, rivals=(BOUND,)),
-        ClaimPart("delay ignored / multirate", FIG7, NO_DELAY, rivals=(MULTI_KF,)),
-        ClaimPart("delay ignored, tuned for it / multirate", FIG7, RETUNED, rivals=(MULTI_KF,))],
+         ClaimPart("multirate / bound: the stiffness error", FIG7, MULTI_KF, rivals=(BOUND,)),
+         ClaimPart("delay ignored / multirate", FIG7, NO_DELAY, rivals=(MULTI_KF,)),
+         ClaimPart("delay ignored, tuned for it / multirate", FIG7, RETUNED, rivals=(MULTI_KF,))],
         note="What ignoring the delay costs is a matter of tuning: more than twice the error with "
         "the gains of the filter that knows the delay; far less than that filter's error with "
         "gains tuned for ignoring it, since on a single sine the lag that is left cancels the lag "
@@ -294,12 +294,12 @@ CLAIMS = (
     Claim("Table II", "gain margins of 5.92 dB at 15.15 Hz and 22.8 dB at 477.46 Hz",
         [ClaimPart("farther of both margins from the printed ones, best loop / dB", TABLE2,
             "loops", "off", Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
-        ClaimPart("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off",
+         ClaimPart("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off",
             Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
-        *(ClaimPart(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
+         *(ClaimPart(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
                 Bound("=", hertz), metric="hertz")
             for label, hertz in zip((SINGLE, MULTI), HERTZ, strict=True)),
-        ClaimPart("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
+         ClaimPart("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
             metric="count")],
         note="The table gives no speed, no Q and R, no discretisation: a search of "
         "4590 loops finds those that fit. Several do, at several speeds: the table does not tell "
@@ -320,17 +320,17 @@ CLAIMS = (
     Claim("Fig. 8 (b)", "the multirate controller's input is smoother",
         [compare("largest 1 ms step, pseudo-residuals / single-rate", FIG8, PROPOSED,
             SINGLE, 0.4, "largest_step"),
-        compare("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
+         compare("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
             quantity="total_variation")]),
     Claim("Fig. 8", "the gain margins of both control systems were set to be the same",
         [ClaimPart("share of time at the yaw moment's limit, multirate with single-rate's margin",
             FIG8, EQUAL, "saturation", metric="share"),
-        ClaimPart("its slip / multirate with the same PI", FIG8, EQUAL, "rms_slip",
+         ClaimPart("its slip / multirate with the same PI", FIG8, EQUAL, "rms_slip",
             rivals=(MULTI,))],
         note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
         "limit to limit with the noise."),
     Claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",
         [compare("single-rate / none", FIG10, SINGLE, "none", quantity="rms_slip"),
-        compare("pseudo-residuals / none", FIG10, PROPOSED, "none", quantity="rms_slip"),
-        compare("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE, quantity="rms_slip")]),
+         compare("pseudo-residuals / none", FIG10, PROPOSED, "none", quantity="rms_slip"),
+         compare("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE, quantity="rms_slip")]),
 )

@@ -154,7 +154,7 @@ CLAIMS = (
         "pseudo-residuals let the estimate converge, as measurements at every step would",
         [ClaimPart("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
             "difference", Bound("<=", 1e-9), metric="difference"),
-        *(ClaimPart(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
+         *(ClaimPart(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
                 "share", Bound("=", 0.0), metric="share")
             for gain in (LITERAL, SPREAD))],
         note="C has full row rank only: (20) cannot know the error that the sample does not see. "

@@ -39,7 +39,7 @@ CLAIMS = (
     Claim("Sec. 1.3", "slip is observable from vision alone",
         [ClaimPart("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
             Bound("=", 4.0), "rank"),
-        compare("vision alone / the slip itself", FIG5, VISION, "truth")]),
+         compare("vision alone / the slip itself", FIG5, VISION, "truth")]),
     Claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
         [compare(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
                 max_ratio, "y_l")
@@ -60,5 +60,5 @@ CLAIMS = (
         "phase of the slip as too soft tyres do, the other way: with noise the two errors cancel."),
     Claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
         [compare("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, quantity="y_l"),
-        compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")]),
+         compare("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, quantity="y_l")]),
 )
