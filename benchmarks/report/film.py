@@ -35,10 +35,7 @@ class FilmDriver(NamedTuple):
 
 
 def check_film(path: Path | None) -> None:
-    """Check a film's ending (ValueError), folder (OSError) and modules (ModuleNotFoundError) first.
-
-    It needs the extra `render`.
-    """
+    """Check a film's ending (ValueError), folder (OSError), modules (ModuleNotFoundError) first."""
     if path is None:
         return
     if path.suffix.lower() not in RATES:

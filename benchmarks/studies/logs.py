@@ -24,7 +24,7 @@ _FILE = Path(__file__).with_suffix(".toml")
 _NAME = "joint"
 _DEG = math.degrees(1.0)
 _COLUMNS = (
-    "drive", "estimator", Column("n", "rows", form=".0f", interval=False),
+    Column("scenario", "drive"), "estimator", Column("n", "rows", form=".0f", interval=False),
     Column("median", "median / deg", _DEG, ".2f", interval=False),
     Column("p95", "95th / deg", _DEG, ".2f", interval=False),
     Column("worst", "worst / deg", _DEG, ".2f", interval=False), *HONESTY,
@@ -41,7 +41,7 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
             absent.append(
                 f"{preset['name']} is not there: {preset['address']}. Licence: "
                 f"{preset['licence']}. Save as {preset['pattern']} in the folder "
-                f"of --data: {preset['prepare']}."
+                f"of --data: {preset['prepare']}"
             )
         for path in files:
             beside = path.with_name("vehicle.toml")
@@ -49,7 +49,7 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
             try:
                 parts, _ = read_parts(path, parse_mapping(preset["mapping"]))
             except ValueError as error:
-                absent.append(f"{error}.")
+                absent.append(str(error))
                 continue
             for part in parts:
                 log = apply_wires(part, read_wires(vehicle))
@@ -57,7 +57,7 @@ def _measure(request: Request) -> tuple[list[dict[str, Any]], list[str]]:
                     records += _score(log, vehicle)
                 else:
                     reason = "no true sideslip angle while it moves, from 2 s on"
-                    absent.append(f"{log.name} is not scored: {reason}.")
+                    absent.append(f"{log.name} is not scored: {reason}")
     return records, absent
 
 
@@ -82,17 +82,14 @@ def _score(log: Log, vehicle: VehicleSource) -> list[dict[str, Any]]:
         numbers = np.quantile(np.abs(error), (0.5, 0.95, 1.0)).tolist()
         numbers += compute_honesty(error, estimates.std[counts, place])
         keys = ("median", "p95", "worst", *(column.key for column in HONESTY))
-        record = {"drive": log.name, "estimator": label, "n": len(error)}
+        record = {"scenario": log.name, "estimator": label, "n": len(error)}
         records.append(record | dict(zip(keys, numbers, strict=True)))
     return records
 
 
 def _add_tables(suite: Suite, results: tuple[list[dict[str, Any]], list[str]]) -> None:
-    records, absent = results
-    for record in records:
-        numbers = {key: value for key, value in record.items() if key != "drive"}
-        suite.add_rows([numbers], scenario=record["drive"])
-    suite.warnings = [text.removesuffix(".") for text in absent]
+    records, suite.warnings = results
+    suite.add_rows(records)
     if records:
         note = "Absolute errors of the sideslip angle from 2 s on, moving forward."
         suite.tables = [ResultTable("Recorded drives", _COLUMNS, records, note)]

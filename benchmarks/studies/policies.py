@@ -84,16 +84,16 @@ class PolicyEvaluation:
             entry = self.entries[label]
             line: dict[str, Any] = {metric: interval(drive[metric]) for metric in _METRICS}
             line |= {"label": label, "fails": float(np.mean(drive["failure"] != 0.0))}
+            line |= {"controller": name if label == name else entry.agent}
+            line |= {"estimator": entry.estimator, "spec": ControlCase(task, entry).spec}
             if label != name:
                 ratio = geometric_mean(np.log(compute_cost_ratios(costs, drive.costs)))
                 line |= {"cost ratio": format_percent(ratio)}
                 line |= {"better": compute_win_rate(costs, drive.costs).value}
                 verdict.append(f"{name} costs {line['cost ratio']} of {label}, seed by seed.")
             lines.append(line)
-            columns = {"estimator": entry.estimator, "scenario": task.scenario, "salt": self.salt}
-            columns |= {"controller": name if label == name else entry.agent}
-            columns |= {"spec": ControlCase(task, entry).spec}
-            suite.add_rows([line], task.env_id, n=len(self.seeds), **columns)
+        n = len(self.seeds)
+        suite.add_rows(lines, task.env_id, n=n, scenario=task.scenario, salt=self.salt)
         note = (
             f"cost ratio: {name}'s over each other's, paired geometric means with 95 % intervals. "
             f"better: on how many of the seeds {name} costs less. step: the largest between two "
