@@ -14,7 +14,7 @@ import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from .core.filter import NO_OUTPUTS, FilterOutputs, StepRecord
-from .core.record import FILTER, FilterRecords
+from .core.memory import FILTER, FilterLayers
 from .design.options import FAST_CHANNELS, FIND
 from .design.periodic import count_ticks
 from .estimator import Estimator, compile_advance
@@ -37,7 +37,7 @@ def _align_rows(rows: Array, lags: dict[int, int]) -> Array:
     return result
 
 
-def _advance(filters: FilterRecords, gains: Array, fast: Array, packets: Array) -> Array:
+def _advance(filters: FilterLayers, gains: Array, fast: Array, packets: Array) -> Array:
     """Advance a filter by rows and packets; return the packets' NIS."""
     packets = np.ascontiguousarray(packets[:, :PACKET_WIDTH])
     record, nis = StepRecord(fast, len(fast), packets, len(packets)), np.full(len(packets), np.nan)
@@ -60,7 +60,7 @@ class _LatencySearch:
         # latency in force and its standard deviation (ticks), whether no more looks are needed
         self.lag, self.sd, self.done = 0, np.inf, False
 
-    def begin(self, filters: FilterRecords, rows: Array, packets: Array) -> None:
+    def begin(self, filters: FilterLayers, rows: Array, packets: Array) -> None:
         """Begin a new stretch at a filter's memory, with what that has not taken yet."""
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
@@ -77,8 +77,8 @@ class _LatencySearch:
         self._count += len(rows)
 
     def look(
-        self, delayed_filters: FilterRecords, rows: Array, packets: Array, gains: Array
-    ) -> FilterRecords:
+        self, delayed_filters: FilterLayers, rows: Array, packets: Array, gains: Array
+    ) -> FilterLayers:
         """Compare latencies where a look is due; return the memory for the latency in force."""
         if self._count in self._looks:
             delayed_filters = self._compare(delayed_filters, gains)
@@ -86,7 +86,7 @@ class _LatencySearch:
             self.begin(delayed_filters, rows, packets)
         return delayed_filters
 
-    def _compare(self, delayed_filters: FilterRecords, gains: Array) -> FilterRecords:
+    def _compare(self, delayed_filters: FilterLayers, gains: Array) -> FilterLayers:
         rows = np.concatenate(self._rows)
         stretch = cache(partial(self._run_stretch, rows=rows, gains=gains))  # by lag
         lag, curvature, margin = self._minimise_nis(lambda lag: stretch(lag)[0])
@@ -121,7 +121,7 @@ class _LatencySearch:
         distant_nis = min(sum_nis(lag) for lag in grid if abs(lag - best) >= coarse)
         return best, curvature, distant_nis - sum_nis(best)
 
-    def _run_stretch(self, lag: int, rows: Array, gains: Array) -> tuple[float, int, FilterRecords]:
+    def _run_stretch(self, lag: int, rows: Array, gains: Array) -> tuple[float, int, FilterLayers]:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
         fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]

@@ -23,8 +23,7 @@ from .core.filter import (
     reset_filters,
     write_estimate,
 )
-from .core.model import LATERAL, VELOCITY
-from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
+from .core.memory import FILTER, FilterLayers, FilterMemory, SkipCounters
 from .core.update import is_healthy
 from .design import periodic
 from .design.options import STATES, FilterConfig
@@ -82,7 +81,7 @@ class Estimator:
         self.reset()
 
     @property
-    def _f(self) -> FilterRecord:
+    def _f(self) -> FilterMemory:
         return self.filters[0]
 
     @property
@@ -92,13 +91,13 @@ class Estimator:
         columns |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
         # a log without them had no yaw moment and a straight road
         columns -= {FAST.torque_left, FAST.torque_right, FAST.curvature}
-        if any(f.kind == VELOCITY for f in self.filters):
+        if any(f.velocity > 0.0 for f in self.filters):
             columns.add(FAST.gyro)
-        if self._f.measured and (self._f.kind == LATERAL or self._f.speed_share > 0.0):
+        if self._f.measured and (self._f.planar > 0 or self._f.velocity > 0.0):
             columns.add(FAST.wheel_left)
         return tuple(FAST._fields[column] for column in sorted(columns))
 
-    def check(self, filters: FilterRecords) -> None:
+    def check(self, filters: FilterLayers) -> None:
         """Check that the filter converges, ValueError if not, and warn of what it cannot see.
 
         Args:
@@ -119,7 +118,7 @@ class Estimator:
             text = f"{self.name} cannot see: {'; '.join(self.unobservable)}"
             warnings.warn(text, UnobservableWarning, stacklevel=3)
 
-    def _design_table(self, f: FilterRecord, schedule: Schedule, v: float) -> tuple[Array, Array]:
+    def _design_table(self, f: FilterMemory, schedule: Schedule, v: float) -> tuple[Array, Array]:
         """Compute the table of gains at a speed and the error's map; ValueError if that grows."""
         try:
             table, M = periodic.design_and_map(f, schedule, v, self.config)

@@ -19,7 +19,7 @@ from ..envs.recordings.tables import parse_column_name
 from ..envs.sensors.link import SlowSensor
 from ..envs.vehicle.parameters import VehicleSource, make_vehicle
 from .core.filter import NO_OUTPUTS, StepRecord
-from .core.record import FilterRecords
+from .core.memory import FilterLayers
 from .design.options import FAST_CHANNELS
 from .make import make_estimator
 from .wires import apply_wires, move_course, read_wires
@@ -173,7 +173,7 @@ class Stream:
         """Forget everything; `tick` is that of the buffer's first row."""
         self._base, self._newest, self._first = tick, tick - 1, -1  # ticks; -1: not all have come
         self._changed = self._done = tick  # from which on rows changed, or are not filtered yet
-        self._snapshots: dict[int, FilterRecords] = {}  # of the filter before a tick's row
+        self._snapshots: dict[int, FilterLayers] = {}  # of the filter before a tick's row
         self._rows.fill(np.nan)
         self._filled.fill(np.nan)
         self._latest.fill(-np.inf)

@@ -15,12 +15,11 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import PACKET, Array, Log
 from ..core.filter import run_tick
-from ..core.intersample import NONE
 from ..core.late_samples import IGNORE
-from ..core.model import BETA, LATERAL
+from ..core.memory import GAIN, WINDOW, FilterMemory, GainTables
+from ..core.model import BETA
 from ..core.packets import process_packet
 from ..core.predict import read_fast_row
-from ..core.record import WINDOW, FilterRecord, GainTables
 from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator
@@ -80,7 +79,7 @@ def smooth(
 def _remove_delay(estimator: Estimator) -> Estimator:
     """Copy the filter for samples that are never late; ValueError where there is none."""
     f = estimator.filters[0]
-    is_plain = f.intersample_rule == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
+    is_plain = f.gain_rule == GAIN.covariance and f.delayed == 0 and f.pace == 1
     if len(estimator.filters) > 1 or not is_plain:
         raise ValueError(
             f"{estimator.name}: a smoother needs one layer with gains='covariance', samples used "
@@ -106,7 +105,7 @@ class _FilteredBlock(NamedTuple):
 
 @jit
 def _filter_forwards(
-    f: FilterRecord, gains: GainTables, fast: Matrix, packets: Matrix, position: int, nis: Vector,
+    f: FilterMemory, gains: GainTables, fast: Matrix, packets: Matrix, position: int, nis: Vector,
     block: _FilteredBlock,
 ) -> int:  # fmt: skip
     """Filter fast rows, and packets from `position` on that arrive by then; return those done."""
@@ -121,7 +120,7 @@ def _filter_forwards(
                 Q[j, i, k] = f.Q[i, k]
                 diagonal = f.decay[i] if i == k else 0.0
                 F[j, i, k] = f.G[i, k] if i < dense else diagonal
-            if f.kind == LATERAL and f.speed_before > 0.0:
+            if f.planar > 0 and f.speed_before > 0.0:
                 F[j, i, BETA] *= f.speed_before / f.model_speed
         while position < len(packets) and not packets[position, PACKET.arrived] > f.tick:
             process_packet(f, gains, packets[position])

@@ -17,7 +17,13 @@ from ...envs.numerics.packed import (
     vector_width,
 )
 from ...envs.numerics.primitives import Scalar, Vector, absolute, any_lane, select, sqrt
-from .record import N_CORE, N_TOTAL, FilterRecord
+from .memory import GAIN, N_CORE, N_TOTAL, FilterMemory
+
+
+@jit
+def has_covariance(f: FilterMemory) -> Scalar:
+    """Return whether the filter carries P along, for its gains; others read them from a table."""
+    return f.gain_rule <= GAIN.split
 
 
 @jit
@@ -30,7 +36,7 @@ def dot(row: Vector, v: Vector, n: int) -> Scalar:
 
 
 @jit
-def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
+def predict_measurement(f: FilterMemory, s: int, i: int) -> Scalar:
     """Predict a row of a slow sensor: C x and, over the ground, the road's heading."""
     value = dot(f.C[s, i], f.x, f.n)
     return value + f.road_turn if f.ground[s, i] == 1 else value
@@ -85,7 +91,7 @@ def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
 
 
 @jit
-def apply_transition(f: FilterRecord, v: Vector) -> None:
+def apply_transition(f: FilterMemory, v: Vector) -> None:
     """Predict v <- F v with F = diag(own_decay) + G."""
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
@@ -98,7 +104,7 @@ def apply_transition(f: FilterRecord, v: Vector) -> None:
 
 
 @jit
-def predict_covariance(f: FilterRecord) -> None:
+def predict_covariance(f: FilterMemory) -> None:
     """Predict P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones.
 
     The rows of the dense states are computed by fours, what stands above the diagonal counts.
@@ -143,7 +149,7 @@ def predict_covariance(f: FilterRecord) -> None:
 
 
 @jit
-def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
+def correct_scalar(f: FilterMemory, variance: Scalar, residual: Scalar) -> None:
     """Correct by one residual whose covariance with the state is `f.PC`.
 
     P <- P - K s K^T with the residual's variance s, to which Joseph's form comes down for the
@@ -163,7 +169,7 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
 
 @jit
-def project(f: FilterRecord, row: Vector) -> Scalar:
+def project(f: FilterMemory, row: Vector) -> Scalar:
     """Compute f.PC = P C^T of a measurement of the states."""
     n, N, P, PC = f.n, f.total, f.P, f.PC
     for j in range(0, N, vector_width(P)):
@@ -182,7 +188,7 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
 
 
 @jit
-def project_row(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
+def project_row(f: FilterMemory, s: int, i: int, target: int) -> Scalar:
     """Compute f.PC = P C^T of a sensor's row."""
     if target < 0:
         return project(f, f.C[s, i])

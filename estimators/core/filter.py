@@ -1,6 +1,6 @@
 """The filter itself, compiled: fast rows and packets in; states, or an observation, out.
 
-Layers are the records of an estimator: one filter, or the two of double-layer-gps. A tick stores
+Layers are the filters of an estimator: one, or the two of double-layer-gps. A tick stores
 what was captured at the last one and predicts from there; then fast sensors correct, then packets.
 A filter at the slow sensor's rate listens every `pace` ticks; in between it holds its states
 (`stride`) or predicts them.
@@ -14,12 +14,14 @@ from ...envs.numerics.functions import sincos, wrap
 from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, sqrt
 from ...envs.record import PACKET
+from .covariance import has_covariance
 from .innovation import interpolate_hdop
+from .intersample import locate_step_row
 from .late_samples import store_due_captures
+from .memory import COUNTERS, N_SLOW, WINDOW, FilterLayers, FilterMemory, GainTables
 from .model import BETA, CURVATURE, build_model, is_finite, linearise
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, find_next_cell, read_fast_row
-from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 from .update import FIRST_VARIANCE, compute_excess, correct_fast, is_healthy
 
 
@@ -74,7 +76,7 @@ def _fill(vector: Vector, value: Scalar) -> None:
 
 
 @noinline
-def _reset_filter(f: FilterRecord, first: int) -> None:
+def _reset_filter(f: FilterMemory, first: int) -> None:
     """Reset a filter to its start, before the fast row of the tick `first`."""
     f.start, f.tick, f.has_started, f.at = first, first - 1, 0, 0
     f.cell, f.missing_cell, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
@@ -85,8 +87,8 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
         _fill(vector, 0.0)
     _fill(f.eps, 0.0)
     copy_into(f.first, f.x)
-    for i in range(len(f.share)):
-        _fill(f.share[i], 0.0)
+    for i in range(len(f.tick_gains)):
+        _fill(f.tick_gains[i], 0.0)
     for i in range(len(f.P)):
         _fill(f.P[i], 0.0)
     for i in range(len(f.prior)):
@@ -124,7 +126,7 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
 
 
 @jit
-def run_tick(f: FilterRecord, gains: GainTables) -> None:
+def run_tick(f: FilterMemory, gains: GainTables) -> None:
     """Step from the last tick to this one, whose fast row was read."""
     f.tick += 1
     if f.stride > 1:
@@ -147,7 +149,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
     else:  # the first step has nothing to predict from
         f.has_started = 1
         f.at = ((f.tick - f.origin) // f.stride) % f.cycle
-        f.x[0] += f.speed_share * f.speed
+        f.x[0] += f.velocity * f.speed
     slot = f.tick % WINDOW
     f.past_road_turn[slot] = f.road_turn
     for i in range(f.stored):
@@ -163,16 +165,15 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 
 @jit
-def _read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
-    """Read P[i, j], i <= j; with periodic gains that of the settled cycle."""
-    if f.periodic == 1:
-        row = 1 + f.at * maximum(f.fasts, 1)  # that of this step
-        return gains[f.cell, row, f.total + i * f.n - i * (i - 1) // 2 + j - i]
-    return f.P[i, j]
+def _read_covariance(f: FilterMemory, gains: GainTables, i: int, j: int) -> Scalar:
+    """Read P[i, j], i <= j; with tables of gains that of the settled cycle."""
+    if has_covariance(f):
+        return f.P[i, j]
+    return gains[f.cell, locate_step_row(f), f.total + i * f.n - i * (i - 1) // 2 + j - i]
 
 
 @jit
-def _compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
+def _compute_deviation(f: FilterMemory, gains: GainTables, i: int) -> Scalar:
     """Compute a state's present standard deviation; of a lost filter, larger by its surprise."""
     growth = maximum(compute_excess(f), 1.0)
     return sqrt(maximum(_read_covariance(f, gains, i, i), 0.0) * growth)
@@ -180,7 +181,7 @@ def _compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
 
 @jit
 def _update_second_layer(
-    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
+    first: FilterMemory, second: FilterMemory, gains: GainTables, packet: Vector
 ) -> None:
     """Correct the second layer by a packet as a velocity: double-layer-gps (8)-(9)."""
     # v_x = V cos(beta), v_y = V sin(beta), with beta as it was predicted for the captured tick;
@@ -207,7 +208,7 @@ def _update_second_layer(
 
 @jit
 def _take_packet(
-    layers: FilterRecords, gains: GainTables, packets: Matrix, position: int, nis: Vector
+    layers: FilterLayers, gains: GainTables, packets: Matrix, position: int, nis: Vector
 ) -> None:
     """Process a packet by all layers, and write its NIS."""
     was_used = process_packet(layers[0], gains, packets[position])
@@ -218,7 +219,7 @@ def _take_packet(
 
 
 @jit
-def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: Matrix) -> None:
+def _write_row(layers: FilterLayers, gains: GainTables, j: int, X: Matrix, S: Matrix) -> None:
     """Write states and deviations of all layers in row j of X and S."""
     column = 0
     for layer in range(len(layers)):
@@ -230,7 +231,7 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: M
 
 
 @jit
-def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
+def write_estimate(layers: FilterLayers, gains: GainTables, x: Vector, P: Matrix) -> bool:
     """Write the states of all layers and their covariance; False where gains for P are missing.
 
     Args:
@@ -256,7 +257,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matri
 
 @noinline
 def advance(
-    layers: FilterRecords, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
+    layers: FilterLayers, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
 ) -> int:
     """Process a record's rows from `start` on and its packets; return rows done, to go on there.
 
@@ -272,7 +273,7 @@ def advance(
     f = layers[0]
     position, end_tick = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
-        if f.periodic == 1:
+        if not has_covariance(f):
             cell = find_next_cell(f, fast[j])
             if gains[cell, 0, 0] == 0.0:
                 f.missing_cell, f.cursor = cell, position
@@ -293,7 +294,7 @@ def advance(
 
 
 @jit
-def reset_filters(layers: FilterRecords, first: int) -> None:
+def reset_filters(layers: FilterLayers, first: int) -> None:
     """Reset all layers of an estimator."""
     for i in range(len(layers)):
         _reset_filter(layers[i], first)
@@ -307,7 +308,7 @@ def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
 
 @jit
 def _compute_nees(
-    f: FilterRecord, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
+    f: FilterMemory, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
 ) -> Scalar:
     """Compute e' P_e^-1 e / len(e) of the states i (beta) and j (gamma; -1: none), or 0."""
     if i >= 0 and j >= 0:

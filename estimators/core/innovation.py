@@ -11,14 +11,14 @@ from ...envs.numerics.primitives import Scalar, Vector, minimum, sqrt
 from ...envs.record import PACKET
 from .covariance import dot, project_row
 from .late_samples import inflate_covariance
+from .memory import N_SLOW, FilterMemory
 from .model import compute_row_variance
-from .record import N_SLOW, FilterRecord
 
 MAX_SURPRISE = 50.0  # squared innovation over its variance, of which more says no more
 
 
 @jit
-def note_surprise(f: FilterRecord, kind: int, surprise: Scalar, weight: Scalar) -> None:
+def note_surprise(f: FilterMemory, kind: int, surprise: Scalar, weight: Scalar) -> None:
     """Note how large an innovation was.
 
     Args:
@@ -34,7 +34,7 @@ _AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agre
 
 
 @jit
-def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
+def interpolate_hdop(f: FilterMemory, s: int, packet: Vector) -> Scalar:
     """Interpolate the factor on deviations at a packet's HDOP; 1 without a table or an HDOP."""
     if f.knots == 0 or f.hdop_column[s] == 0:
         return 1.0
@@ -51,7 +51,7 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
 
 
 @jit
-def compute_sample_variance(f: FilterRecord, s: int, i: int) -> Scalar:
+def compute_sample_variance(f: FilterMemory, s: int, i: int) -> Scalar:
     """Compute the variance of a row of the packet in f.sample."""
     factor, variance = interpolate_hdop(f, s, f.sample), f.r[s, i]
     captured = int(f.sample[PACKET.captured])
@@ -62,7 +62,7 @@ def compute_sample_variance(f: FilterRecord, s: int, i: int) -> Scalar:
 
 
 @jit
-def _test_innovation(f: FilterRecord, s: int, target: int) -> bool:
+def _test_innovation(f: FilterMemory, s: int, target: int) -> bool:
     """Compute f.nis = residual^T S^-1 residual (f.residual); return whether it passes the gate."""
     p, S, nis = f.rows[s], f.S, 0.0
     for i in range(p):  # C P C^T + R, its lower half
@@ -88,7 +88,7 @@ def _test_innovation(f: FilterRecord, s: int, target: int) -> bool:
 
 
 @jit
-def _is_consistent(f: FilterRecord, s: int) -> bool:
+def _is_consistent(f: FilterMemory, s: int) -> bool:
     """Return whether every residual is within `_AGREEMENT_SD` deviations of the last gated one."""
     for i in range(f.rows[s]):
         difference, row_variance = f.residual[i] - f.rejected_residual[s, i], 0.0
@@ -103,7 +103,7 @@ def _is_consistent(f: FilterRecord, s: int) -> bool:
 
 
 @jit
-def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
+def _is_observed_elsewhere(f: FilterMemory, s: int, state: int) -> bool:
     """Return whether another sensor of a state was accepted since s was first gated."""
     for other in range(N_SLOW):
         if other != s and f.rows[other] > 0 and f.last_accepted[other] >= f.first_rejected[s]:
@@ -114,7 +114,7 @@ def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
 
 
 @jit
-def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
+def _reset_sensor_states(f: FilterMemory, s: int) -> bool:
     """Forget what only sensor s measures, of each row the last dense state; False without one."""
     has_reset = False
     for i in range(f.rows[s]):
@@ -129,7 +129,7 @@ def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
 
 
 @jit
-def check_sample(f: FilterRecord, s: int, target: int) -> bool:
+def check_sample(f: FilterMemory, s: int, target: int) -> bool:
     """Return whether to use f.sample: it passes the gate, or the filter starts anew with it."""
     passed = _test_innovation(f, s, target)
     if f.recovery_count == 0:

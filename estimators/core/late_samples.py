@@ -9,9 +9,16 @@ from typing import NamedTuple
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.primitives import Scalar, Vector, maximum
 from ...envs.record import PACKET
-from .covariance import apply_transition, correct_scalar, dot, predict_measurement, project
+from .covariance import (
+    apply_transition,
+    correct_scalar,
+    dot,
+    has_covariance,
+    predict_measurement,
+    project,
+)
+from .memory import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterMemory
 from .model import PSI, compute_row_variance
-from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 
 # what a sample measures, where it is no clone (its place, positive)
 DIRECT = -1  # the states as they are
@@ -61,7 +68,7 @@ def get_direct() -> int:
 
 
 @jit
-def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
+def _clone_states(f: FilterMemory, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
     for i in range(f.rows[s]):
@@ -69,7 +76,7 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
         row = f.C[s, i]
         f.x[clone] = predict_measurement(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
-        if f.periodic == 0:
+        if has_covariance(f):
             variance = project(f, row)
             for j in range(f.total):
                 f.P[clone, j] = f.PC[j]
@@ -78,7 +85,7 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
 
 
 @jit
-def _update_covariance(f: FilterRecord, s: int) -> None:
+def _update_covariance(f: FilterMemory, s: int) -> None:
     """Update the covariance at the capture by Larsen's rule; the states follow at the arrival."""
     for i in range(f.rows[s]):
         row = f.C[s, i]
@@ -92,7 +99,7 @@ def _update_covariance(f: FilterRecord, s: int) -> None:
 
 
 @jit
-def _correct_larsen_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
+def _correct_larsen_gain(f: FilterMemory, s: int, i: int, row: Vector) -> None:
     """Correct Larsen's M_k K_s of row i for a measurement `row` (n,) with the gain f.gain."""
     projected = dot(row, f.larsen_gain[s, i], f.n)
     for k in range(f.n):
@@ -100,7 +107,7 @@ def _correct_larsen_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
 
 
 @jit
-def store_due_captures(f: FilterRecord, last: int) -> None:
+def store_due_captures(f: FilterMemory, last: int) -> None:
     """Store what the sensors that captured at this tick measured, and advance their clocks."""
     for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
@@ -117,7 +124,7 @@ def store_due_captures(f: FilterRecord, last: int) -> None:
 
 
 @inline
-def predict_late(f: FilterRecord) -> None:
+def predict_late(f: FilterMemory) -> None:
     """Predict Larsen's M_k K_s of every sample under way by a step."""
     if f.delay_rule == LARSEN:
         for s in range(N_SLOW):
@@ -127,7 +134,7 @@ def predict_late(f: FilterRecord) -> None:
 
 
 @inline
-def correct_late(f: FilterRecord, row: Vector) -> None:
+def correct_late(f: FilterMemory, row: Vector) -> None:
     """Correct Larsen's M_k K_s of every sample under way for a measurement."""
     if f.delay_rule == LARSEN:
         for s in range(N_SLOW):
@@ -137,7 +144,7 @@ def correct_late(f: FilterRecord, row: Vector) -> None:
 
 
 @jit
-def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
+def is_duplicate(f: FilterMemory, s: int, captured: int) -> bool:
     """Return whether a sample of a sensor on its clock must not be used; then it is counted."""
     frame = (captured - f.phase[s]) // f.period[s]
     last_stamp = f.known_stamps[s, frame % N_STAMPS]
@@ -153,7 +160,7 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
 
 
 @jit
-def find_target(f: FilterRecord, s: int, captured: int) -> int:
+def find_target(f: FilterMemory, s: int, captured: int) -> int:
     """Find what an arrived sample measures: its first clone, or a code; it counts as taken"""
     if is_duplicate(f, s, captured):
         return DROPPED
@@ -173,7 +180,7 @@ def find_target(f: FilterRecord, s: int, captured: int) -> int:
 
 
 @jit
-def predict_sample(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
+def predict_sample(f: FilterMemory, s: int, i: int, target: int) -> Scalar:
     """Predict row i of the sample in f.sample."""
     if target == WEIGHED:
         return f.larsen_expected[s, i]
@@ -189,7 +196,7 @@ def predict_sample(f: FilterRecord, s: int, i: int, target: int) -> Scalar:
 
 
 @jit
-def turn_heading(f: FilterRecord, s: int, turn: float) -> None:
+def turn_heading(f: FilterMemory, s: int, turn: float) -> None:
     """Turn the heading, the first row of sensor s, now and in what is stored of it."""
     f.x[PSI] += turn
     f.expected[0] += turn
@@ -202,7 +209,7 @@ def turn_heading(f: FilterRecord, s: int, turn: float) -> None:
 
 
 @jit
-def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
+def inflate_covariance(f: FilterMemory, state: int, variance: Scalar) -> None:
     """Add a variance to a state's, now and in what is stored of it."""
     v = f.PC
     for i in range(f.total):

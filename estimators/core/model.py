@@ -13,9 +13,8 @@ from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
 from ...envs.vehicle.linear import write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply
-from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
+from .memory import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterMemory
 
-FIXED, LATERAL, VELOCITY = range(3)  # kinds: what makes A and B anew: nothing, speed, yaw rate
 BETA, GAMMA, PSI, Y_L = range(4)  # places of a bicycle's states
 CURVATURE = 2  # place of the road's curvature among a bicycle's inputs; others have no third
 MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
@@ -26,7 +25,7 @@ _MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its
 
 
 @jit
-def _build_lateral(f: FilterRecord, V: Scalar) -> None:
+def _build_lateral(f: FilterMemory, V: Scalar) -> None:
     """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B, first = f.A, f.B, N_INPUTS - f.dense  # state j pushes by column first + j of B
     if f.model_speed > 0.0:
@@ -50,7 +49,7 @@ def _is_steering_felt(V: Scalar) -> Scalar:
 
 
 @jit
-def _write_body(f: FilterRecord, V: Scalar) -> None:
+def _write_body(f: FilterMemory, V: Scalar) -> None:
     """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
     A, B, i = f.A, f.B, f.phi_state
     # phi'' enters F_y, hence phi'' itself: with S = M_s h_s all divides by 1 - S^2 / (M I_x)
@@ -68,7 +67,7 @@ def _write_body(f: FilterRecord, V: Scalar) -> None:
 
 
 @jit
-def _write_accel(f: FilterRecord, V: Scalar) -> None:
+def _write_accel(f: FilterMemory, V: Scalar) -> None:
     """Write the specific force a_y = V (beta' + gamma) + g phi, with feed-through of steering."""
     row, first = f.C_fast[f.accel_row], N_INPUTS - f.dense
     for j in range(f.dense):
@@ -81,7 +80,7 @@ def _write_accel(f: FilterRecord, V: Scalar) -> None:
 
 
 @jit
-def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> tuple[Scalar, ...]:
+def _compute_rates(f: FilterMemory, V: Scalar, front: Scalar, rear: Scalar) -> tuple[Scalar, ...]:
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
@@ -90,7 +89,7 @@ def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> t
 
 
 @jit
-def _write_tyres(f: FilterRecord, V: Scalar) -> None:
+def _write_tyres(f: FilterMemory, V: Scalar) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
     B, push, phi_rate = f.B, f.push, f.phi_state + 1
     for j in range(f.tyre_states):
@@ -130,7 +129,7 @@ def _compute_axle_force(
 
 
 @jit
-def linearise(f: FilterRecord, steer: Scalar) -> None:
+def linearise(f: FilterMemory, steer: Scalar) -> None:
     """Expand both axles' forces at the present state, and set the process noise that follows it."""
     x, V, tyre = f.x, maximum(f.model_speed, MIN_SPEED), f.tyre
     if _is_steering_felt(V):
@@ -166,7 +165,7 @@ def linearise(f: FilterRecord, steer: Scalar) -> None:
 
 
 @jit
-def build_tyres(f: FilterRecord, steer: Scalar) -> None:
+def build_tyres(f: FilterMemory, steer: Scalar) -> None:
     """Build the model of estimated tyres at the present state."""
     linearise(f, steer)
     f.felt[f.accel_scale_state] = 0.0
@@ -180,7 +179,7 @@ def build_tyres(f: FilterRecord, steer: Scalar) -> None:
 
 
 @jit
-def discretise(f: FilterRecord) -> None:
+def discretise(f: FilterMemory) -> None:
     """Compute f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
     Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
@@ -238,19 +237,19 @@ def discretise(f: FilterRecord) -> None:
 
 
 @jit
-def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
+def compute_row_variance(f: FilterMemory, s: int, i: int, V: Scalar) -> Scalar:
     """Compute the variance of a slow sensor's row at a speed."""
     scaled = f.noise_over_speed[s, i]
     return scaled / (V * V) if scaled > 0.0 else f.r[s, i]
 
 
 @noinline
-def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
+def build_model(f: FilterMemory, speed: Scalar, turning: Scalar) -> None:
     """Build the model at a speed, and the noise that grows with 1/V."""
     V = maximum(speed, MIN_SPEED)
-    if f.kind == LATERAL:
+    if f.planar > 0:
         _build_lateral(f, V)
-    elif f.kind == VELOCITY:  # v_x, v_y: double-layer-gps (4)-(5)
+    elif f.velocity > 0.0:  # v_x, v_y: double-layer-gps (4)-(5)
         f.A[0, 1], f.A[1, 0] = turning, -turning
     f.model_speed, f.turning = V, turning
     discretise(f)

@@ -11,16 +11,16 @@ from ...envs.numerics.jit import copy_into, jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
 from .late_samples import BUFFER, DROPPED, find_target, get_direct, is_duplicate
+from .memory import COUNTERS, N_SNAPSHOTS, SNAPSHOT_INTERVAL, WINDOW, FilterMemory, GainTables
 from .model import MIN_SPEED, build_model, compute_row_variance, is_finite
 from .predict import advance_state
-from .record import COUNTERS, N_SNAPSHOTS, SNAPSHOT_INTERVAL, WINDOW, FilterRecord, GainTables
 from .update import correct_fast, update_filter
 
 _NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 
 @jit
-def _find_slot(f: FilterRecord, tick: int) -> int:
+def _find_slot(f: FilterMemory, tick: int) -> int:
     """Find the snapshot after the fast row of a tick, before its samples."""
     return int((tick - f.start) // SNAPSHOT_INTERVAL % N_SNAPSHOTS)
 
@@ -35,7 +35,7 @@ def _copy_moments(n: int, x: Vector, P: Matrix, to_x: Vector, to_P: Matrix) -> N
 
 
 @jit
-def store_history(f: FilterRecord) -> None:
+def store_history(f: FilterMemory) -> None:
     """Store the inputs, fast measurements and model of the present tick; "buffer" alone."""
     if f.delay_rule != BUFFER:
         return
@@ -49,7 +49,7 @@ def store_history(f: FilterRecord) -> None:
 
 
 @jit
-def _restore_history(f: FilterRecord, tick: int) -> None:
+def _restore_history(f: FilterMemory, tick: int) -> None:
     """Restore inputs, fast measurements and model of a tick."""
     slot = tick % WINDOW
     copy_into(f.past_u[slot], f.u)
@@ -61,7 +61,7 @@ def _restore_history(f: FilterRecord, tick: int) -> None:
 
 
 @jit
-def _has_sample(f: FilterRecord, s: int, captured: int) -> bool:
+def _has_sample(f: FilterMemory, s: int, captured: int) -> bool:
     """Return whether a sensor's sample of a captured tick is stored already."""
     for i in range(len(f.recent)):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
@@ -70,7 +70,7 @@ def _has_sample(f: FilterRecord, s: int, captured: int) -> bool:
 
 
 @jit
-def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new: bool) -> bool:
+def _apply_stored(f: FilterMemory, gains: GainTables, s: int, place: int, is_new: bool) -> bool:
     """Use a stored sample; False if it is new and the gate refuses it, now and for ever."""
     for i in range(f.rows[s]):  # noise that does not follow the speed can come with the packet
         f.r[s, i] = f.recent_r[place, i]
@@ -84,7 +84,7 @@ def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new
 
 @jit
 def _apply_tick_samples(
-    f: FilterRecord, gains: GainTables, tick: int, count: int, new_place: int
+    f: FilterMemory, gains: GainTables, tick: int, count: int, new_place: int
 ) -> bool:
     """Use the samples captured at a tick, one sensor after the other; False as `_apply_stored`."""
     for s in range(len(f.period)):
@@ -97,7 +97,7 @@ def _apply_tick_samples(
 
 
 @jit
-def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
+def _replay_window(f: FilterMemory, gains: GainTables, first: int, new_place: int) -> bool:
     """Filter anew from `first` to now with a new sample; False, undone, if the gate refuses it."""
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], 0
     for i in range(len(f.recent)):
@@ -129,7 +129,7 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
 
 
 @noinline
-def _rewind_update(f: FilterRecord, gains: GainTables, s: int) -> bool:
+def _rewind_update(f: FilterMemory, gains: GainTables, s: int) -> bool:
     """Correct by f.sample, of any age within the window; return whether it was used."""
     captured = int(f.sample[PACKET.captured])
     first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
@@ -153,7 +153,7 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int) -> bool:
 
 
 @jit
-def _apply_sample(f: FilterRecord, gains: GainTables, s: int) -> bool:
+def _apply_sample(f: FilterMemory, gains: GainTables, s: int) -> bool:
     """Correct by f.sample, a sound packet, according to its age; return whether it was used."""
     if f.delay_rule == BUFFER:
         return _rewind_update(f, gains, s)
@@ -168,7 +168,7 @@ def _is_whole(value: Scalar) -> Scalar:
 
 
 @jit
-def _is_timely(f: FilterRecord, captured: Scalar, arrived: Scalar) -> bool:
+def _is_timely(f: FilterMemory, captured: Scalar, arrived: Scalar) -> bool:
     """Return whether stamps are ticks from the first row to now, in order; else count them."""
     if not (_is_whole(captured) and _is_whole(arrived)) or arrived < captured:
         f.counts[COUNTERS.unknown] += 1
@@ -182,7 +182,7 @@ def _is_timely(f: FilterRecord, captured: Scalar, arrived: Scalar) -> bool:
 
 
 @jit
-def _is_frozen(f: FilterRecord, s: int) -> bool:
+def _is_frozen(f: FilterMemory, s: int) -> bool:
     """Return whether f.sample, of two values or more, repeats the sensor's last while it moves."""
     packet, last = f.sample, f.last[s]
     if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
@@ -198,7 +198,7 @@ def _is_frozen(f: FilterRecord, s: int) -> bool:
 
 
 @jit
-def _is_valid(f: FilterRecord) -> bool:
+def _is_valid(f: FilterMemory) -> bool:
     """Return whether f.sample is for this filter and fit for use; what is not is counted."""
     packet = f.sample
     for i in range(PACKET.value):
@@ -229,7 +229,7 @@ def _is_valid(f: FilterRecord) -> bool:
 
 
 @jit
-def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
+def _store_waiting(f: FilterMemory, s: int, packet: Vector) -> bool:
     """Queue a packet for the next step that listens; False if it is refused, and counted."""
     if is_duplicate(f, s, int(packet[PACKET.captured])):
         return False
@@ -247,7 +247,7 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 
 @noinline
-def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
+def process_packet(f: FilterMemory, gains: GainTables, packet: Vector) -> bool:
     """Use a packet that has arrived or queue it for the next step; False: dropped and counted."""
     copy_into(packet, f.sample)
     f.nis = np.nan
@@ -260,7 +260,7 @@ def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
 
 
 @jit
-def apply_waiting(f: FilterRecord, gains: GainTables) -> None:
+def apply_waiting(f: FilterMemory, gains: GainTables) -> None:
     """Correct by the packets that came since the last step that listened."""
     for i in range(f.waits):
         copy_into(f.waiting[i], f.sample)

@@ -6,12 +6,12 @@ from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load8, load_element, store8, vector_width
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.record import FAST
-from .covariance import apply_transition, predict_covariance
+from .covariance import apply_transition, has_covariance, predict_covariance
 from .innovation import MAX_SURPRISE, note_surprise
-from .intersample import PSEUDO
+from .intersample import has_pseudo_residuals
 from .late_samples import predict_late
-from .model import BETA, MIN_SPEED, SPEED_TOLERANCE, VELOCITY, build_model, build_tyres, is_finite
-from .record import COUNTERS, N_SLOW, FilterRecord
+from .memory import COUNTERS, N_SLOW, FilterMemory
+from .model import BETA, MIN_SPEED, SPEED_TOLERANCE, build_model, build_tyres, is_finite
 
 _MAX_STEER = 1.0  # rad: no wheels turn further, an angle in degrees soon reads more
 
@@ -37,7 +37,7 @@ def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
 
 
 @jit
-def _filter_speed(f: FilterRecord, fast_row: Vector) -> Scalar:
+def _filter_speed(f: FilterMemory, fast_row: Vector) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds (m/s); a bad sample is skipped."""
     sample = 0.5 * (fast_row[FAST.wheel_left] + fast_row[FAST.wheel_right])
     if not is_finite(sample):
@@ -48,7 +48,7 @@ def _filter_speed(f: FilterRecord, fast_row: Vector) -> Scalar:
 
 
 @jit
-def _find_cell(f: FilterRecord, speed: float) -> int:
+def _find_cell(f: FilterMemory, speed: float) -> int:
     """Find the table of gains nearest to a speed (m/s)."""
     if f.spacing == 0.0:
         return 0
@@ -57,14 +57,14 @@ def _find_cell(f: FilterRecord, speed: float) -> int:
 
 
 @jit
-def find_next_cell(f: FilterRecord, fast_row: Vector) -> Scalar:
+def find_next_cell(f: FilterMemory, fast_row: Vector) -> Scalar:
     """Find the index of the table of gains that the next row will use."""
     speed = _filter_speed(f, fast_row)
     return _find_cell(f, speed) if is_speed_changed(speed, f.model_speed) else f.cell
 
 
 @jit
-def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
+def read_fast_row(f: FilterMemory, fast_row: Vector) -> None:
     """Read a fast row: inputs (the last finite ones), measurements, speed, perhaps a new model."""
     is_sound = True
     for i in range(f.inputs):
@@ -86,8 +86,8 @@ def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
     for i in range(f.fasts):
         f.y[i] = compute_signal(fast_row, f.y_column[i], f.y_factor[i])
     turning, f.speed_before = f.turning, f.model_speed
-    if f.kind == VELOCITY and is_finite(fast_row[FAST.gyro]):
-        turning = fast_row[FAST.gyro]
+    if is_finite(fast_row[FAST.gyro]):
+        turning = f.velocity * fast_row[FAST.gyro]
     is_outdated, speed = turning != f.turning, f.model_speed
     f.speed = _filter_speed(f, fast_row)
     if is_speed_changed(f.speed, f.model_speed):
@@ -98,7 +98,7 @@ def read_fast_row(f: FilterRecord, fast_row: Vector) -> None:
 
 
 @jit
-def propagate(f: FilterRecord, u: Vector) -> None:
+def propagate(f: FilterMemory, u: Vector) -> None:
     """Predict x <- F x + H u + drift and, without tables, P; of a block of lanes, too."""
     step = vector_width(f.P)
     apply_transition(f, f.x)
@@ -107,12 +107,12 @@ def propagate(f: FilterRecord, u: Vector) -> None:
         for k in range(f.inputs):
             total = total + load_element(u, k) * load8(f.HT, k, j)
         store8(f.x, total + load8(f.drift, j), j)
-    if f.periodic == 0:
+    if has_covariance(f):
         predict_covariance(f)
 
 
 @jit
-def _scale_beta(f: FilterRecord) -> None:
+def _scale_beta(f: FilterMemory) -> None:
     """Scale beta = v_y / V to the model's new speed V, since v_y is what stays."""
     f.x[BETA] *= f.beta_scale
     f.e[BETA] *= f.beta_scale
@@ -126,20 +126,20 @@ def _scale_beta(f: FilterRecord) -> None:
 
 
 @noinline
-def advance_state(f: FilterRecord, u: Vector) -> None:
+def advance_state(f: FilterMemory, u: Vector) -> None:
     """Predict by the present model, and what else is carried along."""
     if f.beta_scale != 1.0:
         _scale_beta(f)
     if f.tyre_states > 0 and f.tick % f.linearise_every == 0:
         build_tyres(f, u[0])
     propagate(f, u)
-    if f.intersample_rule == PSEUDO:
+    if has_pseudo_residuals(f):
         apply_transition(f, f.e)
     predict_late(f)
 
 
 @jit
-def compute_residual(f: FilterRecord, i: int) -> Scalar:
+def compute_residual(f: FilterMemory, i: int) -> Scalar:
     """Compute the residual of a fast measurement; of a block of lanes, too."""
     residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):

@@ -1,4 +1,4 @@
-"""From a filter's config to its compiled memory, one record a layer, and its schedules."""
+"""From a filter's config to its compiled memory, one entry a layer, and its schedules."""
 
 import math
 from collections.abc import Mapping
@@ -11,10 +11,9 @@ from ...envs.sensors.slow import SLOW, SLOW_NAMES
 from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import late_samples as rule
-from ..core import record as size
-from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.model import MIN_SPEED, VELOCITY, Y_L
-from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
+from ..core import memory as size
+from ..core.memory import FILTER, GAIN, CarIndex, FilterLayers, FilterMemory
+from ..core.model import MIN_SPEED, Y_L
 from .gains import kalman_gain
 from .options import LATE, MEASUREMENTS, SCALE, TYRES, WANDER, FilterConfig, FilterModel
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
@@ -27,7 +26,7 @@ def _refuse(label: str, *checks: tuple[object, str]) -> None:
             raise ValueError(f"{label}: {message}")
 
 
-def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
+def _allocate_clones(f: FilterMemory, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     delay = config.delay
     f.delay_rule = rule.IGNORE if delay in ("literal", "lag") else [*rule.RULES].index(delay)
@@ -54,7 +53,7 @@ def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     _refuse(config.name, (is_twice, twice), (f.total > size.N_TOTAL, text))
 
 
-def _check_window(f: FilterRecord, config: FilterConfig) -> None:
+def _check_window(f: FilterMemory, config: FilterConfig) -> None:
     """Check that the window holds the longest delay and that rules go together; else ValueError."""
     dt, sensors, is_buffer = float(f.step / f.stride), config.sensors, f.delay_rule == rule.BUFFER
     window = size.WINDOW - size.SNAPSHOT_INTERVAL if is_buffer else size.WINDOW - 1
@@ -101,7 +100,7 @@ _SPACING = 0.5  # m/s between two tables of gains
 
 def assemble(
     config: FilterConfig, vehicle: Vehicle, dt: float, speed: float | None
-) -> tuple[FilterRecords, tuple[Schedule, ...]]:
+) -> tuple[FilterLayers, tuple[Schedule, ...]]:
     """Assemble a filter's memory, shape (layers,), and the schedules of its first slow sensor.
 
     ValueError says that a schedule does not fit ticks, that a sensor can be later than the filter's
@@ -134,7 +133,7 @@ def assemble(
     return layers, planned
 
 
-def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
+def _write_clocks(f: FilterMemory, config: FilterConfig, dt: float) -> None:
     """Write periods, the filter's own step, and by how much late states follow in it."""
     for name, sensor in config.sensors.items():
         label = f"{config.name}: the {name}'s period"
@@ -148,7 +147,7 @@ def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
         f.relax = 1.0 - math.exp(-dt / max(delay, dt))
 
 
-def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
+def _write_trust(f: FilterMemory, config: FilterConfig) -> None:
     """Write what is known of a sample's noise, and which ones are skipped."""
     f.least_satellites, f.r_scale_weight, f.robust = config.satellites, config.adapt, config.robust
     f.steer_jump, f.map_lag = config.steer_rate * f.step, config.map_lag_sd
@@ -168,16 +167,16 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
 
 
 def _write_model(
-    f: FilterRecord, model: FilterModel, vehicle: Vehicle, config: FilterConfig, Q: Array
+    f: FilterMemory, model: FilterModel, vehicle: Vehicle, config: FilterConfig, Q: Array
 ) -> None:
     """Write the model and its measurements; Q (n, n): a step's process noise besides forces'."""
     names, dense = model.names, len(model.states) + len(model.late)
     n = len(names)
-    f.kind, f.n, f.total, f.dense, f.delayed = model.kind, n, n, dense, len(model.late)
+    f.n, f.total, f.dense, f.delayed = n, n, dense, len(model.late)
     f.first_bias = n - len(model.biases)
     for state in ("bank", "phi", "steer_offset", "map_heading", SCALE):
         f[f"{state}_state"] = names.index(state) if state in names else size.SPARE
-    f.offset_share, f.speed_share = "steer_offset" in names, "v_x" in names
+    f.offset_share, f.velocity = "steer_offset" in names, "v_x" in names
     f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
     f.Q[:n, :n], f.decay[:] = Q, 1.0
     _write_constants(f, model, vehicle)
@@ -197,13 +196,14 @@ def _write_model(
     _write_rows(f, model, config)
 
 
-def _write_constants(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
+def _write_constants(f: FilterMemory, model: FilterModel, vehicle: Vehicle) -> None:
     """Write the entries of A and B that `build_model` leaves, and what it makes the others of."""
     names, inertia, phi, behind = model.names, vehicle.yaw_inertia, int(f.phi_state), size.N_INPUTS
     body, rolls = make_roll_model(vehicle), "phi" in names
     for j, (_, pushed) in enumerate(model.disturbances):
         f.B[names.index(pushed), behind + j] = 1.0
-    f.planar, f.preview = len(model.states) - 2 * rolls, vehicle.preview
+    f.planar = len(model.states) - 2 * rolls if "beta" in names else 0
+    f.preview = vehicle.preview
     f.push_rate, f.push_force = f.B[0, behind], model.forces
     f.roll_stiffness, f.roll_damping = -body.A[1, 0], -body.A[1, 1]
     f.roll_arm, f.sway = rolls * body.B[1, 0], rolls * vehicle.roll_moment_arm / vehicle.mass
@@ -218,7 +218,7 @@ def _write_constants(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> N
         f.B[0, behind : behind + 2] = np.array([vehicle.front_arm, -vehicle.rear_arm]) / inertia
 
 
-def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
+def _write_tyres(f: FilterMemory, model: FilterModel, vehicle: Vehicle) -> None:
     """Write where the tyres' states stand and start: at the nominal ones."""
     names = model.names
     f.curved_state = Y_L if {TYRES[0], "map_heading"} <= {*names} else size.SPARE
@@ -246,7 +246,7 @@ def _make_signals(vehicle: Vehicle) -> dict[str, tuple[tuple[int, float], tuple[
 
 
 def _write_signals(
-    f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
+    f: FilterMemory, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
 ) -> None:
     """Write inputs and fast measurements; `build_model` writes rows that depend on speed."""
     table, names = _make_signals(vehicle), model.names
@@ -269,7 +269,7 @@ def _write_signals(
         f.C_fast[1, 1] = f.C_fast[1, 2] = 1.0 / vehicle.mass
 
 
-def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> None:
+def _write_rows(f: FilterMemory, model: FilterModel, config: FilterConfig) -> None:
     """Write what the used slow sensors measure."""
     used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
     f.first_slow = used[0] if used else -1
@@ -295,7 +295,7 @@ def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> No
             f.r_speed = f.r[s, 0]
 
 
-def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
+def _make_schedules(f: FilterMemory, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
     """Make the schedules of the first slow sensor: one, or two extremes for random delays."""
     if not config.sensors:
         return (NO_SENSOR,)
@@ -321,19 +321,14 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
     return (longest,) if shortest == longest else (shortest, longest)
 
 
-def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
+def _write_rules(f: FilterMemory, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
     """Write the codes that choose what compiled code does; ValueError for a contradiction."""
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
-    pseudo = config.intersample == "pseudo-residual"
-    shared = config.row.family == "dual-rate"
-    f.intersample_rule = PSEUDO if pseudo else DUAL_RATE if shared else NONE
-    f.periodic = _is_periodic(f, config, len(planned) > 1)
-    f.placed = f.fasts if config.row.gains == "placed" else 0
-    f.joint = f.placed > 0 or (pseudo and f.periodic)
+    f.gain_rule = _choose_gain_rule(f, config, len(planned) > 1)
     f.stored = f.n if f.delay_rule in (rule.STORED, rule.CONSTANT) or config.row.second else 0
-    if f.measured and f.periodic:
+    if f.measured and f.gain_rule > GAIN.split:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
-    if pseudo:
+    if f.gain_rule == GAIN.split:
         C = build_measurement_rows(f)
         zero = np.zeros((len(C), len(C)))
         f.inverse[: len(C), : f.total] = kalman_gain(np.eye(f.total), C, zero).T
@@ -342,7 +337,7 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
         f"correction between samples; got gate={config.gate}, adapt={config.adapt}, "
         f"latency={dict(config.latency)}, delay={config.delay!r}"
     )
-    is_refused = (f.periodic or f.intersample_rule) and _is_covariance_needed(config)
+    is_refused = f.gain_rule != GAIN.covariance and _is_covariance_needed(config)
     cannot_adapt = config.adapt > 0.0 and config.delay in ("larsen", "buffer")
     needed = f"adapt needs delay='clone', got delay={config.delay!r}"
     _refuse(config.name, (is_refused, text), (cannot_adapt, needed))
@@ -353,20 +348,23 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
     return uses_innovation or config.delay in ("larsen", "buffer")
 
 
-def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
-    """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
-    if f.intersample_rule == DUAL_RATE or config.row.gains == "placed":
-        return True
+def _choose_gain_rule(f: FilterMemory, config: FilterConfig, random: bool) -> int:
+    """Choose where gains come from; `random`: whether the first sensor's delay is."""
+    if config.row.family == "dual-rate":
+        return GAIN.dual_rate
+    if config.row.gains == "placed":
+        return GAIN.joint
+    pseudo = config.intersample == "pseudo-residual"
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
-    if f.kind == VELOCITY or config.row.second:
+    if f.velocity > 0.0 or config.row.second:
         impossible = "its model changes with the yaw rate"
-    elif f.intersample_rule == PSEUDO:
+    elif pseudo:
         early = f"a sample must arrive before the next one is captured, got {config.sensors}"
         refusal = "no gains='covariance': it has one constant gain"
         is_refused = config.gains == "covariance"
         _refuse(config.name, (is_refused, refusal), (f.frames.max() > 1, early))
-        return True
+        return GAIN.pseudo
     elif any(model.biases for model in config.models):
         impossible = "a constant bias has no settled gain"
     elif is_multi_sensor or (random and not ignores_lag):
@@ -374,6 +372,7 @@ def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     if impossible:
         text = f"no gains='periodic': {impossible}; use gains='covariance'"
         _refuse(config.name, (config.gains == "periodic", text))
-        return False
+        return GAIN.split if pseudo else GAIN.covariance
     default = "covariance" if _is_covariance_needed(config) else config.row.gains
-    return (config.gains or default) == "periodic"
+    is_periodic = (config.gains or default) == "periodic"
+    return GAIN.table if is_periodic else GAIN.covariance

@@ -12,8 +12,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.validation import describe_unknown
 from ..core.late_samples import RULES
-from ..core.model import LATERAL
-from ..core.record import N_KNOTS
+from ..core.memory import N_KNOTS
 from ..filters import FilterDefinition
 from .gains import DUAL_RATE_GAINS, DUAL_RATE_RULES, INVERSES, check_covariance
 from .options import (
@@ -190,7 +189,7 @@ def _make_bicycle_model(sensors: tuple[str, ...], chosen: _Values, rolls: bool) 
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = chosen["disturbances"] == "forces", states + _BODY * rolls
     biases = tuple(chosen["bias_sds"])
-    return FilterModel(LATERAL, states, inputs, chosen["fast"], walking, forces, late, biases)
+    return FilterModel(states, inputs, chosen["fast"], walking, forces, late, biases)
 
 
 def _select_slow_sensors(

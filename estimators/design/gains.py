@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import Array
-from ..core.record import FilterRecord
+from ..core.memory import FilterMemory
 
 Poles = Array | npt.NDArray[np.complex128]
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
@@ -78,7 +78,7 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     return kalman_gain(P if kind in ("p-weighted", "bayes") else np.eye(len(P)), C, noises[kind])
 
 
-def transition_matrix(f: FilterRecord, G: Array) -> Array:
+def transition_matrix(f: FilterMemory, G: Array) -> Array:
     """Compute F (n, n) of a step: G on the dense states, the others decay."""
     n, dense = int(f.n), len(G)
     F = np.zeros((n, n))

@@ -19,7 +19,6 @@ import numpy.typing as npt
 from ...envs.record import FAST, Array
 from ...envs.sensors.link import SlowSensor
 from ..core.late_samples import RULES
-from ..core.model import FIXED, VELOCITY
 from ..filters import FilterDefinition
 from .gains import INVERSES
 
@@ -104,7 +103,6 @@ FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
 class FilterModel:
     """States by name, what drives them and what is measured."""
 
-    kind: int  # code of `core.model`
     states: tuple[str, ...]  # those that follow the model
     inputs: tuple[str, ...] = ("steer", "N_z")  # columns of a fast row, or sums of two
     fast: tuple[str, ...] = ("gyro",)  # likewise, measured in every row
@@ -133,18 +131,17 @@ says what they are. The tyres' count too: factors of stiffness, and the reciproc
 NONLINEAR = (*TYRES, SCALE)
 
 MODELS: dict[str, FilterModel] = {
-    "roll": FilterModel(FIXED, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
-    "kinematic": FilterModel(VELOCITY, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
+    "roll": FilterModel(("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
+    "kinematic": FilterModel(("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
     "velocity-roll": FilterModel(
-        VELOCITY,
         ("v_x", "v_y", "phi", "phi_rate"),
         ("accel_x", "accel_y"),
         ("roll_rate",),
         (("d", "phi_rate"),),
     ),
-    "yaw-moment": FilterModel(FIXED, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
+    "yaw-moment": FilterModel(("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
     "tyre-forces": FilterModel(
-        FIXED, ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
+        ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
     ),
 }
 """Models other than the bicycle's, by name."""

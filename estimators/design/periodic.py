@@ -17,9 +17,8 @@ from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximu
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.covariance import correct_scalar, project_row
 from ..core.filter import NO_OUTPUTS, StepRecord, advance, reset_filters, run_tick
-from ..core.intersample import DUAL_RATE, NONE, PSEUDO
 from ..core.late_samples import CLONE, CONSTANT, DROPPED, IGNORE, STORED, find_target
-from ..core.record import FILTER, WINDOW, FilterRecord, FilterRecords, GainTables
+from ..core.memory import FILTER, GAIN, WINDOW, FilterLayers, FilterMemory, GainTables
 from .gains import SampledSystem, compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
 
@@ -66,7 +65,7 @@ _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is
 
 @jit
 def _iterate_gains(
-    filters: FilterRecords, lags: Vector, cycles: int, tolerance: float, table: Matrix,
+    filters: FilterLayers, lags: Vector, cycles: int, tolerance: float, table: Matrix,
     before: Vector, gains: GainTables,
 ) -> int:  # fmt: skip
     """Run a covariance filter over its schedule until its gains settle; return the cycles used."""
@@ -81,7 +80,8 @@ def _iterate_gains(
             run_tick(f, gains)
             if f.tick % f.pace == 0:
                 for i in range(f.fasts):
-                    change = maximum(change, _copy_gain(f.share[i], table[1 + step * width + i], N))
+                    to = table[1 + step * width + i]
+                    change = maximum(change, _copy_gain(f.tick_gains[i], to, N))
             for frame in range(len(lags)):
                 captured = f.tick - lags[frame]
                 if (captured - frame * f.period[s]) % cycle != 0 or captured < 0:
@@ -116,26 +116,29 @@ def _copy_gain(source: Vector, target: Vector, size: int) -> Scalar:
     return change
 
 
-def _compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
+def _compute_table_shape(f: FilterMemory, schedule: Schedule) -> tuple[int, int]:
     """Compute the shape of a table of gains: rows and columns."""
     p, m = int(f.rows.max()), int(f.fasts)
-    extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.intersample_rule)]
-    rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
+    rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags)
+    if f.gain_rule in (GAIN.split, GAIN.pseudo):
+        rows += 2 * (m + p)
+    elif f.gain_rule == GAIN.dual_rate:
+        rows += schedule.cycle * p
     return rows, int(f.total + f.n * (f.n + 1) // 2)
 
 
-def allocate_gains(f: FilterRecord, schedule: Schedule) -> Array:
+def allocate_gains(f: FilterMemory, schedule: Schedule) -> Array:
     """Allocate zeros for gains (cells of speed, rows, columns); a one where P gives them."""
     cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
     shape = cells, *_compute_table_shape(f, schedule)
-    return np.zeros(shape) if f.periodic else np.ones((1, 1, 1))
+    return np.zeros(shape) if f.gain_rule > GAIN.split else np.ones((1, 1, 1))
 
 
-def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> FilterRecords:
+def _copy_for_schedule(f: FilterMemory, schedule: Schedule, speed: float) -> FilterLayers:
     """Copy a filter (1,) as one that takes steps of a schedule at a held speed, gains from P."""
-    filters: FilterRecords = np.array([f])
+    filters: FilterLayers = np.array([f])
     copy = filters.view(np.recarray)[0]
-    copy.periodic = copy.measured = copy.origin = copy.joint = copy.intersample_rule = 0
+    copy.gain_rule, copy.measured, copy.origin = GAIN.covariance, 0, 0
     copy.pace = 1 if f.stride > 1 else f.pace
     copy.stride, copy.speed, copy.smoothing = 1, speed, 0.0
     copy.delay_rule = CLONE if f.delay_rule == CLONE else IGNORE
@@ -146,7 +149,7 @@ def _copy_for_schedule(f: FilterRecord, schedule: Schedule, speed: float) -> Fil
     return filters
 
 
-def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig) -> Array:
+def _design_gains(f: FilterMemory, schedule: Schedule, speed: float, config: FilterConfig) -> Array:
     """Design the table of gains (rows, columns) of a filter at a speed (m/s)."""
     filters = _copy_for_schedule(f, schedule, speed)
     copy = filters.view(np.recarray)[0]
@@ -155,10 +158,10 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
     s = int(f.first_slow)
     table = np.zeros(_compute_table_shape(f, schedule))
     table[0, 0] = 1.0
-    if f.intersample_rule == DUAL_RATE or config.poles:
+    if f.gain_rule == GAIN.dual_rate or config.poles:
         reset_filters(filters, 0)
         G: Array = copy.G[: copy.dense, : copy.n].copy()
-        if f.intersample_rule == DUAL_RATE:
+        if f.gain_rule == GAIN.dual_rate:
             _write_shares(copy, G, schedule, config, table)
         else:
             _write_placed_gains(copy, G, config.poles, table)
@@ -166,9 +169,9 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
         lags = np.array(schedule.lags, np.int64) * int(f.delay_rule == CLONE)
         cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
         before = np.zeros((int(f.total), int(f.total)))
-        tolerance = _GAIN_TOLERANCE if f.periodic else _CHECK_TOLERANCE
+        tolerance = _GAIN_TOLERANCE if f.gain_rule > GAIN.split else _CHECK_TOLERANCE
         _iterate_gains(filters, lags, cycles, tolerance, table, before, np.zeros((1, 1, 1)))
-        if f.intersample_rule == PSEUDO:
+        if f.gain_rule in (GAIN.split, GAIN.pseudo):
             C = build_measurement_rows(f)
             R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
             inverse = compute_inverse(config.inverse, C, before, R)
@@ -176,7 +179,7 @@ def _design_gains(f: FilterRecord, schedule: Schedule, speed: float, config: Fil
     return table
 
 
-def build_measurement_rows(f: FilterRecord) -> Array:
+def build_measurement_rows(f: FilterMemory) -> Array:
     """Build C (m + p, total): the fast rows, then the slow ones, of first clones if any."""
     s, m = int(f.first_slow), int(f.fasts)
     p = int(f.rows[s]) if s >= 0 else 0
@@ -191,7 +194,7 @@ def build_measurement_rows(f: FilterRecord) -> Array:
 
 
 def _write_shares(
-    f: FilterRecord, G: Array, schedule: Schedule, config: FilterConfig, table: Array
+    f: FilterMemory, G: Array, schedule: Schedule, config: FilterConfig, table: Array
 ) -> None:
     """Write the weights of an innovation of the dual-rate rules behind the gains."""
     n, s, total = int(f.n), int(f.first_slow), int(f.total)
@@ -206,7 +209,7 @@ def _write_shares(
     table[1 : 1 + steps, total:] = covariances[:, upper[0], upper[1]]
 
 
-def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
+def _write_placed_gains(f: FilterMemory, G: Array, poles: tuple[float, ...], table: Array) -> None:
     """Write the gains of the fast rows for poles (rad/s), and the covariance, into a table."""
     from scipy.linalg import solve_discrete_lyapunov  # slow to load
 
@@ -220,7 +223,7 @@ def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], tab
     table[1, int(f.total) :] = P[np.triu_indices(n)]
 
 
-def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inverse: Array) -> None:
+def _write_pseudo_gains(f: FilterMemory, schedule: Schedule, table: Array, inverse: Array) -> None:
     """Append the constant gain and the generalised inverse of the pseudo-residual rule."""
     p, m, total = int(f.rows[f.first_slow]), int(f.fasts), int(f.total)
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
@@ -253,13 +256,13 @@ def _design_cached(key: bytes) -> tuple[Array, Array]:
 
 
 def design_and_map(
-    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
+    f: FilterMemory, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, Array]:
     """Design gains (rows, columns) at a speed and the error's map over a cycle, both read-only."""
     return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
 
 
-def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed: float) -> Array:
+def _compute_error_map(f: FilterMemory, table: Array, schedule: Schedule, speed: float) -> Array:
     """Compute the map (size, size) of the error over a cycle by what the compiled filter does."""
     # Behind the error of the states stands what else a rule carries on: the estimated error e,
     # clones or predictions of the captures under way. A column is what becomes of a small error
@@ -268,10 +271,10 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
     filters = _copy_for_schedule(f, schedule, speed)
     g = filters.view(np.recarray)[0]
     g.delay_rule = f.delay_rule if f.delay_rule in (CLONE, STORED, CONSTANT) else IGNORE
-    g.intersample_rule, g.periodic = f.intersample_rule, 1
-    g.joint = int(f.joint or f.intersample_rule == PSEUDO)
+    by_table = {GAIN.covariance: GAIN.table, GAIN.split: GAIN.pseudo}
+    g.gain_rule = by_table.get(int(f.gain_rule), f.gain_rule)
     latest, g.heading_fix[:] = max(lags, default=0), 0
-    g.assumed, g.spacing, g.recovery_count, g.speed_share = latest, 0.0, 0, 0.0
+    g.assumed, g.spacing, g.recovery_count, g.velocity = latest, 0.0, 0, 0.0
     reset_filters(filters, 0)
     start = (latest // cycle + 1) * cycle  # until then the first samples arrive
     captured = np.arange(0, start + cycle, period) if lags else np.zeros(0)
@@ -289,10 +292,10 @@ def _compute_error_map(f: FilterRecord, table: Array, schedule: Schedule, speed:
 
     def list_errors(tick: int) -> list[Array]:
         """List what holds an error before a tick's step, as views of the filter's memory."""
-        spans, vectors = [slice(0, f.n)], (g.x, g.e) if f.intersample_rule == PSEUDO else (g.x,)
+        spans, vectors = [slice(0, f.n)], (g.x, g.e) if g.gain_rule == GAIN.pseudo else (g.x,)
         if f.delay_rule == CLONE and lags:
             s, p = int(f.first_slow), int(f.rows[f.first_slow])
-            is_read = f.intersample_rule == PSEUDO  # e's is read later
+            is_read = g.gain_rule == GAIN.pseudo  # e's is read later
             is_carried = (g.stamp[s, : f.frames[s]] >= 0) | is_read
             firsts = f.first_clone[s] + p * np.flatnonzero(is_carried)
             spans += [slice(first, first + p) for first in firsts]

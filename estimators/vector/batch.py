@@ -1,7 +1,7 @@
 """Many filters of one kind in one compiled call: those of one shape in SIMD lanes, others alone.
 
-A block b has a record's fields of the same names, whose numbers are lanes, so the equations of
-`core` are compiled for it unchanged. Filter i of a batch, record f, has a lane of block i // LANES.
+A block b has a filter's fields of the same names, whose numbers are lanes, so the equations of
+`core` are compiled for it unchanged. Filter i of a batch, memory f, has a lane of block i // LANES.
 Its model stays there and is loaded anew where its speed changed; its state in every call. A user's
 own estimators are an object a row. What all of them read are the records of the vector env.
 """
@@ -22,10 +22,8 @@ from ...envs.numerics.simd import LANES
 from ...envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.task import ObservationEntry
 from ..core.filter import Observed, OutputTable, StepRecord
-from ..core.intersample import NONE
 from ..core.late_samples import CLONE, CONSTANT, IGNORE, STORED
-from ..core.model import VELOCITY
-from ..core.record import FILTER, N_CORE, N_FAST, N_INPUTS, FilterRecords
+from ..core.memory import FILTER, GAIN, N_CORE, N_FAST, N_INPUTS, FilterLayers
 from ..estimator import Estimator
 from ..filters import FILTERS
 from ..make import make_estimator
@@ -64,7 +62,7 @@ _SCALARS = (
 # packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
 _SHAPE = (  # what the filters of a block share
-    *("n", "dense", "total", "inputs", "fasts", "periodic", "measured", "cycle"),
+    *("n", "dense", "total", "inputs", "fasts", "gain_rule", "measured", "cycle"),
     *("stored", "robust", "u_column", "y_column"),
 )
 _FIELDS = (
@@ -80,13 +78,13 @@ _FIELDS = (
 BLOCK = pad_to_cache_line(_FIELDS)
 
 
-def _read_shape(layers: FilterRecords) -> _Shape:
+def _read_shape(layers: FilterLayers) -> _Shape:
     """Read what the filters of a block share; None for a filter whose ticks are computed alone."""
     # lanes compute models that change by speed alone, of which every tick predicts and corrects
     # without rules between samples, and store nothing of the past but predictions
     f = layers[0]
-    is_steady = f.tyre_states == 0 and f.kind != VELOCITY
-    is_plain = f.stride == f.pace == 1 and f.intersample_rule == NONE and f.joint == 0
+    is_steady = f.tyre_states == 0 and f.velocity == 0.0
+    is_plain = f.stride == f.pace == 1 and f.gain_rule in (GAIN.covariance, GAIN.table)
     has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
     is_small = f.delay_rule in (CLONE, IGNORE, STORED, CONSTANT) and f.total <= _MAX_STATES
     if len(layers) == 1 and is_steady and is_plain and has_fixed_noise and is_small:
@@ -94,7 +92,7 @@ def _read_shape(layers: FilterRecords) -> _Shape:
     return None
 
 
-def _make_blocks(filters: FilterRecords, shapes: Sequence[_Shape]) -> Any:
+def _make_blocks(filters: FilterLayers, shapes: Sequence[_Shape]) -> Any:
     """Make the blocks of filters (N, layers), each of its first shape."""
     blocks = allocate_aligned((-(-len(filters) // LANES),), BLOCK)
     for b, first in zip(blocks, range(0, len(filters), LANES), strict=True):
@@ -150,7 +148,7 @@ class BatchEstimator:
         self.configure(range(len(specs)), specs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy: its records lie on cache lines, too, and its lanes are empty."""
+        """Restore a copy: its filters lie on cache lines, too, and its lanes are empty."""
         self.__dict__.update(state)
         if "filters" not in state:  # estimators of a user's, each an object of its own
             return

@@ -1,6 +1,6 @@
 """The batch's part of an observation, compiled: filters of one shape by lanes, others alone.
 
-A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
+A lane's tick is computed in its memory, as that of a filter alone is, where the model changes or a
 row is not sound. So is every packet, and what is stored of a capture.
 """
 
@@ -14,9 +14,10 @@ from ...envs.numerics.packed import count_lanes, load_element, store_element
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
 from ...envs.numerics.simd import LANES
 from ...envs.record import FAST, PACKET, Array
-from ..core.covariance import correct_scalar, project
+from ..core.covariance import correct_scalar, has_covariance, project
 from ..core.filter import Observed, StepRecord, observe, run_tick
 from ..core.late_samples import store_due_captures
+from ..core.memory import N_SLOW, WINDOW, FilterLayers, FilterMemory, GainTables
 from ..core.model import CURVATURE, is_finite
 from ..core.packets import process_packet
 from ..core.predict import (
@@ -27,7 +28,6 @@ from ..core.predict import (
     propagate,
     read_fast_row,
 )
-from ..core.record import N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 
 LaneBlock = Any
 """One record of the dtype `batch.BLOCK`; `b` in compiled code."""
@@ -37,7 +37,7 @@ MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 class FilterBank(NamedTuple):
     """The filters of a batch, and the gains of all of them in one array."""
 
-    filters: FilterRecords  # dtype `FILTER`, shape (N, layers)
+    filters: FilterLayers  # dtype `FILTER`, shape (N, layers)
     pool: Array  # gains, shape (total,)
     places: npt.NDArray[np.int64]  # offset, cells, rows and columns of each in the pool, (N, 4)
 
@@ -51,7 +51,7 @@ def _get_gains(bank: FilterBank, i: int) -> GainTables:
 
 
 @jit
-def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+def _load_model(b: LaneBlock, lane: int, f: FilterMemory) -> None:
     """Load what a filter's ticks read and do not write."""
     n, dense = f.n, f.dense
     for i in range(n):
@@ -81,7 +81,7 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 
 @jit
-def _load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+def _load_lane(b: LaneBlock, lane: int, f: FilterMemory) -> None:
     """Load a filter's model, where its speed changed, and its state into its lane."""
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
@@ -94,18 +94,18 @@ def _load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 
 @jit
-def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+def _load_states(b: LaneBlock, lane: int, f: FilterMemory) -> None:
     N = b.total
     for i in range(N):
         b.x[i, lane] = f.x[i]
-    if b.periodic == 0:
+    if has_covariance(b):
         for i in range(N):
             for j in range(i, N):
                 b.P[i, j, lane] = f.P[i, j]
 
 
 @jit
-def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+def _load_clock(b: LaneBlock, lane: int, f: FilterMemory) -> None:
     """Load the tick of the next capture."""
     first = np.inf
     for s in range(N_SLOW):
@@ -115,8 +115,8 @@ def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 
 @jit
-def _store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store the state of a lane in its filter's record."""
+def _store_lane(b: LaneBlock, lane: int, f: FilterMemory) -> None:
+    """Store the state of a lane in its filter's memory."""
     _store_states(b, lane, f)
     for k in range(b.inputs):
         f.u[k] = b.u[k, lane]
@@ -127,19 +127,19 @@ def _store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 
 @jit
-def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
+def _store_states(b: LaneBlock, lane: int, f: FilterMemory) -> None:
     N = b.total
     for i in range(N):
         f.x[i] = b.x[i, lane]
-    if b.periodic == 0:
+    if has_covariance(b):
         for i in range(N):
             for j in range(i, N):
                 f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
 
 
 @jit
-def _store_lane_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one."""
+def _store_lane_captures(b: LaneBlock, lane: int, f: FilterMemory) -> None:
+    """Store in its memory what a lane's filter captured at its last tick; before the next one."""
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
     store_due_captures(f, b.tick[lane])
@@ -201,12 +201,12 @@ def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
             for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
                     _store_lane(b, lane, filters[first + lane, 0])
-        if b.periodic == 1:
-            for j in range(b.total):
-                store_element(b.x, load_element(b.x, j) + load_element(b.K, i, j) * residual, j)
-        else:
+        if has_covariance(b):
             variance = project(b, b.C_fast[i]) + load_element(b.r_fast, i)
             correct_scalar(b, variance, residual)
+        else:
+            for j in range(b.total):
+                store_element(b.x, load_element(b.x, j) + load_element(b.K, i, j) * residual, j)
         if has_invalid:
             for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
@@ -244,15 +244,15 @@ def _step_lanes(b: LaneBlock, first: int, bank: FilterBank, speed: Scalar) -> No
                 f.past_road_turn[slot] = b.road_turn[lane]
                 for i in range(b.stored):
                     f.predicted[slot, i] = b.x[i, lane]
-    if b.periodic == 1:
+    if not has_covariance(b):
         _gather_gains(b, first, bank)
     _correct(b, first, bank.filters)
 
 
 @jit
 def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> bool:
-    """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
-    if b.periodic == 1:
+    """Store lanes that stand apart in their memory; False, unchanged, where gains are missing."""
+    if not has_covariance(b):
         for lane in range(count_lanes()):
             if b.apart[lane] == 1.0:
                 i = first + lane
@@ -268,7 +268,7 @@ def _store_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j:
 
 
 @noinline
-def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
+def _step_filter(f: FilterMemory, gains: GainTables, row: Vector) -> None:
     """Step one filter by one tick."""
     read_fast_row(f, row)
     run_tick(f, gains)
@@ -276,7 +276,7 @@ def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
 
 @jit
 def _step_outliers(b: LaneBlock, first: int, bank: FilterBank, fast: Matrix, j: int) -> None:
-    """Step the lanes that stand apart by their records, which the lanes take over."""
+    """Step the lanes that stand apart in their memory, which the lanes take over."""
     for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
             i = first + lane
@@ -296,9 +296,9 @@ def _set_next_due(b: LaneBlock, lane: int, packets: Matrix, count: int) -> None:
 
 @jit
 def _process_packets(
-    b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Matrix, count: int
+    b: LaneBlock, lane: int, f: FilterMemory, gains: GainTables, packets: Matrix, count: int
 ) -> None:
-    """Process the packets of a lane's filter that are here now, by its record."""
+    """Process the packets of a lane's filter that are here now, in its memory."""
     k = b.cursor[lane]
     _store_lane(b, lane, f)
     while k < count and not (f.tick < packets[k, PACKET.arrived] <= b.last[lane]):

@@ -19,7 +19,7 @@ from ...envs.task import Infos, ObservationEntry, make_space
 from ...envs.validation import describe_unknown, short_repr
 from ...envs.vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 from ..core.filter import Observed, OutputTable, StepRecord, observe
-from ..core.record import FILTER
+from ..core.memory import FILTER
 from ..design.options import FOREIGN_STATE, STATES
 from ..estimator import Estimator
 from ..filters import FILTERS

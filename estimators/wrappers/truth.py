@@ -16,6 +16,7 @@ from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import Vehicle
+from ..core.memory import GAIN
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
@@ -126,7 +127,7 @@ def choose_vehicle(estimator: AnyEstimator, built: Vehicle, vehicle: Vehicle) ->
         built: Vehicle for which it was built.
         vehicle: True vehicle.
     """
-    if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
+    if isinstance(estimator, ForeignEstimator) or estimator.filters[0].gain_rule > GAIN.split:
         return vehicle
     fixed = ("name", "friction", *STIFFNESSES)
     return vehicle.replace(**{name: getattr(built, name) for name in fixed})

@@ -8,7 +8,7 @@ import pytest
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.record import COUNTERS
+from sideslip.estimators.core.memory import COUNTERS, GAIN
 from sideslip.estimators.design.options import OPTIONS
 from tests.estimators.dense import WITH_TYRES
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
@@ -140,8 +140,8 @@ def test_every_number_but_one_has_a_limit(key: str) -> None:
 
 def test_random_delay_needs_no_option() -> None:
     sensors = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
-    assert make_estimator("multirate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 0
-    assert make_estimator("single-rate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 1
+    for name, rule in (("multirate-kf", GAIN.covariance), ("single-rate-kf", GAIN.table)):
+        assert make_estimator(name, sensors=sensors, speed=7.0).filters[0].gain_rule == rule
 
 
 @pytest.fixture

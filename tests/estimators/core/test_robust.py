@@ -17,8 +17,8 @@ from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.core.filter import NO_OUTPUTS, StepRecord
+from sideslip.estimators.core.memory import N_INPUTS
 from sideslip.estimators.core.model import build_model, linearise
-from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.dense import WITH_TYRES
 
 assert sideslip.__version__

@@ -8,7 +8,7 @@ import pytest
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from sideslip.estimators.core.record import N_RECENT, SNAPSHOT_INTERVAL, WINDOW
+from sideslip.estimators.core.memory import N_RECENT, SNAPSHOT_INTERVAL, WINDOW
 from tests.estimators.simulation import CAMERA, FIG7
 
 V = FIG7.speed

@@ -10,8 +10,8 @@ from sideslip.envs import COMS, Log
 from sideslip.envs.record import FAST, PACKET, Record
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
+from sideslip.estimators.core.memory import N_INPUTS
 from sideslip.estimators.core.model import _compute_axle_force, build_model, linearise
-from sideslip.estimators.core.record import N_INPUTS
 from tests.estimators.core.test_consistency import within
 from tests.estimators.core.test_wary import CAMERA as CAMERA_PLACE
 from tests.estimators.core.test_wary import FROM, built, change_lane, drives, spoilt

@@ -13,7 +13,7 @@ from sideslip.envs.numerics.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.late_samples import RULES
-from sideslip.estimators.core.record import FILTER, N_CORE, N_TOTAL
+from sideslip.estimators.core.memory import FILTER, N_CORE, N_TOTAL
 from sideslip.estimators.vector.batch import BLOCK, _read_shape
 from sideslip.estimators.vector.lanes import MIN_LANES
 from tests.estimators.dense import WITH_TYRES

@@ -1,7 +1,7 @@
-"""One filter's memory: a single record that compiled code reads and writes in place.
+"""One filter's memory: named numbers that compiled code reads and writes in place.
 
 A copy is a complete snapshot. Sizes are fixed, so every filter runs on the same compiled code; the
-codes `kind`, `delay_rule`, `intersample_rule` and `periodic` say which fields are used.
+codes `delay_rule` and `gain_rule` say which fields are used.
 `design.assemble` writes what options and vehicle decide, `reset_filters` and the ticks the rest.
 
 What a model lacks takes no branch: its coefficients are 0 and its state stands at SPARE. Rows and
@@ -34,8 +34,8 @@ SNAPSHOT_INTERVAL = 16  # ticks between two snapshots of the rule "buffer"
 N_SNAPSHOTS = WINDOW // SNAPSHOT_INTERVAL
 N_RECENT = 64  # packets within the window
 
-FilterRecord = Any  # one record of the dtype `FILTER`; `f` in all compiled code
-FilterRecords = npt.NDArray[Any]  # (layers,) or (filters, layers) of the dtype `FILTER`
+FilterMemory = Any  # an entry of the dtype `FILTER`; `f` in all compiled code
+FilterLayers = npt.NDArray[Any]  # (layers,) or (filters, layers) of the dtype `FILTER`
 GainTables = Any  # (cells of speed, rows, columns), see `design.periodic`; ones where P gives them
 
 
@@ -63,19 +63,29 @@ class CarIndex(NamedTuple):
     rear_stiffness: int = 5  # N/rad, of a rear tyre
 
 
-COUNTERS, CAR = SkipCounters(), CarIndex()
+class GainRules(NamedTuple):
+    """Codes of the field `gain_rule`: where gains come from, what corrects between samples."""
+
+    covariance: int = 0  # from P, one measurement after the other; nothing between samples
+    split: int = 1  # likewise; a sample's gain is split over its period, by pseudo-residuals
+    pseudo: int = 2  # a constant gain from a table, for all residuals of a tick, pseudo-ones too
+    joint: int = 3  # from a table, for all fast residuals of a tick; nothing between samples
+    table: int = 4  # from a table, one measurement after the other; nothing between samples
+    dual_rate: int = 5  # likewise, and fractions of the last innovation between samples
+
+
+COUNTERS, CAR, GAIN = SkipCounters(), CarIndex(), GainRules()
 
 _INT, _FLOAT = np.int64, np.float64
 
 _FIELDS: list[tuple[Any, ...]] = [
     # model: dx = A x + B u on the first `dense` states; those behind them decay by themselves
-    ("kind", _INT),
     ("n", _INT),  # states
     ("dense", _INT),
     ("delayed", _INT),  # the last dense states that lag behind what the camera sees
     ("total", _INT),  # states and clones
     ("first_bias", _INT),  # the first state that nothing drives but noise
-    ("planar", _INT),  # states of a bicycle that does not roll, of beta, gamma, psi, y_l
+    ("planar", _INT),  # of beta, gamma, psi, y_l those that a bicycle has; 0: no bicycle
     # beta' by the first disturbance d: (push_rate + push_force / (M V)) d
     ("push_rate", _FLOAT),
     ("push_force", _FLOAT),
@@ -120,7 +130,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("Q", _FLOAT, (N_CORE, N_CORE)),  # process noise of one step
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
-    ("speed_share", _FLOAT),  # 1: the first state is v_x, which starts at the measured speed
+    ("velocity", _FLOAT),  # 1: the first states are v_x, v_y, which turn by the gyro
     # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
@@ -170,23 +180,20 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # tick, phase of a single-rate filter's steps
-    # the rule for late samples: codes stand in `late_samples`, and in `intersample`
+    # the rule for late samples: codes stand in `late_samples`
     ("delay_rule", _INT),  # code of the rule, such as CLONE
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where its clones start in x; 0 or WEIGHED: it has none
     ("stored", _INT),  # states whose predictions are stored; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains
-    ("periodic", _INT),
-    ("joint", _INT),  # 1: all fast residuals of a tick are taken before its corrections
-    ("placed", _INT),  # fast rows that then correct by the table: an observer's
-    ("intersample_rule", _INT),  # code of the rule between slow samples, such as PSEUDO
+    ("gain_rule", _INT),  # code of the rule, such as GAIN.covariance
     ("cycle", _INT),  # steps after which the schedule repeats
     ("pattern", _INT),  # frames in the schedule's cycle
     ("low", _FLOAT),  # m/s, speed of the first table of gains
     ("high", _FLOAT),  # m/s, speed of the last table
     ("spacing", _FLOAT),  # m/s between tables; 0: one table
-    ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # C^+ transposed; PSEUDO, not periodic
+    ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # C^+ transposed; split
     # speed
     ("measured", _INT),  # 1: from the wheels, 0: fixed
     ("smoothing", _FLOAT),  # weight of a new sample in the low-pass; 0: fixed
@@ -194,7 +201,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("model_speed", _FLOAT),  # m/s, speed of the present model
     ("beta_scale", _FLOAT),  # old speed over new, by which beta = v_y / V is scaled before a step
     ("speed_before", _FLOAT),  # m/s, speed of the model at the row before
-    ("turning", _FLOAT),  # rad/s, the present model's yaw rate; VELOCITY
+    ("turning", _FLOAT),  # rad/s, the present model's yaw rate; velocities
     ("cell", _INT),  # the present table of gains
     ("missing_cell", _INT),  # the table that is missing; -1: none
     # state of the filter now
@@ -234,13 +241,13 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("larsen_gain", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("larsen_expected", _FLOAT, (N_SLOW, N_ROWS)),
     # corrections between slow samples
-    ("share", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # gains of a tick, fast, slow rows; not periodic
-    ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); PSEUDO
-    ("expected", _FLOAT, (N_ROWS,)),  # C x before this tick's corrections, slow rows; PSEUDO
-    ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
-    ("innovation", _FLOAT, (N_ROWS,)),  # innovation of the last sample; DUAL_RATE
-    ("since", _INT),  # steps since the last sample; -1: there was none; DUAL_RATE
-    ("to_line", _INT, (7,)),  # unused: with it the matrices, sorted behind, begin on cache lines
+    ("tick_gains", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # of a tick, fast and slow rows, from P
+    ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); split, pseudo
+    ("expected", _FLOAT, (N_ROWS,)),  # C x before a tick's corrections; split, pseudo
+    ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, pseudo
+    ("innovation", _FLOAT, (N_ROWS,)),  # innovation of the last sample; dual_rate
+    ("since", _INT),  # steps since the last sample; -1: there was none; dual_rate
+    ("to_line", _INT, (3,)),  # unused: with it the matrices, sorted behind, begin on cache lines
     # scratch
     ("u_new", _FLOAT, (N_INPUTS,)),
     ("PC", _FLOAT, (N_TOTAL,)),  # P C^T
@@ -269,7 +276,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 
 
 _LEADING = (  # what a tick in lanes reads or writes, side by side; x and P lie on cache lines
-    *("x", "P", "n", "total", "periodic", "measured", "speed", "speed_before", "model_speed"),
+    *("x", "P", "n", "total", "gain_rule", "measured", "speed", "speed_before", "model_speed"),
     *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
     *("y", "u", "counts"),
 )
