@@ -255,7 +255,7 @@ class _System:
         (drives,) = (x for x in self.simulations if x.name == self.task.scenario)
         paper_filters = [x for x in drives.filters if x.label == self.label]
         filters = (*paper_filters, _RECOMMENDED, _INFORMED)
-        numbers = join_numbers(list(replace(drives, filters=filters).run(seeds)))
+        numbers = join_numbers(replace(drives, filters=filters).run(seeds))
         original, recommended, rival = (numbers[x.label, self.metric] for x in filters)
         return original, recommended, rival
 

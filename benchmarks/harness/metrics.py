@@ -72,10 +72,6 @@ class Metric:
     turning: bool = False  # whether it is meaningful only where the reference has a yaw rate
 
 
-def _make_error(name: str) -> Callable[[StepSample], Array]:
-    return lambda m: m.info[name] - m.info[f"{name}_ref"]
-
-
 def _make_change(i: int) -> Callable[[StepSample], Array]:
     """Make the change of an input's command from one decision to the next."""
     return lambda m: np.abs(m.command[:, i] - m.last_command[:, i]) * m.full_scale[i]
@@ -87,8 +83,9 @@ EPISODE = (
     Metric("rms_slip", "rad", lambda m: m.info["beta"], "rms"),
     Metric("peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max",
            "peak slip / deg", _DEGREES, 2),
-    Metric("rms_slip_error", "rad", _make_error("beta"), "rms", "slip error / deg", _DEGREES, 2),
-    Metric("rms_yaw_error", "rad/s", _make_error("gamma"), "rms",
+    Metric("rms_slip_error", "rad", lambda m: m.info["beta"] - m.info["beta_ref"], "rms",
+           "slip error / deg", _DEGREES, 2),
+    Metric("rms_yaw_error", "rad/s", lambda m: m.info["gamma"] - m.info["gamma_ref"], "rms",
            "yaw error / (deg/s)", _DEGREES, 2, turning=True),
     # largest distance from the path of the reference's yaw rate and slip
     Metric("path_error", "m", lambda m: np.abs(m.lateral_deviation), "max",

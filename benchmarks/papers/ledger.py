@@ -145,7 +145,7 @@ class SeedResult(NamedTuple):
     curves: Mapping[str, Mapping[str, Array]] = {}  # (K,) by subject (truth, ...) and signal
 
 
-def join_numbers(results: Sequence[SeedResult]) -> dict[tuple[str, str], Array]:
+def join_numbers(results: Iterable[SeedResult]) -> dict[tuple[str, str], Array]:
     """Join the numbers of all seeds, shape (seeds,), or longer where one has several.
 
     Args:

@@ -90,7 +90,7 @@ def test_a_paper_filter_is_measured_as_its_own_simulation_has_it() -> None:
     system = next(x for x in readme.SYSTEMS if x.paper == "dual-rate")
     shown, joint, informed = system.measure(range(2), None)
     (drives,) = (x for x in system.simulations if x.name == "dual-rate-fig4")
-    numbers = join_numbers(list(drives.run((0, 1))))
+    numbers = join_numbers(drives.run((0, 1)))
     np.testing.assert_array_equal(shown, numbers["pseudo measurement", "beta"])
     assert (informed < np.minimum(shown, joint)).all()
 
@@ -116,7 +116,7 @@ def _ratio(numbers: estimation.Numbers, of: str, to: str) -> float:
 
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
-    numbers = join_numbers(list(estimation.EXPERIMENTS[1].simulation.run(range(8))))
+    numbers = join_numbers(estimation.EXPERIMENTS[1].simulation.run(range(8)))
     assert _ratio(numbers, "dakf", "course-kf") <= 0.75
 
 

@@ -30,7 +30,7 @@ SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration":
 def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
     filters = (PaperFilter("a", "multirate-kf"), PaperFilter("b", "bicycle-kf", vehicle="true"))
     simulation = EstimationSimulation("short", VISION, SHORT, filters, bound=True)
-    found = join_numbers(list(simulation.run((3, 5))))
+    found = join_numbers(simulation.run((3, 5)))
     env = gym.make(VISION, scenario=SHORT, control_period=10)
     base: Any = env.unwrapped
     for i, seed in enumerate((3, 5)):
@@ -67,7 +67,7 @@ def test_options_of_a_contestant_reach_its_agent() -> None:
     drivers = {name: tie_vision._DRIVERS[name] for name in names}
     drivers[label] = drivers["multirate"]._replace(options={"rate": "control", "gain": 5.0})
     slip = ControlSimulation("s", VISION, "tie-vision-fig8", drivers)
-    numbers = join_numbers(list(slip.run((0,))))
+    numbers = join_numbers(slip.run((0,)))
     assert numbers["none", "saturation"] == 0.0
     assert numbers[label, "rms_slip"] < 0.9 * numbers["multirate", "rms_slip"]
     assert numbers[label, "total_variation"] > 2.0 * numbers["multirate", "total_variation"]
