@@ -1,7 +1,7 @@
 """Sideslip estimators: filters for fast, slow and late sensors, and the door for your own.
 
 Where to start reading: `filters` has the table of filters; `make` turns a row into an `Estimator`:
-`design.config` parses its options, `design.assemble` writes its record. `core.record` names every
+`design.config` parses its options, `design.assemble` writes its memory. `core.memory` names every
 number of a filter, `core.filter` is what happens at every tick. `wrappers` and `vector` put filters
 around environments, `joint` one around a user's signals. `protocol` is for users' own.
 """

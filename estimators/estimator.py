@@ -291,7 +291,7 @@ class Estimator:
 
     @property
     def counts(self) -> dict[str, int]:
-        """All counters of what was skipped, by the names of `core.record.SkipCounters`."""
+        """All counters of what was skipped, by the names of `core.memory.SkipCounters`."""
         return dict(zip(SkipCounters._fields, map(int, self._f.counts), strict=True))
 
     @property

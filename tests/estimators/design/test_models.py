@@ -25,7 +25,7 @@ STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
 
 
 def model_of(name: Any, vehicle: Any, speed: Any, step: Any, sensors: Any) -> Any:
-    """G (dense, n) and H of a filter's record whose step is the given one."""
+    """G (dense, n) and H of a filter whose step is the given one."""
     filter_ = make_estimator(name, vehicle=vehicle, sensors=sensors, speed=speed)
     f = filter_.filters[0]
     f.step = step
