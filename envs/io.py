@@ -39,7 +39,10 @@ def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
     Links are followed, an older file's mode and owner stay; a pipe, a device or an open file such
     as /dev/stdout is written directly.
     """
-    old = os.stat(path) if os.path.exists(path) else None
+    try:
+        old = os.stat(path)
+    except FileNotFoundError:
+        old = None
     if old and (not stat.S_ISREG(old.st_mode) or os.path.abspath(path).startswith(_OPEN)):
         with open(path, "ab") as file:
             yield file

@@ -1,7 +1,7 @@
 """Controllers, one or several alike in a file, around the compiled law of `base.Controller`.
 
 Args:
-    state: Memory, shape (N, memory), which `record_action` updates.
+    state: Memory, shape (N, memory).
     action: Action that the env gets, shape (N, width).
     speed: Speed (m/s).
 """

@@ -45,10 +45,12 @@ class Controller:
     memory = 0  # numbers of memory for each row
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
     vehicle: Vehicle  # the car that the controller is designed for
-    law: Callable[..., None]  # of inputs, state, action as `_law`, largest moments, and `_design`
-    _design: tuple[Any, ...]
+    law: Callable[..., None]  # compiled: inputs, state, action, largest moments, `_design`
+    _design: tuple[Any, ...]  # numbers of the law
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
+        if not hasattr(self, "law") and type(self)._law is Controller._law:
+            raise TypeError(f"{type(self).__name__} has no law: give it `law` or `_law`")
         facts = get_env_facts(env)
         names = facts.names
         self.grip = None if grip is None else check_positive("grip", grip)
@@ -69,7 +71,7 @@ class Controller:
 
     def __repr__(self) -> str:
         grip = "" if self.grip is None else f", grip {self.grip:g}"
-        reads = ", ".join(self.needs) or "nothing"
+        reads = ", ".join(dict.fromkeys(self.needs)) or "nothing"
         return f"<{type(self).__name__} for {self.vehicle.name}{grip}; reads {reads}>"
 
     @property
@@ -110,7 +112,7 @@ class Controller:
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
-        """Note in the state that the env gets an action other than the controller's own."""
+        """Update the state where the env gets an action other than the controller's own."""
 
     def predict(
         self, observation: npt.NDArray[np.float32], state: Array | None = None,

@@ -110,7 +110,10 @@ def _interpolate_column(table: Vector, v: Scalar) -> Scalar:
 
 
 @jit
-def _feedforward_law(x: Matrix, _: Matrix, action: Matrix, _max_share: Vector, design: Any) -> None:
+def _feedforward_law(
+    x: Matrix, _state: Matrix, action: Matrix, _max_share: Vector, design: Any
+) -> None:
+    """Compute the actions from `Inputs` x."""
     car, full_scale = design
     for n in range(len(x)):
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])

@@ -273,6 +273,7 @@ class Loop:
             duration: Longest duration (s).
         """
         start_time = last_heard = time.monotonic()
+        self.onboard.digest = 0  # of this drive
         had_gc, deadline = gc.isenabled(), 0  # ns; 0: no row has come
         gc.disable()  # a collection takes hundreds of ms
         try:

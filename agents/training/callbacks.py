@@ -108,7 +108,7 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a training beside its tensors, of JSON types."""
+    """The state of a training beside its tensors, which JSON can hold."""
 
     groups: dict[str, Any]  # `param_groups` of each optimiser
     sideslip: str  # version of the package
@@ -118,9 +118,9 @@ class Checkpoint:
     scaling: list[Any]  # of the observations: `Standardisation`
     evaluations: list[Any]  # so far
 
-    def load_initial(self, folder: Path) -> Policy | None:
+    def load_initial(self, folder: str | Path) -> Policy | None:
         """Load the policy that it started from, under its own name; None for another training."""
-        name, file = self.aim.begun_with, folder / INITIAL_FILE
+        name, file = self.aim.begun_with, Path(folder) / INITIAL_FILE
         if not name:
             return None
         if not file.is_file():

@@ -115,7 +115,7 @@ def make_user_entries(
 
 
 def choose_estimator(agent: str) -> str:
-    """Choose the estimator of an agent: a policy's own, "" for what saw an env alone."""
+    """Choose the estimator of a named agent: a policy's own, "" for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
     if agent.endswith(ZIP):

@@ -2,7 +2,7 @@
 
 Args:
     log: Part of a recorded drive.
-    name: Column, as "gyro" or "accel_y".
+    name: Column, "gyro" or "accel_y".
     steady: Whether steady turns count alone.
     tyres: Factor of the understeer gradient, 0 for a neutral car.
     stated: Calibration of the steering that was applied to the logs.

@@ -98,8 +98,8 @@ def make_estimator_tuning(
     if not searched:
         raise ValueError(f"{estimator} has no process noise to search; name the options to search")
     for option in searched:
-        if option in held:
-            raise ValueError(f"the option {option} is both held and searched")
+        if option in arguments:
+            raise ValueError(f"the option {option} is both given and searched")
         if not _has_option(estimator, option, arguments):  # it raises with what it has
             call_quietly(make_estimator, estimator, **{**arguments, option: 1.0})
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
@@ -141,7 +141,10 @@ def _find_env(
             for scenario in scenarios:
                 env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
                 env.reset(seed=FIRST_SEED)
-                arguments = make_filter_arguments(env.unwrapped) | unstable | held
+                facts = make_filter_arguments(env.unwrapped)
+                if known := [option for option in held if option in facts]:
+                    raise ValueError(f"{', '.join(known)} is the environment's, no option")
+                arguments = facts | unstable | held
                 filter_ = call_quietly(make_estimator, estimator, **arguments)
         except ValueError as error:
             refused.setdefault(str(error), name)

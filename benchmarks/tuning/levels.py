@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import gymnasium as gym
 import numpy as np
@@ -38,7 +38,9 @@ from ..harness.drives import (
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
 from ..harness.stats import average, compute_honesty
-from .search import STORAGE, SearchOptions, run_study
+
+if TYPE_CHECKING:
+    from .search import SearchOptions
 
 app = typer.Typer()
 NAME = "joint"
@@ -187,7 +189,7 @@ def _score(case: tuple[Mapping[str, float], Sequence[int]]) -> list[float]:
 
 
 def _search(
-    start: Mapping[str, float], drives: int, search: SearchOptions
+    start: Mapping[str, float], drives: int, search: "SearchOptions"
 ) -> tuple[dict[str, float], float, float]:
     """Search from some levels on: the best levels, their log score (rad), and the start's."""
     ranges = {name: (level / _REACH, level * _REACH) for name, level in start.items()}
@@ -199,6 +201,8 @@ def _search(
 
     sources = hash_sources("estimators") + hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
     name = f"levels of {NAME} on {drives} drives {sources}"
+    from .search import run_study
+
     trials = run_study(name, ranges, search, evaluate, drives, start)
     scores = [trial.user_attrs["objective"] for trial in trials]
     best = int(np.argmin(scores))
@@ -216,11 +220,13 @@ def _search_levels(
     trials: Annotated[int, typer.Option(min=1, help="Trials.")] = 1200,
     drives: Annotated[int, typer.Option(min=5, help="Drives, the same for all.")] = 120,
     out: Annotated[Path, typer.Option(help="JSON for the levels.")] = Path("levels.json"),
-    storage: Annotated[str, typer.Option(help="Where a stopped search goes on.")] = STORAGE,
+    storage: Annotated[str | None, typer.Option(help="Where a stopped search goes on.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes.")] = None,
 ) -> None:
     """Search the levels of `joint` from those in use, and write them."""
-    search = SearchOptions(trials, storage, seed=1, jobs=jobs, console=Console())
+    from .search import STORAGE, SearchOptions
+
+    search = SearchOptions(trials, storage or STORAGE, seed=1, jobs=jobs, console=Console())
     best, score, before = _search(_get_levels(), drives, search)
     levels = {name: float(f"{value:.3g}") for name, value in best.items()}
     write_text(out, json.dumps({"score": score, "before": before, "levels": levels}, indent=1))

@@ -5,8 +5,8 @@
 The engine's functions become device functions, rebuilt from the code of the other engines with
 CUDA's own primitives and literals of one precision. Rows lie along the last axis of what a tick
 reads and writes, so that neighbouring threads touch neighbouring numbers. A generator is NumPy's
-PCG64 (O'Neill, HMC-CS-2014-0905): state, then increment, each of four words of 32 bits, the lowest
-first.
+PCG64 (O'Neill, "PCG", HMC-CS-2014-0905): state, then increment, each of four words of 32 bits,
+the lowest first.
 
 Args:
     constants: Constants of the kernel.

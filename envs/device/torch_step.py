@@ -193,23 +193,25 @@ class TorchStep:
     ) -> _TickState:  # fmt: skip
         """Step the cars that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
         functions, pick, cars = self._functions, self._select, tick_state.cars
-        start = cars.tick
+        start_tick = cars.tick
         params = functions.make_step_params(p)
         task, change = params.task, params.tyre_change
         # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
         state = StepState(
             Motion(*cars.motion), ActuatorState(*cars.drive), None, cars.driver,
-            functions.apply_tyre_change(params.car, change, start > change.tick),
+            functions.apply_tyre_change(params.car, change, start_tick > change.tick),
             tuple(cars.refs), NominalMotion(*cars.nominal_motion), ErrorState(*cars.errors),
         )  # fmt: skip
         normals = NormalDraws(draws[:4], draws[4:8], draws[8])
-        acts = start >= task.lead_in
+        acts = start_tick >= task.lead_in
         N_z = pick(acts, yaw_share * task.yaw_scale, 0.0)
         added = pick(acts, steer_share * task.authority, 0.0)
         inputs = TickInputs(N_z, added, normals, next_steer, cars.past_efforts[0])
-        next_state, measured = functions.integrate_tick(params, inputs, state, start, self.kind)
+        next_state, measured = functions.integrate_tick(
+            params, inputs, state, start_tick, self.kind
+        )
         alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
-        tick = start + alive
+        tick = start_tick + alive
         tick_cost = functions.compute_tick_cost(
             next_state.motion, measured.cost_inputs, task, params.path, self.kind
         )

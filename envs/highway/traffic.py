@@ -241,8 +241,10 @@ class _EgoVehicle(HighwayVehicle):  # type: ignore[misc]
 class _BrakingVehicle(IDMVehicle):  # type: ignore[misc]
     """An IDM vehicle in its lane that from a time (s) on brakes (m/s2) until it stands."""
 
-    def __init__(self, road: Road, place: Array, speed: float, onset: float, rate: float) -> None:
-        super().__init__(road, place, speed=speed, target_speed=speed, enable_lane_change=False)
+    def __init__(
+        self, road: Road, position: Array, speed: float, onset: float, rate: float
+    ) -> None:
+        super().__init__(road, position, speed=speed, target_speed=speed, enable_lane_change=False)
         self.time_left, self.rate = onset, rate
         self.speed: float = speed
 

@@ -39,16 +39,17 @@ def get_range(value: Range | None) -> tuple[float, float]:
     return float(low), float(high)
 
 
-# Quantities that a scenario gives as a number or a range, then those of a `World`, by the names and
-# in the units of their fields; 0 stands for None. Uniform in (0, 1) are side and wind_side, below a
-# half mirrored, and phase, where the waves of a world begin. A new one goes to the end, as its
-# place chooses its random number.
+# Quantities that are drawn, by the names and in the units of their fields; 0 stands for None.
+# Uniform in (0, 1) are side and wind_side, below a half mirrored, and phase, where the waves of a
+# world begin. A new one goes to the end, as its place chooses its random number.
 Draws = namedtuple(
     "Draws",
+    # of a scenario
     "speed friction front_stiffness rear_stiffness onset amplitude amplitude_2 frequency "
     "frequency_2 frequency_3 frequency_4 hold wind_force wind_arm wind_start wind_length side "
     "wind_side curvature path_speed friction_right tyre_change_time front_change rear_change "
     "gyro_bias accel_y_bias gps_latency bank initial_beta initial_gamma "
+    # of a `World`
     "camera_yaw camera_pitch camera_height steer_offset steer_scale wheel_scale wheel_left "
     "torque_scale torque_left torque_rate gyro_scale gyro_drift accel_scale accel_roll accel_ahead "
     "vibration course_error course_period gps_stamp map_error map_length map_lag load inertia "

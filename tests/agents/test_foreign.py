@@ -34,6 +34,11 @@ class YawDamper(Controller):
         action[:, 0] = self.gain * (inputs[:, 1] - inputs[:, 0])
 
 
+def test_a_controller_without_a_law_cannot_be_built() -> None:
+    with pytest.raises(TypeError, match="Lawless has no law: give it `law` or `_law`"):
+        type("Lawless", (Controller,), {})(gym.make(VISION))
+
+
 class Still:
     """No more than `predict`."""
 

@@ -93,6 +93,11 @@ def test_fig8_control_against_none(scenario: str, limit: float, estimator: str, 
     assert ratio <= limit
 
 
+def test_an_unknown_placement_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown placement 'both'; known: "):
+        design_pi(COMS, 7.0, placement="both")
+
+
 def test_the_integral_does_not_wind_up() -> None:
     """While the moment is saturated the memory stays below one full scale."""
     env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")

@@ -52,6 +52,14 @@ def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> Non
     assert np.array_equal(replayed, estimates) and ticks == len(estimates) >= 500
 
 
+def test_a_second_drive_of_a_controller_replays(tmp_path: Path) -> None:
+    car, recorder = onboard(STEERING, "dakf"), Recorder(tmp_path / "second.session", SETUP)
+    drive(STEERING, car, True)
+    drive(STEERING, car, True, recorder)
+    recorder.close()
+    assert replay_session(tmp_path / "second.session", onboard(STEERING, "dakf"), None)[1]
+
+
 def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
     driven: tuple[Path, Any, int | None], tmp_path: Path
 ) -> None:

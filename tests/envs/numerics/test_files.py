@@ -156,3 +156,11 @@ def test_a_long_name_is_written(path: Path) -> None:
     long = path.with_name("n" * 255)
     write_atomic(long, b"new")
     assert long.read_bytes() == b"new"
+
+
+def test_a_link_to_itself_is_refused_and_stays(tmp_path: Path) -> None:
+    path = tmp_path / "link"
+    path.symlink_to(path)
+    with pytest.raises(OSError, match="symbolic links"):
+        write_atomic(path, b"new")
+    assert path.is_symlink()

@@ -325,8 +325,8 @@ def test_rows_of_a_batch_have_a_single_cars_bits(mode: str) -> None:
 
 def test_groups_are_scaled_about_the_ideal() -> None:
     world = WORLDS["v1"]
-    fields = [World.__dataclass_fields__[name] for name in NAMES[:-3]]
-    assert set(GROUPS) == {field.metadata["group"] for field in fields}
+    names = "camera, steering, wheels and motors, inertial, GPS and map, load, road, tyres"
+    assert ", ".join(GROUPS) == names
     doubled = world.scale("camera", 2.0)
     assert doubled.camera_yaw == pytest.approx(2.0 * np.array(world.camera_yaw))
     assert doubled.steer_scale == world.steer_scale
