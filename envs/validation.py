@@ -7,6 +7,11 @@ Args:
     known: Known names.
     minimum: Smallest number.
     maximum: Largest number; None for no limit.
+    action: Numbers of one row, shape (width,).
+    actions: Those of several rows, shape (count, width).
+    count: Number of rows.
+    width: Numbers of an action.
+    fail: Whether a bad action becomes NaN; else ValueError names it or its row.
 """
 
 import dataclasses
@@ -134,14 +139,29 @@ def format_rows(rows: npt.ArrayLike) -> str:
     return f"rows {', '.join(map(str, numbers[:_MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
 
 
-def parse_action(action: object, width: int, fail: bool) -> Actions:
-    """Parse an action to float32, shape (width,).
+def split_by_rows(values: Mapping[str, object], count: int, what: str = "") -> list[dict[str, Any]]:
+    """Split arguments by rows: a list, tuple or array has one, or None, for each row.
 
     Args:
-        action: Numbers of one row, shape (width,).
-        width: Numbers of an action.
-        fail: Whether a bad one becomes NaN instead of raising ValueError.
+        values: Arguments of all rows by name.
+        count: Number of rows.
+        what: Kind of the arguments, put before a name in messages.
     """
+    columns = {}
+    for name, value in values.items():
+        if isinstance(value, np.ndarray) and value.ndim > 0:
+            value = value.tolist()
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            rule = f"one or a list of {count}, one a row"
+            raise ValueError(f"{what}{name}: {rule}, got {len(value)}")
+        columns[name] = value
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in range(count)]
+
+
+def parse_action(action: object, width: int, fail: bool) -> Actions:
+    """Parse an action to float32, shape (width,)."""
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
         return action if action.flags.carray else action.copy()  # others are other types
     try:
@@ -154,14 +174,7 @@ def parse_action(action: object, width: int, fail: bool) -> Actions:
 
 
 def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
-    """Parse actions of several rows to float32, shape (count, width).
-
-    Args:
-        actions: Numbers of all rows, shape (count, width).
-        count: Number of rows.
-        width: Numbers of a row.
-        fail: Whether rows of wrong shape or without numbers become NaN; else ValueError names them.
-    """
+    """Parse actions of several rows to float32; rows of wrong shape or without numbers are bad."""
     try:
         array = np.array(actions, np.float32)  # a copy: contiguous whatever came
         if array.shape == (count, width):

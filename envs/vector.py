@@ -17,7 +17,7 @@ from .record import Array
 from .rendering.renderer import VectorRenderMixin
 from .stability import StabilityEnv
 from .task import REFUSED, WILD, Infos, make_infos
-from .validation import Mask, check_int, parse_actions, warn_once
+from .validation import Mask, check_int, parse_actions, split_by_rows, warn_once
 
 Observations = npt.NDArray[np.float32]
 T = TypeVar("T")
@@ -38,22 +38,13 @@ def make_rows(
     if arguments.get("vision") == "image":
         mode = "make_vec(..., vectorization_mode='sync')"
         raise ValueError(f"vision='image' sees for one car at a time: {mode}")
-    columns = {}
-    for name in ("scenario", "vehicle"):  # arguments that may be a list
-        value = arguments.get(name)
-        if not isinstance(value, list | tuple):
-            value = [value] * count
-        elif len(value) != count:
-            raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
-        columns[name] = value
-    envs: dict[tuple[int, ...], StabilityEnv] = {}
+    lists = {name: arguments[name] for name in ("scenario", "vehicle") if name in arguments}
+    envs: dict[tuple[object, ...], StabilityEnv] = {}
     rows = []
-    for values in zip(*columns.values(), strict=True):
-        key = tuple(map(id, values))
+    for values in split_by_rows(lists, count):
+        key = (*values, *map(id, values.values()))
         if key not in envs:
-            named = zip(columns, values, strict=True)
-            row_arguments = {name: value for name, value in named if value is not None}
-            envs[key] = StabilityEnv(**{**arguments, **row_arguments})
+            envs[key] = StabilityEnv(**{**arguments, **values})
         rows.append(envs[key].config)
     return next(iter(envs.values())), rows * N if is_uniform else rows
 

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ..task import Infos
-from ..validation import Mask, format_rows, short_repr
+from ..validation import Mask, format_rows, short_repr, split_by_rows
 from .batch import IntArray, NumbaEngine
 from .config import EnvConfig
 from .layout import EpisodeConfig
@@ -115,7 +115,7 @@ class BatchEnv(VectorEnv[ArrayT, Any, Any], ABC, Generic[ArrayT]):
     ) -> tuple[list[EpisodeConfig], IntArray]:
         """Make configs with options of reset; (configs, index (M,) of each chosen row's)."""
         N, index = self.num_envs, np.empty_like(chosen)
-        row_options = _split_options(options, N) if options else [{}] * N
+        row_options = split_by_rows(options, N, "reset option ") if options else [{}] * N
         configs: list[EpisodeConfig] = []
         known: dict[tuple[object, ...], int] = {}  # rows with the same objects share a config
         for m, i in enumerate(chosen.tolist()):
@@ -220,17 +220,3 @@ def _parse_reset_mask(mask: Any, count: int) -> Mask:
     if not mask.any():
         raise ValueError("options['reset_mask'] resets no row")
     return mask
-
-
-def _split_options(options: Mapping[str, object], count: int) -> list[dict[str, Any]]:
-    """Split options of reset by rows: a list, tuple or array has one, or None, for each row."""
-    columns = {}
-    for name, value in options.items():
-        if isinstance(value, np.ndarray) and value.ndim > 0:
-            value = value.tolist()
-        if not isinstance(value, list | tuple):
-            value = [value] * count
-        elif len(value) != count:
-            raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
-        columns[name] = value
-    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in range(count)]

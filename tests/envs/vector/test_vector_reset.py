@@ -100,7 +100,7 @@ REFUSED: list[tuple[Any, dict[str, Any], type[Exception], str]] = [
     (-2, {}, ValueError, r"rows 0, 1 \(2 of them\) would get a negative seed, -2"),
     ([1, -1, 2, 3], {}, ValueError, "row 1 would get a negative seed, -1"),
     (1, {"speed": 3.0}, ValueError, "unknown reset option speed; known: scenario, vehicle"),
-    (1, {"friction": [0.5, 0.6]}, ValueError, "friction: one or a list of 4, got 2"),
+    (1, {"friction": [0.5, 0.6]}, ValueError, "friction: one or a list of 4, one a row, got 2"),
     (1, {"friction": [0.5, 0.6, -1.0, 0.5]}, ValueError, "friction must be positive"),
     (1, {"scenario": ["sine", "sine", "slalon", "sine"]}, ValueError, "scenario 'slalon'"),
     (1, {"reset_mask": [True] * 4}, TypeError, "an array of bool, got list"),
