@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.numerics.packed import pad_to_cache_line
+from ...envs.numerics.packed import make_offsets, pad_to_cache_line
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.vehicle.linear import Bicycle
 
 N_CORE = 24  # states of a model; in whole eights, as `N_TOTAL`
 SPARE = N_CORE - 2  # the place, with the one behind it, of states that a model lacks
@@ -52,17 +53,6 @@ class SkipCounters(NamedTuple):
     stuck: int = 7  # every value as in the sensor's last packet, of an earlier tick, while it moves
 
 
-class CarIndex(NamedTuple):
-    """Places in `car`: the order of `compute_bicycle_coefficients`, the names of `Vehicle`."""
-
-    mass: int = 0  # kg
-    yaw_inertia: int = 1  # kg m2
-    front_arm: int = 2  # m
-    rear_arm: int = 3  # m
-    front_stiffness: int = 4  # N/rad, of a front tyre
-    rear_stiffness: int = 5  # N/rad, of a rear tyre
-
-
 class GainRules(NamedTuple):
     """Codes of the field `gain_rule`: where gains come from, what corrects between samples."""
 
@@ -74,7 +64,8 @@ class GainRules(NamedTuple):
     dual_rate: int = 5  # likewise, and fractions of the last innovation between samples
 
 
-COUNTERS, CAR, GAIN = SkipCounters(), CarIndex(), GainRules()
+COUNTERS, GAIN = SkipCounters(), GainRules()
+CAR, CAR_WIDTH = make_offsets(Bicycle)  # places in `car`
 
 _INT, _FLOAT = np.int64, np.float64
 
@@ -96,7 +87,7 @@ _FIELDS: list[tuple[Any, ...]] = [
     ("curved_state", _INT),  # y_l where sin(course) is not taken for the course
     ("map_lag", _FLOAT),  # s, deviation of the time by which the road's curvature is late
     ("phi_state", _INT),  # a bicycle's phi, followed by phi_rate
-    ("car", _FLOAT, (len(CarIndex._fields),)),
+    ("car", _FLOAT, (CAR_WIDTH,)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
     ("roll_damping", _FLOAT),  # C_x / I_x
     ("roll_arm", _FLOAT),  # M_s h_s / I_x; 0: it does not roll

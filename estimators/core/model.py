@@ -31,7 +31,7 @@ def _build_lateral(f: FilterMemory, V: Scalar) -> None:
     if f.model_speed > 0.0:
         f.beta_scale *= f.model_speed / V
     write_lateral(A, B, f.car, V, f.planar, f.inputs, f.preview)
-    B[0, N_INPUTS] = f.push_rate + f.push_force / (f.car[CAR.mass] * V)
+    B[0, N_INPUTS] = f.push_rate + f.push_force / (f.car[CAR.m] * V)
     _write_body(f, V)
     _write_tyres(f, V)
     B[0, first + f.bank_state] = -GRAVITY / V  # the body does not roll by gravity
@@ -82,8 +82,8 @@ def _write_accel(f: FilterMemory, V: Scalar) -> None:
 @jit
 def _compute_rates(f: FilterMemory, V: Scalar, front: Scalar, rear: Scalar) -> tuple[Scalar, ...]:
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
-    beta = (front + rear) / (f.car[CAR.mass] * V)
-    gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
+    beta = (front + rear) / (f.car[CAR.m] * V)
+    gamma = (f.car[CAR.l_f] * front - f.car[CAR.l_r] * rear) / f.car[CAR.I]
     phi_rate = f.roll_arm / (1.0 - f.roll_arm * f.sway) * V * beta
     return beta + f.sway / V * phi_rate, gamma, phi_rate
 
@@ -145,12 +145,12 @@ def linearise(f: FilterMemory, steer: Scalar) -> None:
     error, i = f.map_lag * V * f.u[CURVATURE], f.map_heading_state
     f.Q[i, i] = (1.0 - f.decay[i] * f.decay[i]) * (f.prior[i, i] + error * error)
     for i in range(2):
-        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
+        arm = f.car[CAR.l_f] if i == 0 else 0.0 - f.car[CAR.l_r]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
         force, slope, per_factor, per_friction = _compute_axle_force(
             f.stiffness[i], f.load[i], alpha, tyre[i], tyre[2]
         )
-        f.car[CAR.front_stiffness + i] = 0.5 * slope  # of one tyre
+        f.car[CAR.C_f + i] = 0.5 * slope  # of one tyre
         if not moves:  # the tyres are unobservable
             per_factor, per_friction = 0.0, 0.0
         f.force_slopes[i, 0], f.force_slopes[i, 1] = per_factor, per_friction
@@ -159,7 +159,7 @@ def linearise(f: FilterMemory, steer: Scalar) -> None:
     if f.model_error > 0.0:
         force_error = f.model_error * total_force
         # the axles err independently: half a wheelbase is their mean arm
-        moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
+        moment_error = 0.5 * (f.car[CAR.l_f] + f.car[CAR.l_r]) * force_error
         f.Q[f.dense, f.dense] = f.q_nominal[0] + f.q_share[0] * force_error * force_error
         f.Q[f.dense + 1, f.dense + 1] = f.q_nominal[1] + f.q_share[1] * moment_error * moment_error
 

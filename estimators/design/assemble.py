@@ -12,7 +12,7 @@ from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ..core import late_samples as rule
 from ..core import memory as size
-from ..core.memory import FILTER, GAIN, CarIndex, FilterLayers, FilterMemory
+from ..core.memory import FILTER, GAIN, FilterLayers, FilterMemory
 from ..core.model import MIN_SPEED, Y_L
 from .gains import kalman_gain
 from .options import LATE, MEASUREMENTS, SCALE, TYRES, WANDER, FilterConfig, FilterModel
@@ -177,7 +177,7 @@ def _write_model(
     for state in ("bank", "phi", "steer_offset", "map_heading", SCALE):
         f[f"{state}_state"] = names.index(state) if state in names else size.SPARE
     f.offset_share, f.velocity = "steer_offset" in names, "v_x" in names
-    f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
+    f.car[:] = vehicle.lateral
     f.Q[:n, :n], f.decay[:] = Q, 1.0
     _write_constants(f, model, vehicle)
     if model.forces:  # exact discretisation of the process

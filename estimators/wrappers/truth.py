@@ -16,7 +16,7 @@ from ...envs.record import FAST, Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.validation import check_choice
 from ...envs.vehicle.parameters import Vehicle
-from ..core.memory import GAIN
+from ..core.memory import CAR, GAIN
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
@@ -142,7 +142,7 @@ def set_stiffness(estimator: AnyEstimator, vehicle: Vehicle) -> None:
     """
     if isinstance(estimator, Estimator):
         for f in estimator.filters:
-            f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
+            f.car[CAR.C_f], f.car[CAR.C_r] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
 def refuse_stacked(env: Any, kind: type) -> None:
