@@ -130,17 +130,10 @@ MAGNIFIED = 4.0  # times the sideslip angle is drawn
 _LENGTH, _CIRCLE = 190.0, 38.0  # pixels: the car, and the circle of 0.3 of its weight
 
 
-class _SlipAngles(NamedTuple):
-    """Sideslip angles of a car at an instant (rad)."""
-
-    beta: float
-    reference: float
-    estimates: dict[str, float]  # by label
-    shades: dict[str, str]  # their colours
-
-
-def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAngles) -> None:
-    """Draw a car with its tyres' forces, sideslip angles and wind."""
+def _draw_closeup(
+    canvas: Canvas, box: Box, scene: road.CarScene, now: Array, estimates: list[tuple[float, str]]
+) -> None:
+    """Draw a car with its tyres' forces, wind, and sideslip angles, of estimates with colours."""
     body = front, rear, _ = road.compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
     x_0, y_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear), box[1] + 0.5 * box[3]
@@ -152,7 +145,7 @@ def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAn
     for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
         place = box[0] + 44.0, to_pixels(np.array([[wheel.x, wheel.y]]))[0, 1]
         _draw_motor(canvas, place, torque, torque / scene.max_torque)
-    _draw_directions(canvas, (x_0, y_0), slips)
+    _draw_directions(canvas, (x_0, y_0), now, estimates)
     if scene.wind:
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
         canvas.draw_arrow(foot, foot - (0.0, math.copysign(34.0, scene.wind)), PALETTE[3], 4.0)
@@ -160,7 +153,7 @@ def _draw_closeup(canvas: Canvas, box: Box, scene: road.CarScene, slips: _SlipAn
     x = box[0] + 14.0
     if any(wheel.capacity for wheel in scene.wheels):
         canvas.draw_text((x, box[1] + 12.0), "tyre forces in their friction circles", road.SOFT, 12)
-    degrees = round(math.degrees(slips.beta), 1) + 0.0  # no -0.0
+    degrees = round(math.degrees(now[TRACE_POINT.beta]), 1) + 0.0  # no -0.0
     words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
     canvas.draw_text((x, box[1] + box[3] - 12.0), words, INK, 12)
 
@@ -193,7 +186,9 @@ def _draw_motor(canvas: Canvas, place: tuple[float, float], torque: float, share
     canvas.draw_text((x, y - 6.0), f"{torque:+.0f} N m", INK, 12, 0.5)
 
 
-def _draw_directions(canvas: Canvas, centre: tuple[float, float], slips: _SlipAngles) -> None:
+def _draw_directions(
+    canvas: Canvas, centre: tuple[float, float], now: Array, estimates: list[tuple[float, str]]
+) -> None:
     """Draw the directions of the velocity, of its reference and of the estimates."""
 
     def make_ray(angle: float, length: float) -> Array:
@@ -201,10 +196,10 @@ def _draw_directions(canvas: Canvas, centre: tuple[float, float], slips: _SlipAn
         return np.array([centre, centre + length * direction])
 
     canvas.draw_line(make_ray(0.0, 138.0), "#C3C8CE", 1.0)
-    canvas.draw_line(make_ray(slips.reference, 138.0), INK, 1.0, (4.0, 3.0))
-    for label, angle in slips.estimates.items():
-        canvas.draw_line(make_ray(angle, 132.0), slips.shades[label], 2.0)
-    canvas.draw_arrow(centre, make_ray(slips.beta, 122.0)[1], INK, 3.0)
+    canvas.draw_line(make_ray(now[TRACE_POINT.beta_ref], 138.0), INK, 1.0, (4.0, 3.0))
+    for angle, shade in estimates:
+        canvas.draw_line(make_ray(angle, 132.0), shade, 2.0)
+    canvas.draw_arrow(centre, make_ray(now[TRACE_POINT.beta], 122.0)[1], INK, 3.0)
     canvas.draw_disc(centre, 4.0, INK)
     canvas.draw_disc(centre, 1.8, "#FFFFFF")
 
@@ -240,9 +235,9 @@ def draw_picture(
     if draw_world is None:
         driven_car = road.CarTrack(scene, truth, road.BLUE, name if ghosts else "")
         road.draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
-    newest = {label: float(x[-1, 0]) for label, x in estimates.items() if np.isfinite(x[-1, 0])}
-    slips = _SlipAngles(now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], newest, shades)
-    _draw_closeup(canvas, _CLOSEUP, scene, slips)
+    newest = [(float(x[-1, 0]), shades[label]) for label, x in estimates.items()]
+    newest = [(angle, shade) for angle, shade in newest if math.isfinite(angle)]
+    _draw_closeup(canvas, _CLOSEUP, scene, now, newest)
     turns, scale = int(switches[FLAGS.reference]) != ZERO_SLIP, float(p[P.task.yaw_scale])
     others = [x.truth for x in ghost_cars]
     strips = _make_strips(truth, estimates, shades, others, scale, turns)

@@ -24,7 +24,6 @@ from sideslip.envs.rendering.charts import (
     MAX_SPAN,
     SIZE,
     _draw_closeup,
-    _SlipAngles,
     draw_picture,
 )
 from sideslip.envs.rendering.palette import GREY, INK, PALETTE, find_colour, mix_colours
@@ -248,9 +247,9 @@ def still() -> CarScene:
 
 
 def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
-    canvas, name = Noted(), "exact-kf"
-    slips = _SlipAngles(beta, 0.0, {name: estimate}, {name: find_colour(name)})
-    _draw_closeup(canvas, BOX, scene, slips)
+    canvas, now = Noted(), np.zeros(len(TRACE_POINT))
+    now[TRACE_POINT.beta] = beta
+    _draw_closeup(canvas, BOX, scene, now, [(estimate, find_colour("exact-kf"))])
     return canvas
 
 
