@@ -194,9 +194,10 @@ def get_label(source: object) -> str:
 
 
 def compute_std(P: Array) -> Array:
-    """Compute the standard deviations (n,) of a covariance; NaN stays.
+    """Compute the standard deviations (..., n) of covariances; NaN stays.
 
     Args:
-        P: Covariance, shape (n, n).
+        P: Covariances, shape (..., n, n).
     """
-    return np.sqrt(np.maximum(np.diag(P), 0.0))
+    variances: Array = np.einsum("...ii->...i", P)
+    return np.sqrt(np.maximum(variances, 0.0))

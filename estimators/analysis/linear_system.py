@@ -20,7 +20,7 @@ from ..design.gains import (
     frame_map,
 )
 from ..design.periodic import MARGINAL, find_unobservable, spectral_radius
-from ..protocol import Estimates, UnobservableWarning
+from ..protocol import Estimates, UnobservableWarning, compute_std
 
 
 class DualRate:
@@ -88,8 +88,7 @@ class DualRate:
         self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
         self.shares, self.ratio, self._F, self._C = shares, int(ratio), F, measured
         self._check_stability(F, measured, allow_unstable)
-        P = system.compute_covariances(shares)  # after each step of a cycle
-        self._std = np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
+        self._std = compute_std(system.compute_covariances(shares))  # after each step of a cycle
         self._start = np.zeros(n)
         self._start[:m] = _parse_array("start", 0.0 if start is None else start, m)
         self.reset()

@@ -23,7 +23,7 @@ from ..core.predict import read_fast_row
 from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator
-from ..protocol import Estimates
+from ..protocol import Estimates, compute_std
 
 _RANK = 1e-14  # of a correlation matrix, what counts as nothing
 
@@ -167,4 +167,4 @@ def _smooth_backwards(block: _FilteredBlock) -> tuple[Array, Array]:
     for k in range(len(J) - 1, -1, -1):
         x[k] += J[k] @ (x[k + 1] - before[k + 1])
         P[k] += J[k] @ (P[k + 1] - predicted[k]) @ J[k].T
-    return x, np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))
+    return x, compute_std(P)
