@@ -58,9 +58,7 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 
 
 @jit
-def compute_reference(
-    steer: Scalar, v: Scalar, target: ReferenceParams, reference_kind: int
-) -> Vector:
+def compute_reference(steer: Scalar, v: Scalar, target: ReferenceParams, reference: int) -> Vector:
     """Compute the steady-state beta_ref (rad) and gamma_ref (rad/s) of a command at a speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
@@ -72,15 +70,15 @@ def compute_reference(
         steer: The driver's steering command (rad).
         v: Measured speed (m/s).
         target: `ReferenceParams`.
-        reference_kind: Place of the reference in `REFERENCES`.
+        reference: Place of the reference in `REFERENCES`.
     """
-    if reference_kind == ZERO_SLIP:
+    if reference == ZERO_SLIP:
         return 0.0 * steer, 0.0 * steer
-    G = target.G_lagged if reference_kind == LAGGED else target.G
+    G = target.G_lagged if reference == LAGGED else target.G
     gain = steer / maximum(1.0 + G * v * v, 0.2)
     beta = (1.0 - target.b_1 * v * v) * target.b_0 * gain  # dakf-stability (23)
     gamma = v * target.per_l * gain  # dakf-stability (23)
-    if reference_kind in (LIMITED, LAGGED):
+    if reference in (LIMITED, LAGGED):
         max_beta, max_gamma = 0.02 * target.mu_g, 0.85 * target.mu_g / maximum(v, 1.0)
         beta = minimum(maximum(beta, 0.0 - max_beta), max_beta)
         gamma = minimum(maximum(gamma, 0.0 - max_gamma), max_gamma)
@@ -89,7 +87,7 @@ def compute_reference(
 
 @jit
 def filter_reference(
-    before: Vector, steady: Vector, target: ReferenceParams, reference_kind: int
+    before: Vector, steady: Vector, target: ReferenceParams, reference: int
 ) -> Vector:
     """Filter the reference (rad, rad/s) over a tick: the lagged one approaches, the others jump.
 
@@ -97,9 +95,9 @@ def filter_reference(
         before: (beta_ref, gamma_ref) of the tick before (rad, rad/s).
         steady: Result of `compute_reference` (rad, rad/s).
         target: `ReferenceParams`.
-        reference_kind: Place of the reference in `REFERENCES`.
+        reference: Place of the reference in `REFERENCES`.
     """
-    if reference_kind == LAGGED:
+    if reference == LAGGED:
         rest = target.rest
         return apply_lag(steady[0], before[0], rest), apply_lag(steady[1], before[1], rest)
     return steady
@@ -112,7 +110,7 @@ RATE_TICKS = 10  # over which the yaw moment's rate is taken
 
 @jit
 def compute_cost_rate(
-    e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference_kind: int,
+    e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference: int,
     moment_rate: Scalar = 0.0,
 ) -> Scalar:  # fmt: skip
     """Compute the cost rate of a tick (1/s), capped at 100.
@@ -125,13 +123,13 @@ def compute_cost_rate(
         e_gamma: Error of the yaw rate (rad/s), not judged with "zero-slip".
         moment_share: Yaw moment as a fraction of its full scale.
         steer_added: Added steering angle (rad).
-        reference_kind: Place of the reference in `REFERENCES`.
+        reference: Place of the reference in `REFERENCES`.
         moment_rate: Cost rate of the yaw moment's rate (1/s).
     """
     b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
     c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
     c = c + moment_rate
-    if reference_kind != ZERO_SLIP:
+    if reference != ZERO_SLIP:
         g = e_gamma * (1.0 / GAMMA_SCALE)
         c = c + g * g
     return minimum(absolute(c), COST_CAP)
@@ -284,11 +282,9 @@ def make_observation_layout(
         entries.append(ObservationEntry(name, FAST_UNITS[column], -bound, bound))
     for kind in SLOW:
         if kind.name in slow:
-            values = [(f"{kind.name}_{x.name}", x.unit, -x.bound, x.bound) for x in kind.values]
-            values += [
-                (f"{kind.name}_age", "s", 0.0, AGE_CAP),
-                (f"{kind.name}_fresh", "-", 0.0, 1.0),
-            ]
-            entries += map(ObservationEntry._make, values)
+            values = [(x.name, x.unit, -x.bound, x.bound) for x in kind.values]
+            values += [("age", "s", 0.0, AGE_CAP), ("fresh", "-", 0.0, 1.0)]
+            for name, unit, low, high in values:
+                entries.append(ObservationEntry(f"{kind.name}_{name}", unit, low, high))
     refs = ("beta_ref", "rad", -1.0, 1.0), ("gamma_ref", "rad/s", -10.0, 10.0)
     return (*entries, *map(ObservationEntry._make, refs))

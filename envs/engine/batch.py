@@ -76,9 +76,7 @@ class _LaneBuffers(NamedTuple):
 
 
 @jit
-def _get_episode_arrays(
-    batch: BatchArrays, i: int, bounds: Matrix, window: Matrix
-) -> EpisodeArrays:
+def _get_arrays(batch: BatchArrays, i: int, bounds: Matrix, window: Matrix) -> EpisodeArrays:
     """Get the arrays of episode i of a batch."""
     return EpisodeArrays(
         batch.params[i], batch.states[i], batch.switches[i], batch.obs[i], batch.rows[i],
@@ -106,14 +104,14 @@ def _step_lanes(count: int, batch: BatchArrays, actions: Matrix, buffers: _LaneB
     for lane in range(count_lanes()):
         i = buffers.members[lane if lane < count else 0]
         window = block.window[:, :, lane]
-        overwrite_steering(_get_episode_arrays(batch, i, bounds, window), n)
+        overwrite_steering(_get_arrays(batch, i, bounds, window), n)
     if integrate_step(block, variant, read(buffers.shares, SHARES), n, False) == 0:
         return False
     refs, last = read(block.report, _REFS), len(bounds[0]) - 2
     slow_start = observe_fast(block, n, refs)
     for lane in range(count):
         i = buffers.members[lane]
-        row = _get_episode_arrays(batch, i, bounds, block.window[:, :, lane])
+        row = _get_arrays(batch, i, bounds, block.window[:, :, lane])
         for k in range(n_state):
             states[i, k] = block.z[k, lane]
         states[i, Z.driver] = block.z[Z.driver, lane]
@@ -200,7 +198,7 @@ def _has_variant_change(m: int, batch: BatchArrays, buffers: _LaneBuffers) -> bo
 @jit
 def _step_single(i: int, batch: BatchArrays, actions: Matrix, buffers: _LaneBuffers) -> int:
     """Step row i by itself; return the ticks done."""
-    row = _get_episode_arrays(batch, i, buffers.block.bounds, buffers.window)
+    row = _get_arrays(batch, i, buffers.block.bounds, buffers.window)
     return int(step_vehicle(row, actions[i], batch.rows.shape[1]))
 
 
@@ -218,7 +216,7 @@ def _reset_rows(
             copy_into(batch.packets[i, j], final.packets[i, j])
         final.ticks_done[i], final.delivered[i] = batch.ticks_done[i], batch.delivered[i]
         key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
-        row = _get_episode_arrays(batch, i, buffers.block.bounds, buffers.window)
+        row = _get_arrays(batch, i, buffers.block.bounds, buffers.window)
         start = EpisodeStart(
             starts.params[t], starts.low[t], starts.high[t], starts.switches[t], starts.motion[t]
         )

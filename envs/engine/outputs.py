@@ -2,6 +2,9 @@
 
 Packets are captured at a tick and delivered at their arrival in the order (captured tick, sensor);
 those under way lie in the state.
+
+Args:
+    k: Index of the slow sensors' first entry in the observation.
 """
 
 from ..numerics.functions import FOREVER, NEVER, TICK, clip
@@ -202,13 +205,7 @@ def finish_step(row: EpisodeArrays, n: int, done: int) -> None:
 
 @noinline
 def finish_slow_sensors(row: EpisodeArrays, done: int, k: int) -> None:
-    """Do slow sensors and report of one vehicle's step.
-
-    Args:
-        row: Arrays of the episode.
-        done: Ticks integrated in the step.
-        k: Index of the slow sensors' first entry in the observation.
-    """
+    """Do slow sensors and report of one vehicle's step."""
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done))
 
 

@@ -15,6 +15,8 @@ Args:
     where: Offsets of numbers, a NamedTuple or a tuple.
     index: Place on the array's axes, those behind `where`'s in `read` and `write`; of eight numbers
         that of the first.
+    value: Number to store.
+    values: Numbers to store, a tuple like `where`; in `store8` eight, or one for all of them.
     first: First of the `lane_width(array)` columns.
     matrix: Symmetric matrix.
     rows: Number of rows.
@@ -74,14 +76,7 @@ def read(array: Vector, where: T, *index: int) -> T:
 
 
 def write(array: Vector, values: tuple[Scalar, ...], where: tuple[int, ...], *index: int) -> None:
-    """Write numbers along the first axis of a packed array.
-
-    Args:
-        array: Packed array.
-        values: The numbers, a tuple.
-        where: Their offsets, as many.
-        index: Their place on the other axes.
-    """
+    """Write numbers along the first axis of a packed array."""
     for place, value in zip(where, values, strict=True):
         array[(place, *index)] = value
 
@@ -92,13 +87,7 @@ def load_element(array: Vector, *index: int) -> Scalar:
 
 
 def store_element(array: Vector, value: Scalar, *index: int) -> None:
-    """Store a number in an array.
-
-    Args:
-        array: Vector, or an array with further axes.
-        value: Number to store.
-        index: Index of the element, by axis.
-    """
+    """Store a number in an array."""
     array[index] = value
 
 
@@ -139,13 +128,7 @@ def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
 
 
 def store8(array: Matrix, values: Scalar, *index: int) -> None:
-    """Store eight numbers, or one number eight times, as neighbours.
-
-    Args:
-        array: The matrix or vector.
-        values: Eight numbers, or one number.
-        index: Index of the first of them.
-    """
+    """Store eight numbers, or one number eight times, as neighbours."""
     *row, first = index
     array[(*row, slice(first, first + 8))] = values
 

@@ -20,6 +20,7 @@ from .parameters import GRAVITY, Vehicle
 
 Car: TypeAlias = Any  # `CarParams` of `dynamics`, which imports this file
 State: TypeAlias = Any  # its `Motion` or `Velocity`
+Axles: TypeAlias = tuple[Scalar, Scalar]  # a number of the front axle, one of the rear
 Variant: TypeAlias = Any  # a `PlantVariant`, or the engine's `StepVariant`, which has its fields
 
 TYRE_LAWS = ("linear", "fiala", "dugoff", "magic-formula")
@@ -225,18 +226,14 @@ def _split_slip_tangents(
 
 
 @jit
-def _compute_slips(
-    motion: State, load: TyreLoad, car: Car, small_angle: int
-) -> tuple[Scalar, Scalar]:
+def _compute_slips(motion: State, load: TyreLoad, car: Car, small_angle: int) -> Axles:
     """Compute the tangents (front, rear) of the slip angles, positive for a force to the left."""
     across_f, along_f, across_r, along_r = _split_slip_tangents(motion, load, car, small_angle)
     return across_f / along_f, across_r / along_r
 
 
 @jit
-def compute_slip_rates(
-    motion: State, load: TyreLoad, car: Car, small_angle: int
-) -> tuple[Scalar, Scalar]:
+def compute_slip_rates(motion: State, load: TyreLoad, car: Car, small_angle: int) -> Axles:
     """Compute the rates (1/s) at which the slip of relaxing tyres follows, of (front, rear).
 
     sigma dt'/dt = |v_along| (t - t'): Pacejka (2006), (7.7). Without a length both are zero.
@@ -249,9 +246,7 @@ def compute_slip_rates(
 
 
 @jit
-def _compute_relaxed_slips(
-    motion: State, load: TyreLoad, car: Car, small_angle: int
-) -> tuple[Scalar, Scalar]:
+def _compute_relaxed_slips(motion: State, load: TyreLoad, car: Car, small_angle: int) -> Axles:
     """Compute the tangents (front, rear) that act: the states, or without a length the slips."""
     t_f, t_r = motion.slip_f, motion.slip_r
     is_rigid = car.relaxation == 0.0
@@ -262,7 +257,7 @@ def _compute_relaxed_slips(
 
 
 @inline
-def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> tuple[Scalar, Scalar]:
+def _compute_load_transfer(motion: State, car: Car, g_y: Scalar) -> Axles:
     """Fractions (-0.9 to 0.9) of its load that the front and the rear left wheel give to the right.
 
     The suspension transmits K_x phi + C_x phi_dot; the moment of the rest of the car's height,

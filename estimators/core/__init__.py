@@ -9,11 +9,17 @@ Args:
     f: Memory of a filter, or a block of lanes where a function takes one.
     gains: Tables of gains, shape (cells, rows, columns).
     layers: Memory of an estimator: (1,), or (2,), of which the second measures the first's states.
+    record: Rows and packets to process.
+    start: Number of its rows that are done already.
+    outputs: Arrays to fill.
+    observed: Observation and outputs.
     s: Index of a slow sensor.
     i: Index of a row of its measurement, or of a fast measurement.
     row: Row of C, shape (n,).
+    frame: Place of a frame in the schedule, or f.pattern for between samples.
     captured: Captured tick of a sample.
     target: What a sample measures: its first clone, or a code of `late_samples`.
+    is_gated: Whether the gate judges a sample and its NIS is taken: not once more when rewound.
     k: Row of the present table of gains.
     residual: Measurement minus its prediction.
     fast_row: Fast row, shape (FAST_WIDTH,).

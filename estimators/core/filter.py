@@ -259,15 +259,7 @@ def write_estimate(layers: FilterLayers, gains: GainTables, x: Vector, P: Matrix
 def advance(
     layers: FilterLayers, gains: GainTables, record: StepRecord, start: int, outputs: FilterOutputs
 ) -> int:
-    """Process a record's rows from `start` on and its packets; return rows done, to go on there.
-
-    Args:
-        layers: Memory, shape (1,); or (2,), of which the second measures what the first estimates.
-        gains: Tables of gains of the first layer, shape (cells, rows, columns).
-        record: Rows and packets.
-        start: Number of rows that are done already.
-        outputs: Arrays to fill.
-    """
+    """Process a record's rows from `start` on and its packets; return rows done, to go on there."""
     fast, rows, packets, count = record
     X, S, nis = outputs
     f = layers[0]
@@ -327,20 +319,12 @@ def _compute_nees(
 
 @noinline
 def observe(
-    filters: Vector, gains: Matrix, record: StepRecord, start: int, observed: Observed
+    layers: FilterLayers, gains: GainTables, record: StepRecord, start: int, observed: Observed
 ) -> int:
-    """Advance the filter and write the observation; return the rows done as `advance` does.
-
-    Args:
-        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        record: Record to process.
-        start: Number of fast rows that are done already.
-        observed: Observation and outputs.
-    """
+    """Advance the filter and write the observation; return the rows done as `advance` does."""
     obs, (inner, plan, limits), beta, gamma, out, summary = observed
     nothing = FilterOutputs(record.fast[:0], record.fast[:0], summary[:0])
-    done = advance(filters, gains, record, start, nothing)
+    done = advance(layers, gains, record, start, nothing)
     if done < record.rows:
         return done
     for i in range(inner):
@@ -348,10 +332,10 @@ def observe(
     m, beta_at, gamma_at = len(plan), -1, -1
     for i in range(m):
         layer, state = 0, plan[i, 0]
-        while state >= filters[layer].n:
-            state -= filters[layer].n
+        while state >= layers[layer].n:
+            state -= layers[layer].n
             layer += 1
-        f = filters[layer]
+        f = layers[layer]
         value = f.x[state]
         if plan[i, 1] == 1:
             value = wrap(value)
@@ -362,7 +346,7 @@ def observe(
             beta_at = state
         elif plan[i, 2] == 2:
             gamma_at = state
-    f = filters[0]
+    f = layers[0]
     summary[0], summary[1] = f.x[0], _compute_deviation(f, gains, 0)
     nees = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
     summary[2] = nees / maximum(compute_excess(f), 1.0)  # lost, it is less sure

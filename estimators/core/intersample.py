@@ -35,13 +35,7 @@ def locate_step_row(f: FilterMemory) -> Scalar:
 
 @jit
 def locate_frame_row(f: FilterMemory, s: int, frame: int) -> Scalar:
-    """Locate the gain of a sensor's first row for a frame.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        frame: Place of the frame in the schedule, or f.pattern for between samples.
-    """
+    """Locate the gain of a sensor's first row for a frame."""
     return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]
 
 

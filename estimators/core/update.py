@@ -79,15 +79,7 @@ def _correct(f: FilterMemory, s: int, target: int) -> None:
 
 @noinline
 def update_filter(f: FilterMemory, gains: GainTables, s: int, target: int, is_gated: bool) -> bool:
-    """Correct by a slow sensor's sound packet in f.sample; False if the gate refuses it.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-        target: What the sample measures, from `find_target`.
-        is_gated: Whether the gate judges it and its NIS is taken: not once more when rewound.
-    """
+    """Correct by a slow sensor's sound packet in f.sample; False if the gate refuses it."""
     if is_gated:
         f.nis = np.nan
     previous_fix = f.first_fix

@@ -50,13 +50,11 @@ _FLOATS: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...] = (
     ((N_FAST, 2), ("y_factor",)),
     ((N_INPUTS,), ("u", "u_new")),
     ((FAST_WIDTH,), ("row",)),  # of this tick
-)
-# of a lane: ticks are those of now, of the last row, of the next packet to take and capture;
-# model_speed, 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds
-# is of no use; apart, 1: its tick is computed alone; wild, 1: its residual is not finite
-_SCALARS = (
-    *("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn"),
-    *("now", "last", "due", "next", "here", "apart", "wild"),
+    # ticks are those of now, of the last row, of the next packet to take and capture; model_speed,
+    # 0: no model was loaded; here, 1: its filter has a row now, else what the lane holds is of no
+    # use; apart, 1: its tick is computed alone; wild, 1: its residual is not finite
+    ((), ("speed", "speed_before", "model_speed", "smoothing", "step", "road_turn")),
+    ((), ("now", "last", "due", "next", "here", "apart", "wild")),
 )
 # of a lane: whether its filter has the block's shape, tick, step within the cycle, table of gains,
 # packets done
@@ -66,11 +64,7 @@ _SHAPE = (  # what the filters of a block share
     *("stored", "robust", "u_column", "y_column"),
 )
 _FIELDS = (
-    [
-        (name, np.float64, (*shape, LANES))
-        for shape, names in (*_FLOATS, ((), _SCALARS))
-        for name in names
-    ]
+    [(name, np.float64, (*shape, LANES)) for shape, names in _FLOATS for name in names]
     + [(name, np.int64, (LANES,)) for name in _INTS]
     + [(name, FILTER[name]) for name in _SHAPE]
     + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
