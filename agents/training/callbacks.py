@@ -39,7 +39,6 @@ with require_extra("train", "training needs {}"):
     from safetensors import SafetensorError, safe_open
     from safetensors.torch import load_file, save
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.logger import KVWriter
     from stable_baselines3.common.utils import get_device, get_latest_run_id
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
@@ -81,7 +80,6 @@ class RunOptions:
     tensorboard_log: str | None = None  # folder for TensorBoard
     report: "Callable[[EvalCallback], None] | None" = None  # called after every rollout
     command: str = ""  # command line, for the policy's card
-    track: str = ""  # project of Weights & Biases, "" for none
 
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
@@ -156,7 +154,6 @@ class EvalCallback(BaseCallback):
         self.period = float(base.control_period * base.dt)  # of control (s)
         rows = checkpoint.evaluations if checkpoint else []
         self.evaluations = [Evaluation(*row) for row in rows]
-        self.writers: list[KVWriter] = []  # further ones of the log
         uncontrolled = self._average_scenarios(evaluate_episodes(self.env, None, self.seeds)[0])
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
@@ -185,9 +182,6 @@ class EvalCallback(BaseCallback):
         """Average the costs of an evaluation by scenario, shape (k,)."""
         k = max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
-
-    def _on_training_start(self) -> None:
-        self.logger.output_formats += self.writers
 
     def _on_step(self) -> bool:
         return True

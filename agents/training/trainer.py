@@ -9,7 +9,6 @@ import json
 import math
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -38,7 +37,6 @@ from .normalise import (
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
-from stable_baselines3.common.logger import KVWriter  # isort: skip
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
 from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
@@ -125,7 +123,7 @@ class Trainer:
     A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
     and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
     actions before weights change. Raises ValueError for another training's folder or arguments that
-    contradict each other, ModuleNotFoundError without TensorBoard or Weights & Biases.
+    contradict each other, ModuleNotFoundError for a log without TensorBoard.
     """
 
     task: TrainingTask
@@ -151,10 +149,8 @@ class Trainer:
                 self.initial = load_policy(agent)
             else:
                 check_zip(Path(agent))
-        logs = {"tensorboard": self.run_options.tensorboard_log, "wandb": self.run_options.track}
-        for package, is_wanted in logs.items():
-            if is_wanted and find_spec(package) is None:
-                raise ModuleNotFoundError(f"a log for {package} needs it: pip install {package}")
+        if self.run_options.tensorboard_log and find_spec("tensorboard") is None:
+            raise ModuleNotFoundError("a log for tensorboard needs it: pip install tensorboard")
         torch.set_num_threads(1)  # on small matrices threads only wait for each other
         self._checkpoint: Checkpoint | None = None
         if self.resume:
@@ -169,7 +165,7 @@ class Trainer:
     def train(self) -> EvalCallback:
         """Train up to the number of steps; the callback has the model and its evaluations."""
         callback, file = self.build(), self._folder / INITIAL_FILE
-        policy, model, run = callback.initial, callback.model, None
+        policy, model = callback.initial, callback.model
         if self._checkpoint is None:
             file.unlink(missing_ok=True)  # of one without a checkpoint
             if policy is not None:
@@ -177,19 +173,12 @@ class Trainer:
         done = model.num_timesteps
         if done < self.steps:
             log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=self.task.algo)
-            if project := self.run_options.track:
-                names = dict[str, Any](project=project, name=self._folder.name)
-                run = import_module("wandb").init(**names, config=asdict(self.task))
-                callback.writers.append(_RunWriter(run))
             try:
                 model.learn(self.steps - done, callback=callback, **log)
                 callback.evaluate()
             except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
                 callback.check()
                 raise
-            finally:
-                if run is not None:
-                    run.finish()
         return callback
 
     def build(self) -> EvalCallback:
@@ -309,16 +298,3 @@ def _measure_reward_scale(agent: "Agent", env: VecEnv, seed: int, steps: int) ->
     for car_scales, open_scale in zip(scales, lengths / (costs + COST_FLOOR), strict=True):
         car_scales.append(float(np.median(car_scales or [open_scale])))
     return scales
-
-
-class _RunWriter(KVWriter):
-    """Writes the log of stable-baselines3 to a run of Weights & Biases."""
-
-    def __init__(self, run: Any) -> None:
-        self._run = run
-
-    def write(self, key_values: dict[str, object], key_excluded: object, step: int = 0) -> None:
-        self._run.log(dict(key_values), step=step)  # the logger empties its own
-
-    def close(self) -> None:
-        """Do nothing: the last evaluation comes after the training's end."""

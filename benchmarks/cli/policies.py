@@ -245,8 +245,6 @@ class _Train:
     eval_freq: int | None = take("Steps between two evaluations (250000).")
     n_eval_envs: int | None = take("Episodes of an evaluation (256).", min=1)
     tensorboard_log: Text = take("A folder for TensorBoard.", None, "--tensorboard-log", "-tb")
-    track: bool = take("Log to Weights & Biases.", False, "--track")
-    wandb_project_name: str = take("With --track.", "sideslip")
     device: str = take("Of the networks, as torch calls it.", "cpu")
     progress: bool = take("Show a bar.", True, "--progress/--no-progress", "-P")
     trained_agent: File = take("Begin with an sb3 zip or a policy.", None, "--trained-agent", "-i")
@@ -302,8 +300,7 @@ class _Train:
             command = shlex.join(_make_command(named, steps, more))
         console = Console()
         with use_shared_bar(console if self.progress else None, "train", "steps", steps) as bar:
-            project, show = self.wandb_project_name if self.track else "", partial(_show, bar)
-            logged = self.tensorboard_log, show, command, project
+            logged = self.tensorboard_log, partial(_show, bar), command
             run_options = callbacks.RunOptions(eval_freq, self.device, *logged)
             if logs is not None:
                 callbacks.describe_for_zoo(task, folder, steps, eval_freq)

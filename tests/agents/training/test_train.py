@@ -10,7 +10,6 @@ import time
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -193,29 +192,13 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
         read_training(tmp_path)
 
 
-def test_a_tracked_training_hands_over_what_is_logged(
+def test_a_log_without_its_package_is_refused_before_a_folder_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One run: named as the folder, told the task, given evaluations and losses, and ended."""
-    run = Mock()
-    monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init, __spec__="there"))
-    trainer.Trainer(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars")).train()
-    assert run.init.call_args.kwargs["project"] == "cars"
-    assert run.init.call_args.kwargs["name"] == "mine"
-    assert run.init.call_args.kwargs["config"]["env_id"] == TINY.env_id
-    own = run.init.return_value
-    logged = [(each.kwargs["step"], each.args[0]) for each in own.log.call_args_list]
-    lines = [json.loads(line) for line in (tmp_path / "mine" / CURVE).read_text().splitlines()]
-    rewards = {
-        step: each["eval/mean_reward"] for step, each in logged if "eval/mean_reward" in each
-    }
-    assert rewards == {each["steps"]: -each["cost"] for each in lines}
-    assert any("train/loss" in each for _, each in logged)
-    own.finish.assert_called_once_with()
-    assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(ModuleNotFoundError, match="a log for wandb needs it: pip install wandb"):
-        trainer.Trainer(TINY, 9, tmp_path / "other", run_options=RunOptions(track="cars"))
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    options = RunOptions(tensorboard_log="logs")
+    with pytest.raises(ModuleNotFoundError, match="a log for tensorboard needs it"):
+        trainer.Trainer(TINY, 9, tmp_path / "other", run_options=options)
     assert not (tmp_path / "other").exists()
 
 
