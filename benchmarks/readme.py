@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -199,17 +200,6 @@ def _replace_table(text: str, new_table: str) -> str:
     return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def _write_tables(rows: Sequence[ResultRow]) -> None:
-    """Write rows and the tables made of them, in the repository's root."""
-    transfer = read_json(TRANSFER) if TRANSFER.is_file() else []
-    readme = _replace_table(README.read_text(encoding="utf-8"), _make_table(rows, transfer))
-    page = _replace_table(PAGE.read_text(encoding="utf-8"), _make_task_table(rows))
-    page = _replace_table(page, _make_doubled_table(rows))
-    write_json(ROWS, rows)
-    write_text(README, readme)
-    write_text(PAGE, page)
-
-
 PAPERS, SYSTEM_ROWS = Path("docs/PAPERS.md"), Path("docs/own_ground.json")
 _TIER = next(iter(TIERS))  # of the papers' car
 SYSTEM_EPISODES = 32  # a task
@@ -348,13 +338,18 @@ def _main(
 ) -> None:
     """Drive README's entries, or the papers' systems, and write their rows and tables."""
     console, salt = Console(stderr=True), salt or make_salt()
+    file, measure_rows = (SYSTEM_ROWS, _measure_systems) if papers else (ROWS, _measure_entries)
+    rows = read_json(file) if driven else measure_rows(salt, jobs, console, keep)
+    tables = [(PAPERS, _make_system_table)]
     if not papers:
-        _write_tables(read_json(ROWS) if driven else _measure_entries(salt, jobs, console, keep))
-        return
-    rows = read_json(SYSTEM_ROWS) if driven else _measure_systems(salt, jobs, console, keep)
-    text = _replace_table(PAPERS.read_text(encoding="utf-8"), _make_system_table(rows))
-    write_json(SYSTEM_ROWS, rows)
-    write_text(PAPERS, text)
+        pages = (PAGE, _make_task_table), (PAGE, _make_doubled_table)
+        tables = [(README, partial(_make_table, transfer=read_json(TRANSFER))), *pages]
+    texts = {page: page.read_text(encoding="utf-8") for page, _ in tables}
+    for page, make_table in tables:
+        texts[page] = _replace_table(texts[page], make_table(rows))
+    write_json(file, rows)
+    for page, text in texts.items():
+        write_text(page, text)
 
 
 if __name__ == "__main__":

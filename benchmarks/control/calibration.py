@@ -66,7 +66,6 @@ class ClairvoyantEpisode:
 class CalibrationRecord(TaskRecord):
     """A task's episodes, and the command that made them."""
 
-    world_version: int
     command: str
     episodes: tuple[ClairvoyantEpisode, ...]
 

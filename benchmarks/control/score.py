@@ -100,11 +100,6 @@ class Standing:
     nominal: Mapping[ControlTask, DriveResult]  # nominal's drives, where it could drive
     us: float = math.nan  # time of a decision (us)
 
-    @property
-    def label(self) -> str:
-        """Name in tables and figures."""
-        return self.entry.label
-
     @cached_property
     def drives(self) -> dict[ControlTask, DriveResult]:
         """Results of the tasks without an error."""
@@ -158,15 +153,11 @@ class Standing:
         return stats.is_share_larger(*~np.concatenate([pair.finished for pair in pairs], axis=1))
 
     @property
-    def is_partial(self) -> bool:
-        """Whether it did not drive every task: who leaves out what it does badly is not ranked."""
-        return any(result.error for result in self.results.values())
-
-    @property
     def rank(self) -> tuple[int, float]:
         """Key of the order: smaller is better; what has no number comes last."""
         value = self.overall.get("score", Estimate(math.nan)).value
-        below = 2 * self.loses_more + self.is_partial
+        # who leaves out what it does badly stands below those that drove every task
+        below = 2 * self.loses_more + any(result.error for result in self.results.values())
         return below, float(np.nan_to_num(-value, nan=np.inf))
 
     @property

@@ -321,7 +321,7 @@ _CostRatios = dict[tuple[str, str], Estimate]
 
 def _compare_entries(results: Results) -> _CostRatios:
     """Compute exp(-r) of each entry beside each other's, averaged, by their labels."""
-    ranking = _Ranking({item.label: item.scores for item in rank_entries(results, None)})
+    ranking = _Ranking({item.entry.label: item.scores for item in rank_entries(results, None)})
     rivals = ranking.ranked.items()
     return {(one, other): ratio for one, ratios in rivals for other, ratio in ratios.items()}
 

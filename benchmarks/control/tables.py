@@ -83,7 +83,7 @@ def make_main_table(
         marked: A user's entries, beside which no decision is timed; None: the matrix.
     """
     lines: list[Line] = [
-        {"label": f"> {x.label}" if x.entry in (marked or ()) else x.label, "n": x.n, "us": x.us}
+        {"label": "> " * (x.entry in (marked or ())) + x.entry.label, "n": x.n, "us": x.us}
         | x.overall
         | {"tasks": (len(x.pairs), len(x.results))}
         for x in ranked
@@ -101,7 +101,7 @@ def make_task_table(
     """Make the table of the scores, every entry in every task."""
     columns = (_LABEL, *(Column(task.name, form="{:.2f} ({:.0f})") for task in tasks))
     lines: list[Line] = [
-        {"label": item.label} | {task.name: _make_cell(item, task) for task in tasks}
+        {"label": item.entry.label} | {task.name: _make_cell(item, task) for task in tasks}
         for item in ranked
     ]
     note = "Score, the mean r; in brackets failures in percent."
@@ -123,7 +123,7 @@ def _make_cell(standing: Standing, task: ControlTask) -> tuple[float, float] | s
 
 def _make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
     lines = [
-        {"label": x.label, "part": 1e-4 * x.us / _PERIOD}
+        {"label": x.entry.label, "part": 1e-4 * x.us / _PERIOD}
         | {metric.name: x.mean(metric.name) for metric in _SHOWN}
         for x in ranked
     ]
@@ -155,7 +155,7 @@ def _list_upsets(matrix: Matrix) -> list[str]:
             both = [(r, best[task]) for task, r in item.scores.items() if task in best]
             if both:
                 lead = np.concatenate([a[: len(b)] - b[: len(a)] for a, b in both])
-                leads[f"{item.label} in tier {tier}"] = lead
+                leads[f"{item.entry.label} in tier {tier}"] = lead
     tested = {text: lead for text, lead in leads.items() if len(lead) > 1 and np.ptp(lead) > 0.0}
     level = 0.05 / max(len(tested), 1)  # Bonferroni's
     return [

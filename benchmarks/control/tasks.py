@@ -114,13 +114,14 @@ class ControlTask:
 
 @dataclass(frozen=True)
 class TaskRecord:
-    """The task of an entry of a file."""
+    """The task of an entry of a file, and the world in which it was measured."""
 
     tier: str
     env_id: str
     vehicle: str
     reference: str
     scenario: str
+    world_version: int
 
     @property
     def task(self) -> ControlTask:
@@ -132,7 +133,6 @@ class TaskRecord:
 class TaskMeasurement(TaskRecord):
     """A candidate with what was measured on tuning seeds: an entry of the file."""
 
-    world_version: int
     oracle: str  # better of `ORACLES` for state
     knowing: str  # better of `ORACLES` for parameters
     peak_slip: float  # median peak of the slip angle without control (deg)

@@ -227,7 +227,6 @@ class BaselineRecord(TaskRecord):
     estimator: str
     controller: str
     salt: str
-    world_version: int
     costs: list[float]
     failures: list[int]
 

@@ -112,7 +112,7 @@ def _make_sentence(standing: Standing) -> str:
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
     if score is None:
         why = f"not driven: {errors[0]}" if errors else "nominal is not driven"
-        return f"{standing.label}: {why}"
+        return f"{standing.entry.label}: {why}"
     below = "surely below" if score.high < 0.0 else "not told apart from"
     where = "surely above" if score.low > 0.0 else below
     finished = np.concatenate([x.finished for x in standing.pairs.values()], axis=1)
@@ -126,7 +126,7 @@ def _make_sentence(standing: Standing) -> str:
         won = 100.0 * standing.overall["share_won"].value
         cost = format_percent(standing.overall["cost_vs_nominal"])
         parts += [f"costs {cost} of nominal where both finish", f"and wins {won:.0f} % of these"]
-    text = f"{standing.label}: {', '.join(parts)}"
+    text = f"{standing.entry.label}: {', '.join(parts)}"
     if errors:
         text += f"; not driven in {len(errors)} of {len(standing.results)} tasks: {errors[0]}"
     return text

@@ -252,10 +252,8 @@ def _check_bias(drive: InspectedDrive) -> Iterator[LogFinding]:
         limit = 2.0 * _ALLOWED["accel_bias_sd"]
         text, cure = f"offset {offset:.2f} m/s2", "subtract it from the column"
         yield _judge("bias", "accel_y", abs(offset) > limit, text, cure)
-    car = drive.car
-    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    under = max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
-    needed = (turning / speed - bias) * (car.wheelbase / speed + under * speed)
+    under = quality.compute_understeer(drive.car)
+    needed = (turning / speed - bias) * (drive.car.wheelbase / speed + under * speed)
     offset, limit = float(np.median(steer - needed)), 2.0 * _ALLOWED["steer_offset_sd"]
     text = f"offset {offset * _DEGREES:.2f} deg at the wheels"
     cure = f"--steering-offset {(drive.wires.offset - offset) * _DEGREES:.2f}"

@@ -165,11 +165,16 @@ def _describe_contradiction(
     return [_make_finding("unit", column, text, cure)]
 
 
+def compute_understeer(car: Vehicle) -> float:
+    """Compute the understeer gradient (rad s2/m) of a car, 0 for one that oversteers."""
+    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
+    return max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
+
+
 def fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
     """Fit the linear car's steering for its yaw rate over the logged one; None if constant."""
     speed, gyro, steer, accel_y = smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
-    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
+    under = tyres * compute_understeer(car)
     slides = np.abs(accel_y - speed * gyro) > (1.0 if accel_y.any() else math.inf)
     used = (np.abs(speed * gyro) < _MILD) & ~slides
     used |= (used.sum() < _FEW) | (not steady)

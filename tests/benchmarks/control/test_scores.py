@@ -78,7 +78,7 @@ def test_below_the_line_stand_those_that_surely_lose_more_cars() -> None:
     results = {(TASK, Entry(name)): result for name, result in entries.items()}
     results[TASK, Entry(NOMINAL)] = nominal
     ranked = rank_entries(results, "road")
-    assert [item.label for item in ranked][-1] == "sure" and ranked[-1].loses_more
+    assert [item.entry.label for item in ranked][-1] == "sure" and ranked[-1].loses_more
     assert not any(item.loses_more for item in ranked[:-1])
 
 
@@ -90,8 +90,8 @@ def test_who_leaves_out_a_task_is_ranked_behind_who_drives_it() -> None:
     results |= {(TASK, Entry("part")): driven([1.0] * 10)}
     results[other, Entry("part")] = replace(driven([1.0] * 10), error="ValueError: no, thanks")
     ranked = rank_entries(results, "road")
-    assert [item.label for item in ranked] == ["nominal", "whole", "part"]
-    assert [item.is_partial for item in ranked] == [False, False, True]
+    assert [item.entry.label for item in ranked] == ["nominal", "whole", "part"]
+    assert [item.rank[0] for item in ranked] == [0, 0, 1]
 
 
 def test_a_larger_share_is_sure_by_the_sign_of_what_differs() -> None:

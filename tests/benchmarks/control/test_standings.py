@@ -112,7 +112,7 @@ def test_won_are_episodes_that_both_finish() -> None:
 
 def test_who_loses_a_few_cars_more_stands_above_the_line() -> None:
     some = results(nominal=2, lqr=3)
-    standing = {each.label: each for each in table(some)}
+    standing = {each.entry.label: each for each in table(some)}
     lqr = standing[f"lqr on {REFERENCE_FILTER}"]
     assert lqr.overall["failure_rate"].value == 3 / 40 and lqr.n == 80
     assert [each.entry.agent for each in table(some)][:2] == [STATE, "lqr"]
@@ -144,7 +144,7 @@ def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
 def test_a_contest_that_nominal_alone_loses_counts_for_the_others() -> None:
     found = results()
     found[TWO, Entry(NOMINAL)] = episodes(9.0, 40)
-    standing = {each.label: each for each in table(found)}
+    standing = {each.entry.label: each for each in table(found)}
     assert all(len(each.pairs) == 2 for each in standing.values())
     assert standing["none"].by_task[TWO]["score"].value == 2.0
     assert "cost_vs_nominal" not in standing["none"].by_task[TWO]
