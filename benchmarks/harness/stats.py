@@ -45,13 +45,14 @@ class Estimate(NamedTuple):
         return Estimate(*(factor * number for number in self))
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
-        """Format the number and, in brackets, its interval if there is one.
+        """Format the number and, in brackets, its interval if there is one; thousands in full.
 
         Args:
             scale: Factor of the numbers.
             digits: Format of the numbers.
         """
-        value, low, high = (f"{scale * number:{digits}}" for number in self)
+        texts = (f"{scale * number:{digits}}" for number in self)
+        value, low, high = (f"{float(x):.0f}" if "e+" in x else x for x in texts)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 

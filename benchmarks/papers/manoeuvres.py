@@ -60,7 +60,7 @@ def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[s
 
 @dataclass(frozen=True)
 class EstimationSimulation(Simulation):
-    """Filters over the drives of a scenario, without control.
+    """Filters over the drives of a scenario that draws no car, without control.
 
     Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on, and
     "square", the mean square of beta's error (rad2); "outage", beta's RMSE while the GPS is out;
@@ -147,7 +147,8 @@ class Driver(NamedTuple):
 
 @dataclass(frozen=True)
 class ControlSimulation(Simulation):
-    """Controllers at 1 ms over the drives of a scenario; their filters know the camera's noise.
+    """Controllers at 1 ms over the drives of a scenario; their filters know the camera's noise,
+    unless `estimate` has options.
 
     Numbers of each: RMS of the slip, and of slip's and yaw rate's errors; peak of the slip; of the
     yaw moment the largest change in 1 ms, the sum of all changes, and the fractions of time at

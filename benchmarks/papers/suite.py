@@ -37,10 +37,10 @@ _TEXT = (
 )
 
 
-Results = tuple[list[MeasuredClaim], dict[str, SeedResult]]  # the first seeds' by simulation
+LedgerResults = tuple[list[MeasuredClaim], dict[str, SeedResult]]  # the first seeds' by simulation
 
 
-def _measure(request: Request) -> Results:
+def _measure(request: Request) -> LedgerResults:
     seeds = request.episodes or 0
     counts = [max(1, round(x.share * seeds)) for x in SIMULATIONS.values()]
     runs = request.run_seeds(run_simulation, list(SIMULATIONS.values()), counts, CHUNK, NAME)
@@ -53,7 +53,7 @@ def _measure(request: Request) -> Results:
     return ledger, {name: run[0] for name, run in by_name.items()}
 
 
-def _compose_verdict(results: Results) -> str:
+def _compose_verdict(results: LedgerResults) -> str:
     ledger, _ = results
     counted = Counter(entry.verdict for entry in ledger)
     papers = dict.fromkeys(entry.paper for entry in ledger)
@@ -81,7 +81,7 @@ _RANGE_NOTE = (
 )
 
 
-def _add_tables(suite: Suite, results: Results) -> None:
+def _add_tables(suite: Suite, results: LedgerResults) -> None:
     verdicts, remarks, numbers = [], [], dict[str, list[Line]]()
     for entry in results[0]:
         claim = entry.claim
@@ -120,7 +120,7 @@ def _make_line(source: str, item: MeasuredPart) -> Line:
 _SIGNALS = {"beta": "sideslip angle / rad", "yaw_moment": "yaw moment / (N m)"}
 
 
-def _add_figures(suite: Suite, results: Results, draw: ModuleType) -> None:
+def _add_figures(suite: Suite, results: LedgerResults, draw: ModuleType) -> None:
     """Draw the signals of the first seed of each simulation."""
     for (name, first), (signal, label) in product(results[1].items(), _SIGNALS.items()):
         curves = first.curves.items()

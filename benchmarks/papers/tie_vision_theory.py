@@ -60,7 +60,7 @@ def _compute_residuals(seed: int) -> Numbers:
     C = rng.normal(size=(OUTPUTS, STATES))
     w, v = draw_arrays(STATES)[:STEPS], draw_arrays(OUTPUTS)[1:]
     start = rng.normal(size=STATES)
-    M, ones = [np.eye(STATES) - k @ C for k in K], [np.eye(STATES)] * STEPS
+    M, identities = [np.eye(STATES) - k @ C for k in K], [np.eye(STATES)] * STEPS
     corrected = [m @ g for m, g in zip(M, G, strict=True)]
     ideal = predicted = compensated = exact = start
     for g, w_i, k, v_i, m in zip(G, w, K, v, M, strict=True):
@@ -69,16 +69,20 @@ def _compute_residuals(seed: int) -> Numbers:
         predicted = g @ predicted + w_i  # no correction between samples
         compensated = g @ compensated + w_i - k @ v_i  # v stands for any pseudo-residual
         exact = m @ g @ exact + w_i  # with the exact residual C G e
+    # what is left of the first error without corrections, and with; printed: G_1 for each G_i
     free, damped = _multiply(G) @ start, _multiply(corrected) @ start
     minus_v, printed = [-x for x in v], [G[1]] * STEPS
     Mw = [m @ x for m, x in zip(M, w, strict=True)]
     cases = {
         "case 1": (_add_terms(damped, corrected, (M, w), (K, minus_v)), ideal),
-        "case 2": (_add_terms(free, G, (ones, w)), predicted),
-        "case 3 (a)": (_add_terms(free, G, (ones, w), (K, minus_v)), compensated),
-        "case 3 (a), printed": (_add_terms(free, printed, (ones, w), (K, minus_v)), compensated),
-        "case 3 (b)": (_add_terms(damped, corrected, (ones, w)), exact),
-        "case 3 (b), printed": (_add_terms(damped, corrected, (ones, Mw)), exact),
+        "case 2": (_add_terms(free, G, (identities, w)), predicted),
+        "case 3 (a)": (_add_terms(free, G, (identities, w), (K, minus_v)), compensated),
+        "case 3 (a), printed": (
+            _add_terms(free, printed, (identities, w), (K, minus_v)),
+            compensated,
+        ),
+        "case 3 (b)": (_add_terms(damped, corrected, (identities, w)), exact),
+        "case 3 (b), printed": (_add_terms(damped, corrected, (identities, Mw)), exact),
     }
     return {(name, "residual"): _compute_residual(*pair) for name, pair in cases.items()}
 

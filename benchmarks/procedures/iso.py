@@ -132,10 +132,11 @@ _SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope
 
 
-def _compute_understeer(series: Series, car: TestCar) -> float:
-    """Compute a circle's understeer gradient K (rad s2/m); ValueError where it stays below 0.25 g.
+def _fit_understeer(series: Series, car: TestCar) -> tuple[float, float]:
+    """Fit delta_f = l / R + K a_y + b on a circle: K (rad s2/m) and b (rad), of the linear car 0.
 
-    By ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y: delta_f = l / R + K a_y.
+    By ISO 4138's handling diagram, l gamma / v_x - delta_f over a_y; ValueError where the circle
+    stays below 0.25 g.
     """
     settled = series.t >= _SETTLE
     side = np.sign(np.mean(series.gamma[settled]))
@@ -145,7 +146,8 @@ def _compute_understeer(series: Series, car: TestCar) -> float:
     linear = (a_y >= LINEAR_FROM) & (a_y <= LINEAR_TO)
     if a_y.max() < LINEAR_TO or linear.sum() < 2:
         raise ValueError(f"the circle reached {a_y.max():.2f} m/s2, not {LINEAR_TO:.2f}")
-    return -float(np.polyfit(a_y[linear], angle[linear], 1)[0])
+    slope, offset = np.polyfit(a_y[linear], angle[linear], 1)
+    return -float(slope), -float(offset)
 
 
 def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> float:
@@ -164,7 +166,7 @@ def run_circle(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> flo
         "speed_change": v - first, "change_start": _SETTLE, "change_length": seconds,
         "duration": _SETTLE + seconds,
     }  # fmt: skip
-    return _compute_understeer(drive(circle), car)
+    return _fit_understeer(drive(circle), car)[0]
 
 
 LOWEST, HIGHEST = 0.2, 2.0  # Hz

@@ -277,7 +277,7 @@ def _add_figures(suite: Suite, done: CaseResults, draw: ModuleType) -> None:
     """Draw tracks with their cones, and frequency responses beside the linear model's."""
     for car in CARS:
         responses = _select_results(done, "iso-7401", car)["none"]
-        for name, unit in (("gamma", "yaw rate / (1/s)"), ("a_y", "a_y / (m/s2/rad)")):
+        for name, unit in zip(iso.OUTPUTS, ("yaw rate / (1/s)", "a_y / (m/s2/rad)"), strict=True):
             sweep, linear = responses[name].sweep, responses[name].linear_sweep
             lines = {"measured": np.abs(sweep.H), "linear model": np.abs(linear)}
             figure = draw.draw_curves(sweep.frequency, lines, "frequency / Hz", unit)

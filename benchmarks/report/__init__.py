@@ -5,5 +5,5 @@ Args:
     suite: Results.
     suites: Results of a run.
     table: Table.
-    path: File, None for none.
+    path: File, None for none where a function takes it.
 """

@@ -35,7 +35,7 @@ class FilmDriver(NamedTuple):
 
 
 def check_film(path: Path | None) -> None:
-    """Check a film's ending (ValueError), folder (OSError), modules (ModuleNotFoundError) first."""
+    """Check a film's ending (ValueError), folder (OSError), and the extra `render` first."""
     if path is None:
         return
     if path.suffix.lower() not in RATES:

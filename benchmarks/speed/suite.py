@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..harness.results import Cell, Column, Line, ResultTable, Suite
-from ..harness.stats import Bound, compute_range
+from ..harness.stats import Bound, Estimate, compute_range
 from ..report.study import Request, Study, format_verdict, summarise_names
 from . import env_steps, plant
 from .timing import FULL, QUICK, TimeTable
@@ -183,19 +183,23 @@ def _add_tables(suite: Suite, tables: Sequence[TimeTable]) -> None:
         table.add_table(suite)
 
 
+def _format(value: float) -> str:
+    return Estimate(value).inline(digits=".3g")
+
+
 def _make_verdict(tables: Sequence[TimeTable]) -> str:
-    us = {name: np.median(taken) for table in tables for name, taken in table.times.items()}
+    us = {x: float(np.median(y)) for table in tables for x, y in table.times.items()}
     step_time, batch_time = us[env_steps.FUSION_V1], us[env_steps.V1_AT_ONCE]
     rivals = (env_steps.CARTPOLE, env_steps.LANE)
-    over = [f"{us[x] / step_time:.3g} for {x}" for x in rivals if x in us]
+    over = [f"{_format(us[x] / step_time)} for {x}" for x in rivals if x in us]
     lines = _evaluate_targets(tables)
     count = sum(line.get("met") == "yes" for line in lines)
-    missed = [f"{line['scenario']} ({line['measured'].value:.3g} of {line['goal']})"
+    missed = [f"{line['scenario']} ({_format(line['measured'].value)} of {line['goal']})"
               for line in lines if line.get("met") == "no"]  # fmt: skip
     shortfall = f"; not met: {summarise_names(missed, 1)}" if missed else ""
     return format_verdict(
-        f"10 ms of driving cost {step_time:.3g} us on one core, {batch_time:.3g} us a car where "
-        f"{env_steps.COUNT} drive at once.",
+        f"10 ms of driving cost {_format(step_time)} us on one core, {_format(batch_time)} us a "
+        f"car where {env_steps.COUNT} drive at once.",
         f"One env-step of ours is 1; it is {' and '.join(over)}." if over else "",
         f"{count} of {len(lines)} goals are met{shortfall}.",
         "Why: one compiled call an env-step, cars side by side in the processor's wide registers.",

@@ -31,8 +31,8 @@ class Effort:
 
     @property
     def quarter(self) -> "Effort":
-        """A quarter of the rounds, for what is slow."""
-        return replace(self, rounds=max(1, self.rounds // 4))
+        """A quarter of the rounds, three at least, for what is slow."""
+        return replace(self, rounds=max(3, self.rounds // 4))
 
 
 QUICK = Effort(9, 0.01)
@@ -100,6 +100,8 @@ class TimeTable:
             try:
                 made[name] = make()
             except (AbsentError, ModuleNotFoundError) as error:
+                if (getattr(error, "name", None) or "").startswith(__package__.partition(".")[0]):
+                    raise  # a module of this package is no choice
                 self.absent[name] = str(error)
         self.times |= measure_interleaved(made, effort)
         return self

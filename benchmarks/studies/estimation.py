@@ -25,8 +25,8 @@ _COLUMNS = (
 )
 TRUE_MODEL = "exact-kf, true model"
 _UNAIDED = "bicycle-kf"  # without a slow sensor
-Numbers = Mapping[tuple[str, str], Array]  # (seeds,) by filter or `BOUND` and quantity
-Results = list[tuple[Numbers, SeedResult]]  # of each experiment, with its first seed
+JoinedNumbers = Mapping[tuple[str, str], Array]  # (seeds,) by filter or `BOUND` and quantity
+Results = list[tuple[JoinedNumbers, SeedResult]]  # of each experiment, with its first seed
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ def _measure(request: Request) -> Results:
     return [(join_numbers(run), run[0]) for run in runs]
 
 
-def _get_squares(numbers: Numbers) -> dict[str, Array]:
-    """Squared errors (rad2) by filter, the bound's last."""
+def _get_squares(numbers: JoinedNumbers) -> dict[str, Array]:
+    """Get the squared errors (rad2) by filter, the bound's last."""
     return {label: x for (label, quantity), x in numbers.items() if quantity == "square"}
 
 
-def _make_records(numbers: Numbers) -> list[dict[str, Any]]:
+def _make_records(numbers: JoinedNumbers) -> list[dict[str, Any]]:
     records, bound = [], numbers[BOUND, "square"]
     for label, squares in _get_squares(numbers).items():
         record = {"estimator": label, "rmse": interval(squares, root_mean)}

@@ -101,7 +101,7 @@ def _correct_by_split_gains(f: FilterMemory, s: int) -> None:
 
 @inline
 def correct_between(f: FilterMemory, gains: GainTables, s: int) -> None:
-    """Correct by what the rule takes after the fast measurements: all of them, or a pseudo-one."""
+    """Correct by pseudo-residuals, a fraction of an innovation, or all fast residuals at once."""
     if f.gain_rule == GAIN.pseudo:
         _correct_x_and_e(f, gains, s)
     elif f.gain_rule == GAIN.split:

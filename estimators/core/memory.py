@@ -54,7 +54,10 @@ class SkipCounters(NamedTuple):
 
 
 class GainRules(NamedTuple):
-    """Codes of the field `gain_rule`: where gains come from, what corrects between samples."""
+    """Codes of the field `gain_rule`: where gains come from, what corrects between samples.
+
+    The order counts: up to `split` P is there, up to `joint` a tick's residuals come at once.
+    """
 
     covariance: int = 0  # from P, one measurement after the other; nothing between samples
     split: int = 1  # likewise; a sample's gain is split over its period, by pseudo-residuals

@@ -148,7 +148,7 @@ def _find_variance(f: FilterMemory, i: int, residual: float, projected: Scalar) 
 def _correct_by_table(f: FilterMemory, gains: GainTables) -> None:
     """Correct x by fast measurements and the table; jointly: all residuals are taken before.
 
-    Those of pseudo-residuals are applied by `correct_between`.
+    Those of all residuals at once, joint and pseudo, are applied by `correct_between`.
     """
     is_joint = f.gain_rule <= GAIN.joint
     for i in range(f.fasts):

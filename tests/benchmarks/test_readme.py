@@ -110,7 +110,7 @@ def test_an_entry_that_cannot_drive_makes_no_table(monkeypatch: pytest.MonkeyPat
         readme._measure_entries("ab12")
 
 
-def _ratio(numbers: estimation.Numbers, of: str, to: str) -> float:
+def _ratio(numbers: estimation.JoinedNumbers, of: str, to: str) -> float:
     return float(np.sqrt(numbers[of, "square"].mean() / numbers[to, "square"].mean()))
 
 

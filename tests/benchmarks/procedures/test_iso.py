@@ -221,8 +221,9 @@ def steady(vehicle: Vehicle, steer: float, fastest: float) -> Series:
 @CARS
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_steady_states_of_the_linear_car_have_its_gradient(vehicle: Vehicle, side: float) -> None:
-    K = iso._compute_understeer(steady(vehicle, 0.06 * side, 13.0), make_car(vehicle))
+    K, offset = iso._fit_understeer(steady(vehicle, 0.06 * side, 13.0), make_car(vehicle))
     assert pytest.approx(make_car(vehicle).understeer_gradient, rel=1e-6) == K
+    assert abs(offset) < 1e-12
 
 
 @CARS
@@ -237,4 +238,4 @@ def test_the_gradient_is_the_weights_over_the_stiffnesses(vehicle: Vehicle) -> N
 
 def test_a_circle_without_lateral_acceleration_is_refused() -> None:
     with pytest.raises(ValueError, match=r"circle reached .* m/s2, not 2.45"):
-        iso._compute_understeer(steady(PASSENGER_CAR, 0.001, 10.0), make_car(PASSENGER_CAR))
+        iso._fit_understeer(steady(PASSENGER_CAR, 0.001, 10.0), make_car(PASSENGER_CAR))

@@ -2,12 +2,14 @@
 
 import shutil
 import sys
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.results import Suite
+from sideslip.benchmarks.report.study import Request
 from sideslip.benchmarks.speed import env_steps, plant, suite, timing
 from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
@@ -175,6 +177,29 @@ def test_every_target_stands_in_the_table() -> None:
     assert [line["scenario"] for line in lines] == [target.name for target in suite.TARGETS]
     outcomes = [line.get("met") for line in lines]
     assert outcomes == [None] * 8 + ["no", None]
+
+
+def test_a_run_measures_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = ((env_steps, "measure_steps"), (env_steps, "measure_filters"),
+             (plant, "measure_plants"), (env_steps, "measure_learners"))  # fmt: skip
+    for module, name in parts:
+        monkeypatch.setattr(module, name, lambda effort, name=name: make_table(**{name: [1.0]}))
+    monkeypatch.setattr(suite, "_measure_first_use", lambda quick: make_table(first=[1.0]))
+    tables = suite._measure(Request(quick=True))
+    assert [*(x for table in tables for x in table.times)] == [*(x for _, x in parts), "first"]
+
+
+def test_what_lacks_a_package_is_absent_and_a_module_of_ours_is_not() -> None:
+    table = make_table()
+    effort = timing.Effort(1, 0.0)
+
+    def make(name: str) -> timing.Workload:
+        return timing.Workload(import_module(name).run, 1)
+
+    table.measure({"theirs": lambda: make("no_such_package")}, effort)
+    assert table.absent == {"theirs": "No module named 'no_such_package'"}
+    with pytest.raises(ModuleNotFoundError):
+        table.measure({"ours": lambda: make("sideslip.no_such")}, effort)
 
 
 def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
