@@ -68,6 +68,12 @@ def get_direct() -> int:
 
 
 @jit
+def _is_weighed_at_capture(f: FilterMemory) -> Scalar:
+    """Return whether the covariance takes a sample when it is captured, by Larsen's rule."""
+    return f.delay_rule == LARSEN
+
+
+@jit
 def _clone_states(f: FilterMemory, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
@@ -115,7 +121,7 @@ def store_due_captures(f: FilterMemory, last: int) -> None:
             is_unknown = f.known_stamps[s, frame % N_STAMPS] != last
             if f.frames[s] > 0 and last == f.next[s] and is_unknown:
                 slot = frame % f.frames[s]
-                if f.delay_rule == LARSEN:
+                if _is_weighed_at_capture(f):
                     _update_covariance(f, s)
                 else:
                     _clone_states(f, s, slot)
@@ -126,7 +132,7 @@ def store_due_captures(f: FilterMemory, last: int) -> None:
 @inline
 def predict_late(f: FilterMemory) -> None:
     """Predict Larsen's M_k K_s of every sample under way by a step."""
-    if f.delay_rule == LARSEN:
+    if _is_weighed_at_capture(f):
         for s in range(N_SLOW):
             if f.stamp[s, 0] >= 0:
                 for i in range(f.rows[s]):
@@ -136,7 +142,7 @@ def predict_late(f: FilterMemory) -> None:
 @inline
 def correct_late(f: FilterMemory, row: Vector) -> None:
     """Correct Larsen's M_k K_s of every sample under way for a measurement."""
-    if f.delay_rule == LARSEN:
+    if _is_weighed_at_capture(f):
         for s in range(N_SLOW):
             if f.stamp[s, 0] >= 0:
                 for i in range(f.rows[s]):
