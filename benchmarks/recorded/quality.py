@@ -19,6 +19,7 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import WARNING_PREFIX
+from ...envs.task import make_reference_params
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.wires import AS_LOGGED, SignalCalibration
 
@@ -167,8 +168,7 @@ def _describe_contradiction(
 
 def compute_understeer(car: Vehicle) -> float:
     """Compute the understeer gradient (rad s2/m) of a car, 0 for one that oversteers."""
-    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    return max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
+    return max(float(make_reference_params(car).G) * car.wheelbase, 0.0)
 
 
 def fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:

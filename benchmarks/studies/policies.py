@@ -159,7 +159,7 @@ def record_evaluation(path: Path, episodes: int = 256, kind: str = "") -> JsonMa
     evaluation, names = evaluate_policy(str(path), episodes), ("mean", "low", "high")
     policy, costs = evaluation.policy, dict[str, JsonMap]()
     for name, drive in evaluation.drives.items():
-        costs[name] = dict(zip(names, _list_rounded(interval(drive.costs), 6), strict=True))
+        costs[name] = dict(zip(names, _round_estimate(interval(drive.costs), 6), strict=True))
     record: JsonMap = {"salt": evaluation.salt, "episodes": len(evaluation.seeds), "cost": costs}
     if kind:
         tasks, evaluate = _list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
@@ -312,12 +312,12 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
     nominal, policy_costs, shown = results[NOMINAL].costs, results["policy"].costs, JsonMap()
     for name in ("policy", _RIVAL, PARAMETERS):
         ratio = geometric_mean(-compute_log_ratios(nominal, results[name]))
-        shown[name] = _list_rounded(ratio.rescale(100.0))
+        shown[name] = _round_estimate(ratio.rescale(100.0))
     for name in (NOMINAL, _RIVAL):
         rate = compute_win_rate(policy_costs, results[name].costs)
-        shown[f"better than {name}"] = _list_rounded(rate)
+        shown[f"better than {name}"] = _round_estimate(rate)
     return shown | {"fails": float((results["policy"]["failure"] != 0.0).mean())}
 
 
-def _list_rounded(numbers: Estimate, digits: int = 3) -> Sequence[float]:
+def _round_estimate(numbers: Estimate, digits: int = 3) -> Sequence[float]:
     return [round(number, digits) for number in numbers]
