@@ -1,5 +1,6 @@
 """Corrections between samples of a slow sensor, and by a sample, where a rule shares them out.
 
+The rules are `memory.GainRules`. joint: an observer's, of all fast residuals of a tick at once.
 pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22), double-layer-gps (28)-(29),
 dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error, by a constant gain K
 (columns: fast rows, slow rows) or a fraction of the last sample's gain. dual-rate: fractions of the

@@ -146,9 +146,9 @@ def _find_variance(f: FilterMemory, i: int, residual: float, projected: Scalar) 
 
 @inline
 def _correct_by_table(f: FilterMemory, gains: GainTables) -> None:
-    """Correct x by fast measurements and the table; jointly: all residuals are taken before.
+    """Correct x by fast measurements and the table, one after the other.
 
-    Those of all residuals at once, joint and pseudo, are applied by `correct_between`.
+    Where a tick's residuals come at once, `correct_between` applies them.
     """
     is_joint = f.gain_rule <= GAIN.joint
     for i in range(f.fasts):
